@@ -10,4 +10,4 @@ unset PYTHONPATH         # a sourced ROS would bring its own pytest plugins
 .venv/bin/ruff format --check --quiet
 .venv/bin/mypy --no-error-summary
 .venv/bin/mypy --no-error-summary --strict examples/*.py
-exec .venv/bin/pytest -q -n 2 "$@"
+exec .venv/bin/pytest -q -n 2 --dist worksteal "$@"

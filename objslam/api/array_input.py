@@ -48,7 +48,7 @@ def as_poses(values: ArrayLike) -> Floats:
 
 
 def as_pose(values: ArrayLike) -> Floats:
-    """Return one pose (4, 4) from a row or a matrix, as `as_poses` takes them. ValueError as there."""
+    """Return one pose (4, 4) from a row or a matrix of `as_poses`. ValueError if it is no valid pose."""
     return as_poses(np.asarray(values, dtype=np.float64)[None])[0]
 
 
@@ -63,7 +63,7 @@ def as_stamps(values: ArrayLike) -> Floats:
 
 
 def as_boxes(values: ArrayLike, where: str) -> Floats:
-    """Return the boxes (B, 4) of one frame, px. An empty list gives (0, 4). ValueError with `where` for another shape."""
+    """Return the boxes (B, 4) of one frame, px. An empty list gives (0, 4). ValueError, with `where`, if not (B, 4)."""
     given = np.asarray(values, dtype=np.float64)
     if given.size and given.shape[1:] != (4,):
         raise ValueError(f"{where}: boxes are (B, 4) x1, y1, x2, y2, got the shape {given.shape}")
@@ -73,7 +73,7 @@ def as_boxes(values: ArrayLike, where: str) -> Floats:
 def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:
     """Return one number for each box (M,) from one list for each frame. Without `values`, each number is `unknown`.
 
-    counts: the number of boxes of each frame. ValueError with `name` if the lists have other lengths.
+    counts: the number of boxes of each frame. ValueError, with `name`, if the lists have other lengths.
     """
     if values is None:
         return np.full(sum(counts), unknown)

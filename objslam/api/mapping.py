@@ -87,7 +87,7 @@ def run(
 
 
 def prior_map(given: ObjectMap | str | PathLike[str]) -> PriorMap:
-    """Return a map of another day for a run. OutputError if its file or folder cannot be read."""
+    """Return the map of another day, from an `ObjectMap`, a file or a result folder. OutputError if it cannot be read."""
     from objslam.mapping.localization import PriorMap
 
     if isinstance(given, object_map.ObjectMap):
@@ -103,9 +103,9 @@ def map_log(
     progress: Progress,
     known: PriorMap | None = None,
 ) -> tuple[RunResult, types.Log]:
-    """Return the result of a run, and the log. If there is a `detector`, the log has the boxes that it found.
+    """Return the result of a run, and the log. A `detector` replaces the boxes of this log.
 
-    known: the map of another day, which the drive may be found in.
+    known: the map of another day, in which the drive is searched for.
     """
     from objslam.mapping import pipeline
 

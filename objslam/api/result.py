@@ -98,11 +98,11 @@ class Result:
         found = self.summary.get("assessment")
         if found is None:
             raise OutputError("this result is from an older version, without an assessment", hint="run again")
-        return Assessment(found["level"], tuple(found["reasons"]))
+        return Assessment(found["level"], tuple(found.get("reasons", ())))
 
     @property
     def views(self) -> Views | None:
-        """Where each image was taken, which tells what was in view. None for a session, or a result of an older version."""
+        """Where each image was taken. None for a live session, or a result of an older version."""
         from objslam.results import read
 
         if self._run is None:

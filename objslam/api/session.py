@@ -35,9 +35,9 @@ class Session(LiveSession):
 
     settings, changes: as in `objslam.run`. The mode is always joint. journal: a file that keeps every accepted message, so
     that a killed program loses nothing. resume: whether to continue an existing journal. name: of the log, in the result.
-    patient: whether frames of any age are accepted, and the session waits for calibrations. It is for a program that waits
-    for the session (`wait`) now and then, such as a replay. map: the map of another day, or its file or result folder. Once
-    the session is found in it, `snapshot().in_map` says so, and snapshots and result are in its frame.
+    patient: whether frames of any age are accepted, and the session waits for calibrations. A replay that calls `wait` now
+    and then needs this. map: the map of another day, or its file or result folder. Once the session is found in this map,
+    `snapshot().in_map` says so, and snapshots and result are in the frame of the map.
     """
 
     def __init__(
@@ -67,11 +67,14 @@ class Session(LiveSession):
         return super().push_odometry(stamp, _pose(odom_T_base), covariance)
 
     def push_localization(self, stamp: float, map_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
-        """Push map_T_base of a localisation at a stamp, s, as `push_odometry` takes it."""
+        """Push map_T_base of a localisation at a stamp, s. The pose has one of the forms of `push_odometry`."""
         return super().push_localization(stamp, _pose(map_T_base), covariance)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: ArrayLike) -> bool:
-        """Push base_T_camera of a camera that moves on the robot, from a stamp, s, on, as `push_odometry` takes a pose."""
+        """Push base_T_camera of a camera that moves on the robot. It holds from the stamp, s, on.
+
+        The pose has one of the forms of `push_odometry`.
+        """
         return super().push_mount(stamp, camera, _pose(base_T_camera))
 
     def snapshot(self) -> Snapshot:

@@ -103,15 +103,16 @@ def recognise_place(
     x = x[np.einsum("hi,ij,hj->h", x, problem.weight, x) <= POSSIBLE_MOTION]
     # The quick score ignores that a landmark has one partner. Only the best hypotheses get a one-to-one assignment.
     order = np.argsort(-_quick_score(problem, a, b, x), kind="stable")[:_VERIFIED]
-    found = [result for h in order.tolist() if (result := _evidence(problem, a, b, x[h])) is not None]
-    if not found:
+    evidence, x, pairs = _assigned(problem, a, b, x[order])
+    if not len(evidence):
         return None
-    evidence, best, pairs = max(found, key=lambda one: one[0])
-    apart = [(score, np.abs(other - best)) for score, other, _ in found]
-    others = [score for score, d in apart if np.hypot(d[0], d[1]) >= _SAME_SHIFT or d[2] >= _SAME_TURN]
-    correction = lift_se2(best)
+    best = int(evidence.argmax())
+    apart = np.abs(x - x[best])
+    other = (np.hypot(apart[:, 0], apart[:, 1]) >= _SAME_SHIFT) | (apart[:, 2] >= _SAME_TURN)
+    correction = lift_se2(x[best])
     correction[:2, 3] += pivot - correction[:2, :2] @ pivot
-    return Recognition(correction, pairs, evidence, evidence - max([0.0, *others]))
+    lead = evidence[best] - evidence[other].max(initial=0.0)
+    return Recognition(correction, pairs[best], float(evidence[best]), float(lead))
 
 
 @dataclass(frozen=True)
@@ -187,17 +188,24 @@ def _solve_seeds(problem: _Problem, seeds: Ints) -> Floats:
     angle = np.arctan2(other[:, 1], other[:, 0]) - np.arctan2(base[:, 1], base[:, 0])
     x = np.zeros((len(seeds), 3))
     x[:, 2] = np.where(alone, 0.0, (angle + np.pi) % (2 * np.pi) - np.pi)
+    begin = np.arange(0, 2 * len(seeds), 2)
     for _ in range(_REFINEMENTS):
-        x = _gauss_newton(problem, a, b, information, x)[0]
+        x = _gauss_newton(problem, a.ravel(), b.ravel(), begin, information.reshape(-1, 3, 3), x)[0]
     return x
 
 
-def _gauss_newton(problem: _Problem, a: Ints, b: Ints, information: Floats, x: Floats) -> tuple[Floats, Floats]:
-    """Return the corrections (..., 3) after one Gauss-Newton step for pairs a, b (..., P), and the Hessian (..., 3, 3)."""
-    at, jacobian = _moved(problem.offset[a], x)
-    weighted = np.swapaxes(jacobian, -1, -2) @ information
-    hessian = problem.weight + (weighted @ jacobian).sum(axis=-3)
-    gradient = (weighted @ (problem.target[b] - at)[..., None])[..., 0].sum(axis=-2) - x @ problem.weight
+def _gauss_newton(problem: _Problem, a: Ints, b: Ints, begin: Ints, information: Floats, x: Floats) -> tuple[Floats, Floats]:
+    """Return the corrections (H, 3) after one Gauss-Newton step, and the Hessians (H, 3, 3).
+
+    a, b: (P,) the pairs of all corrections, one correction after the other. begin: (H,) the first pair of each correction,
+    which has at least one. information: (P, 3, 3) m^-2, of the pairs.
+    """
+    owner = np.repeat(np.arange(len(x)), np.diff(begin, append=len(a)))
+    at, jacobian = (part[:, 0] for part in _moved(problem.offset[a][:, None], x[owner]))
+    weighted = np.swapaxes(jacobian, 1, 2) @ information
+    hessian = problem.weight + np.add.reduceat(weighted @ jacobian, begin)
+    pull = (weighted @ (problem.target[b] - at)[..., None])[..., 0]
+    gradient = np.add.reduceat(pull, begin) - x @ problem.weight
     return x + np.linalg.solve(hessian, gradient[..., None])[..., 0], hessian
 
 
@@ -215,30 +223,46 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the log likelihood ratio (..., C) of "one landmark" over "a new one" for each pair under corrections (..., 3).
-    It is -inf for a pair outside a gate."""
-    miss = problem.target[b] - _moved(problem.offset, x)[0][..., a, :]
+    """Return the log likelihood ratios (H, C) of "one landmark" over "a new one" for each pair under corrections (H, 3).
+
+    a, b: (C,) the pairs. A ratio is -inf for a pair outside a gate.
+    """
+    return _gain(problem, a, b, problem.target[b] - _moved(problem.offset, x)[0][:, a])
+
+
+def _gain(problem: _Problem, a: Ints, b: Ints, miss: Floats) -> Floats:
+    """Return the log likelihood ratios (..., C) of pairs (C,) whose positions differ by (..., C, 3) m."""
     squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
     return np.where(squared <= SAME_POINT_WIDE, problem.peak[a, b] - 0.5 * squared, -np.inf)
 
 
-def _evidence(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[float, Floats, Ints] | None:
-    """Refine a correction (3,). Return its log Bayes factor, the correction, and its best assignment (P, 2).
+def _assigned(problem: _Problem, one: Ints, two: Ints, x: Floats) -> tuple[Floats, Floats, list[Ints]]:
+    """Refine corrections (H, 3). Return their log Bayes factors (G,), the corrections (G, 3), and their best assignments.
 
-    None if no pair gains, or if a pair leaves its gate. one, two: (C,) the candidates.
+    A correction is left out if no pair gains, or if a pair leaves its gate. one, two: (C,) the candidates. An assignment has
+    the shape (P, 2).
     """
     gain = np.zeros(problem.possible.shape)
+    hessian = np.zeros((len(x), 3, 3))
+    pairs: list[Ints] = []
     for _ in range(_REFINEMENTS):
-        gain[one, two] = np.maximum(_gains(problem, one, two, x), 0.0)
-        a, b = linear_sum_assignment(-gain)
-        good = gain[a, b] > 0
-        a, b = a[good], b[good]
-        if len(a) == 0:
-            return None
-        x, hessian = _gauss_newton(problem, a, b, problem.information[a, b], x)
-    final = _gains(problem, a, b, x)
-    if not np.isfinite(final).all():
-        return None
+        pairs, kept = [], []
+        for h, gains in enumerate(np.maximum(_gains(problem, one, two, x), 0.0)):
+            gain[one, two] = gains
+            a, b = linear_sum_assignment(-gain)
+            good = gain[a, b] > 0
+            if good.any():
+                pairs.append(np.stack([a[good], b[good]], axis=1))
+                kept.append(h)
+        if not pairs:
+            return np.zeros(0), np.zeros((0, 3)), []
+        a, b = np.concatenate(pairs).T
+        begin = np.cumsum([0, *map(len, pairs[:-1])])
+        x, hessian = _gauss_newton(problem, a, b, begin, problem.information[a, b], x[kept])
+    at = _moved(problem.offset[a][:, None], np.repeat(x, [len(p) for p in pairs], axis=0))[0][:, 0]
+    final = np.add.reduceat(_gain(problem, a, b, problem.target[b] - at), begin)
     # Laplace's approximation multiplies the prior density at x with the volume that the landmarks leave open.
     occam = 0.5 * (np.linalg.slogdet(problem.weight)[1] - np.linalg.slogdet(hessian)[1])
-    return float(final.sum() - 0.5 * x @ problem.weight @ x + occam), x, np.stack([a, b], axis=1)
+    evidence = final - 0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x) + occam
+    inside = np.isfinite(final)
+    return evidence[inside], x[inside], [p for p, good in zip(pairs, inside.tolist(), strict=True) if good]

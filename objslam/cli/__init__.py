@@ -91,7 +91,7 @@ def main() -> NoReturn:
         if is_out_of_memory(error):
             say("objslam: out of memory", stderr=True)
             sys.exit(1)
-        if isinstance(error, OSError) and error.filename is not None:  # Such as a folder that may not be entered.
+        if isinstance(error, OSError) and error.filename is not None:  # For example, a folder without permission.
             say(f"objslam: {one_line(error.filename)}: {error.strerror}", stderr=True)
             sys.exit(1)
         said = f"{type(error).__name__}: {one_line(error)}"

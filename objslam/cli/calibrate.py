@@ -65,7 +65,7 @@ def calibrate(
         report(ledger)
     if not found:
         raise LogError(f"none of the {len(logs)} logs can be used", hint="the warnings say why")
-    if settings.calibration.file is not None:  # The prior of all logs. Errors that only this file has stay in the result.
+    if settings.calibration.file is not None:  # The prior of all logs. The result also has errors that only the file has.
         known = load_calibration(Path(settings.calibration.file))
         found.insert(0, replace(known, prior=known.sigma, prior_mean=known.values, prior_covariance=known.covariance))
     together = combine(found)

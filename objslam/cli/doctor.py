@@ -70,7 +70,7 @@ def _solved(log: Log, settings: Settings, show: Progress) -> list[str] | None:
 
 
 def _show_trials(found: Diagnosis) -> None:
-    """Print how well the boxes fit with the log as it is, and with the hypotheses that explain most."""
+    """Print how well the boxes fit with the log as it is, and with the corrections (hypotheses) that make them fit best."""
     from rich.table import Table
 
     if not found.trials:

@@ -57,7 +57,7 @@ _SPARE = (
 )  # Columns that a narrow terminal leaves out, in this order.
 NOT_LOCALISED = 3
 """The exit code of a run that wrote its result, but was not found in the map that --map names."""
-_WIDE = 10_000  # The width at which a table is measured, columns. It is larger than any table.
+_WIDE = 10_000  # The width, in characters, of a terminal on which no table is cut, to measure the full width of a table.
 
 
 @with_options

@@ -16,16 +16,16 @@ Alignment = Literal["none", "se2", "sim2", "se3", "sim3"]
 """The alignment of a map with the truth: none, se2 (yaw and translation), se3 (rotation and translation), and sim2 and sim3,
 which also have a scale."""
 
-_MAX_CORRESPONDENCES = 2000  # If there are more correspondences than this, pairs of them are sampled.
-_DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of correspondences.
-_MAX_TRIPLED = 80  # If there are more correspondences than this, triples of them are sampled. 80 have 82,160 triples.
-_MAX_STARTS = 3000  # The maximum number of initial transforms that are scored.
+_MAX_CORRESPONDENCES = 2000  # With more correspondences, pairs of them are sampled. A larger number is slower.
+_DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of correspondences. A larger number is slower.
+_MAX_TRIPLED = 80  # With more correspondences, triples of them are sampled: 80 have 82,160 triples. More are slower.
+_MAX_STARTS = 3000  # The most initial transforms that are scored. More are slower.
 _MAX_TRIPLES = 1000  # The most initial transforms from triples. Triples are right more often than pairs, so fewer suffice.
 _MAX_REFINED = 12  # The number of the best initial transforms that are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
 _ON_A_LINE = 0.02
-"""The sine of a triangle's angle up to which its corners count as on a line. A larger value leaves more triples out. Such a
-triangle turns freely about its longest side if its corners err by 2 % of its length."""
+"""The corners of a triangle are on a line if the sine of an angle is at most this. Position errors of 2 % of the triangle's
+length leave its turn about this line open. A larger value leaves more triples out."""
 _SCALES = (0.1, 10.0)  # The smallest and largest scale from map to truth that sim2 and sim3 search.
 
 
@@ -71,7 +71,7 @@ def match_points(source: Floats, target: Floats, same: Bools, radius: float) -> 
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     squared = ((source[:, None] - target[None]) ** 2).sum(axis=2)
     allowed = same & (squared <= radius**2)
-    # A forbidden pair costs more than all allowed pairs together.
+    # A forbidden pair costs more than all allowed pairs together, so the number of allowed pairs is as large as possible.
     rows, columns = linear_sum_assignment(np.where(allowed, squared, 2 * radius**2 * (min(squared.shape) + 1)))
     kept = allowed[rows, columns]
     return rows[kept], columns[kept]
@@ -91,7 +91,7 @@ def align_objects(
         same: (N, M), True if two objects may be the same.
         radius: maximum distance of a match in m.
         start: the only initial transform. If it is None, each pair of map objects is aligned with each pair of true objects
-            with the same labels and a similar distance. The kinds se3 and sim3 align triples of objects likewise. At most
+            with the same labels and a similar distance. For se3 and sim3, triples of objects replace the pairs. At most
             3,000 of these alignments (1,000 of triples) are sampled, with a fixed seed. The best 12 are initial transforms.
     """
     if kind == "none" or not same.any():
@@ -126,7 +126,7 @@ def _refine(
 def _starts(source: Floats, target: Floats, same: Bools, radius: float, kind: Alignment) -> list[Transform]:
     """Return the best initial transforms. Each aligns two map objects with two true objects.
 
-    For se3 and sim3, each aligns three objects. If no three or no two objects fit, fewer objects are aligned.
+    For se3 and sim3, each aligns three objects. If no group of objects fits, smaller groups are aligned.
     """
     i, k = np.nonzero(same)
     if kind in ("se3", "sim3"):
@@ -175,7 +175,7 @@ def _starts_in_space(source: Floats, target: Floats, i: Ints, k: Ints, radius: f
     a, b = source[i[drawn]], target[k[drawn]]  # (T, 3, 3): the corners of each triangle in the map and in the truth.
     side_a, side_b = (np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) for corners in (a, b))
     long_a, long_b = side_a.sum(axis=1), side_b.sum(axis=1)
-    likely = np.minimum(side_a, side_b).min(axis=1, initial=np.inf) > 1e-9  # A side of length 0 has one object at both ends.
+    likely = np.minimum(side_a, side_b).min(axis=1, initial=np.inf) > 1e-9  # A sampled triple may hold an object twice.
     scale = np.ones(len(a)) if kind == "se3" else long_b / np.maximum(long_a, 1e-9)
     likely &= (scale >= _SCALES[0]) & (scale <= _SCALES[1])
     likely &= (np.abs(scale[:, None] * side_a - side_b) <= 2 * radius).all(axis=1)

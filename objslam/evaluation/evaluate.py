@@ -28,7 +28,7 @@ class Match:
     """A map object and the true object that it matches. `offset` (3,) is map minus truth, m, after the alignment.
 
     squared: squared Mahalanobis distance of the offset in x and y, by the object's covariance, rotated and scaled like the
-    map. squared_3d: the same in x, y and z. Both are None without a covariance.
+    map. squared_3d: the squared distance in x, y and z. Both are None without a covariance.
     body: how the two bodies fit, None if one of the two has no size.
     """
 

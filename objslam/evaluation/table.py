@@ -47,7 +47,7 @@ _PATH_ROWS = (
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
     """Return a table of the scores, a table of the objects by decreasing error, and the warnings.
 
-    Labels and file names are in it as they are, so it needs a console without markup.
+    Print it on a console without markup, because labels and file names are not escaped.
     """
     from rich.console import Group
     from rich.table import Table

@@ -1,1 +1,1 @@
-"""Live: the map of a running robot, which is shown while it grows. `mapping` maps a complete log offline."""
+"""Live: makes and shows the map while the robot drives. `mapping` makes the map of a complete log."""

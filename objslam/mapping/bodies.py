@@ -159,6 +159,9 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     box = (rays.box[:, 2:] > rays.box[:, :2]).all(axis=1)
     ray = np.flatnonzero((association.object >= 0) & sees_size & box)
     ray = ray[fit[association.object[ray]]]
+    origin = map_T_camera[rays.keyframe[ray], :3, 3]
+    # Rays that place nothing can have their point at the camera. Such a point has no direction.
+    ray = ray[np.linalg.norm(estimate.positions[association.object[ray]] - origin, axis=1) > MIN_DEPTH]
     number = np.bincount(association.object[ray], minlength=association.count)
     objects = np.flatnonzero(fit & (number >= _FEWEST))
     ray = ray[np.isin(association.object[ray], objects)]

@@ -19,7 +19,7 @@ from objslam.results import files
 from objslam.results.files import dump_json
 
 _MOST_ISLANDS = 100
-"""The highest number of an island of an earlier merge that is looked for. A larger number finds more of a large merge."""
+"""Folders of an earlier merge are found up to island_100. With a larger number, more folders of a large merge are found."""
 
 
 def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warnings: Sequence[str] = ()) -> list[Path]:

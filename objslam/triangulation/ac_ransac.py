@@ -2,7 +2,7 @@
 
 No fixed threshold fits all objects, because the box of a large object wanders by many times the pixel noise. So the
 consensus is the subset of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon
-& Monasse, IPOL 2, 2012). Its measure is the number of false alarms (NFA): how many subsets agree as well by chance.
+& Monasse, IPOL 2, 2012). The number of false alarms (NFA) measures this: how many subsets would agree as well by chance.
 """
 
 import math
@@ -22,8 +22,8 @@ from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.point_to_lines import PointSolution, minimise_distances
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
-"""The view in which wrong boxes are uniformly distributed: a cone with 45 degrees half angle. Unit: 2 pi sr."""
-_NOISE_SIGMAS = 3.0  # Below this many standard deviations of noise, a smaller deviation of a ray scores no better.
+"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle."""
+_NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score alike.
 _MOST_NOISE = 0.25  # Noise takes at most this share of the view. With more, very noisy rays agree with any point.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
 _MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end earlier if the agreement stops growing.
@@ -35,8 +35,8 @@ def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[Poin
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
     far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
     within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
-    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. `hypotheses` and `jitter` are
-    as in `best_pair`.
+    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. hypotheses, jitter: for
+    `best_pair`.
     """
     xp = module_of(bundle.origin)
     used = xp.ones_like(bundle.index, dtype=xp.bool)
@@ -119,7 +119,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
             which = xp.arange(begin, min(begin + step, hypotheses), device=rays.device)
             first, second, exists = _pairs(bundle.number[chunk], which, hypotheses, jitter[which])
             candidates, valid = _midpoints(bundle, take_along(rays, first, 1), take_along(rays, second, 1))
-            chance = as_single(_chance(bundle, rays, real, candidates))  # This is enough for ranking, and faster.
+            chance = as_single(_chance(bundle, rays, real, candidates))  # Single precision is enough to rank, and faster.
             nfa = as_type(_least_chance(chance, bundle.number[chunk])[0], points)
             nfa = xp.where(valid & exists, nfa, xp.inf)
             row, best = xp.arange(len(nfa), device=nfa.device), nfa.argmin(axis=1)
@@ -133,7 +133,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the indices (B, H) `first` < `second` of the two rays of each pair among the rays of an object, and whether the
-    pair exists. number: (B,) rays of each object. which: (H,) indices of the hypotheses, with their jitter (H,)."""
+    pair exists. number: (B,) rays of each object. which, jitter: (H,) the indices and the jitter of the hypotheses."""
     xp = module_of(number)
     n = as_type(number[:, None], jitter)
     pairs = n * (n - 1) / 2
@@ -167,8 +167,8 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return the probability (B, H, n) that a wrong box gives a ray as close to the points (B, H, 3) as each ray is. It is 1
-    for a ray that points away from the point, and for a ray that is not `real`."""
+    """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes as close to the point (B, H, 3). It
+    is 1 for a ray that points away from the point, and for a ray that is not `real`."""
     xp = module_of(points)
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]

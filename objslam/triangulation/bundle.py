@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from objslam.core.array_module import Tensor, indices_of, module_of
 
 _SIMILAR = (2, 32)
-"""The numbers a and b. If the smallest object of a block has n rays, the largest one has at most a n + b rays. Larger values
-make fewer blocks with more filler. With these values, filler is at most about half of a block of objects with hundreds of
-rays. It may be more where objects have few rays, but costs little there."""
+"""The numbers a and b. If the smallest object of a block has n rays, the largest one has at most a n + b rays. Fillers make
+all objects of a block equally long. Larger values make fewer blocks with more fillers. With these values, about half of a
+block are fillers at most, or more if objects have few rays, but there they cost little."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Bundle:
         return Bundle(self.origin[use], self.direction[use], self.sigma[use], self.position_sigma, index, number)
 
     def blocks(self, objects: Tensor, most: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Split objects, given by their indices, into blocks. A block of several objects has at most `most` places for rays.
+        """Split objects, given by their indices, into blocks of B objects with up to n rays each.
 
         A block holds the objects (B,), the indices of their rays (B, n), and which of these indices are real. The other
-        indices only fill the rows of objects with fewer rays.
+        indices only fill the rows of objects with fewer rays. most: the largest B n of a block of several objects.
         """
         xp = module_of(self.number)
         first = xp.cumsum(self.number, 0) - self.number

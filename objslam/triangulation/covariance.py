@@ -7,7 +7,7 @@ from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.lines import Lines
 
 _EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. A larger number costs time.
-_PLACES = 1 << 13  # The most places for rays of the objects that `parallax` compares together. A larger number needs memory.
+_PLACES = 1 << 13  # The most rays, with fillers, that `parallax` compares together. A larger number needs memory.
 _RANGE_ITERATIONS = 30  # The iterations of the range fit of every object. The fit starts at the median range.
 
 
@@ -32,7 +32,7 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     tilt = lines.sum((RAYLEIGH_MEAN * rays.sigma**2 * distance / s)[:, None] * rays.direction)
     factor = _variance_factor(length(lines.foot) / s, rays, 3)[:, None, None]
     inverse, regular = _inverse(a)
-    bias = factor * (inverse @ tilt[:, :, None])  # The tilt grows with the noise, and the Hessian falls with it.
+    bias = factor * (inverse @ tilt[:, :, None])  # With more noise, the tilt is larger and the Hessian smaller.
     result = factor * inverse @ b @ inverse + bias @ bias.mT
     return xp.where(regular[:, None, None], result, xp.nan)
 
@@ -43,10 +43,10 @@ def fuse_ranges(
     """Fuse the rays in `use` (R,) with their ranges (R,) m, and return points (N, 3) m and covariances (N, 3, 3) m^2.
 
     It is for objects whose rays alone are too uncertain. A ray without a range has the range NaN, and an object without a
-    range gets NaN. All ranges of an object share an error with the standard deviation range_bias (R,) m. It moves the point
-    along the rays, and the covariance includes it. The loss is squared across the rays, because `use` has no outliers. It is
-    Cauchy's along the rays, because a range may belong to the background. `association.refinement.refine` is robust in both
-    directions and gives no covariance.
+    range gets NaN. range_bias: (R,) m, the standard deviation of an error that all ranges of an object share. The covariance
+    includes this error. Across the rays, the loss is squared, because `use` has no outliers. Along the rays, it is Cauchy's,
+    because a range may belong to the background. `association.refinement.refine` is robust in both directions, but gives no
+    covariance.
     """
     xp = module_of(ranges)
     rays, count = bundle.select(use), len(bundle.number)
@@ -168,12 +168,13 @@ def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
 
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
-    """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation. miss: (R,)
-    normalised residuals. Their mean is used, because it is more robust than their mean square. The fit takes `taken` of the
-    2 n degrees of freedom of n rays. `rest` is what is left. The excess over 1 is enlarged, because an estimate from few
-    degrees of freedom is uncertain.
-    The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its limit for a large rest. It is
-    exact to 3 % from 4 rays on."""
+    """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation.
+
+    miss: (R,) normalised residuals. Their mean is used, because it is more robust than their mean square. taken: how many of
+    the 2 n degrees of freedom of n rays the fit uses up. The excess over 1 is enlarged, because an estimate from few degrees
+    of freedom, `rest`, is uncertain. The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its
+    limit for a large rest. It is exact to 3 % from 4 rays on.
+    """
     number = as_type(rays.number, miss)
     mean = group_sum(miss, rays.index, len(number)) / number.clip(min=1) / RAYLEIGH_MEAN
     rest = (2 * number - taken).clip(min=1)

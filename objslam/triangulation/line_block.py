@@ -28,8 +28,8 @@ class LineBlock:
         return perpendicular(points[:, None], self.direction) - self.foot
 
     def spread(self, weight: Tensor) -> Tensor:
-        """Return the sum of weight (n, B) times I - d d^T over the lines of each object, (6, B) as in `outer`. d: a line's
-        direction."""
+        """Return the sum of weight (n, B) times I - d d^T over the lines of each object, by its six entries (6, B). d: a
+        line's direction."""
         result = -outer(self.direction * weight, self.direction)
         result[:3] += weight.sum(axis=0)
         return result

@@ -10,9 +10,9 @@ from objslam.core.array_module import Tensor, as_single, as_type, module_of, tak
 from objslam.triangulation.line_block import LineBlock, dot, norm, solve_symmetric
 
 _WEIGHTED_STEPS = 3
-"""The number of weighted least-squares steps before Newton's. Fewer leave outliers more weight."""
+"""The number of weighted least-squares steps before Newton's. With fewer, outliers keep more weight."""
 _SMOOTHING = 0.05
-"""The smoothing (in mean distances) of the weighted steps. A larger one weakens outliers less."""
+"""A line at distance d has the weight 1 / sqrt(d^2 + this^2), in mean distances. With more, outliers keep more weight."""
 _SINGLE_STEPS = 3
 """The most Newton steps in single precision, which take half the time of those in double precision. More steps do not
 improve a single-precision point."""
@@ -122,8 +122,8 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return, at points (3, B), the gradient (3, B) of Eq. 1, the second derivative (B,) of Eq. 1 along the unit vectors
-    `axis` (3, B), and the sum (B,) of 1 + 1 / d, at most 1e6."""
+    """Return, at points (3, B), the gradient (3, B) of Eq. 1, its second derivative (B,) along the unit vectors `axis`
+    (3, B), and the rounding error (B,) of the gradient, in units of epsilon: the sum of 1 + 1 / d, at most 1e6."""
     q = lines.offset(point)
     inverse = lines.weight / norm(q).clip(min=_TINY)
     u = q * inverse
@@ -133,8 +133,8 @@ def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tens
 
 
 def _hessian(direction: Tensor, u: Tensor, inverse: Tensor) -> Tensor:
-    """Return the sums of t t^T / d with t = n x u, (6, B) as in `outer`. u: (3, n, B) and inverse: (n, B) 1 / d, both zero
-    for a filler."""
+    """Return the sums of t t^T / d with t = n x u, by their six entries (6, B). u: (3, n, B) and inverse: (n, B) 1 / d,
+    both zero for a filler."""
     x, y, z = direction
     a, b, c = u
     t0, t1, t2 = y * c - z * b, z * a - x * c, x * b - y * a

@@ -24,13 +24,14 @@ from objslam.triangulation.newton import approach, newton, off_nearest_line
 from objslam.triangulation.smoothed_newton import finish
 
 _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
-"""The most places for rays in one block, for each backend. A smaller number needs more calls, and a call of torch costs more
-than a call of numpy. A larger block does not fit into the cache of a CPU. On CUDA, it needs more memory: 1 kB a ray. On the
-CPU, blocks four times as large take 1.1 (numpy) and 1.2 times (torch) as long. The number for CUDA was not measured."""
+"""The most rays, with fillers, in one block, for each backend. Smaller blocks need more calls, and a call of torch costs
+more than one of numpy. Larger blocks do not fit into the cache of a CPU: blocks four times as large take 1.1 (numpy) and 1.2
+times (torch) as long. On CUDA, a ray needs 1 kB. The number for CUDA was not measured."""
 _ROUNDS = 3
 """The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest."""
 _LEAST_REGULAR = 1e-6
-"""The regularity of a matrix, from 0 to 1, below which eigenvalues decide whether the lines fix a point."""
+"""If a matrix is less regular than this (from 0 to 1), its eigenvalues decide whether the lines fix a point. A larger value
+computes eigenvalues more often."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _places(bundle: Bundle) -> int:
 
 
 def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the least-squares points (3, B) of a block, as in `least_squares`, and which are unique (B,)."""
+    """Return the points (3, B) of `least_squares` for a block, and which are unique (B,)."""
     xp = module_of(origin)
     number = weight.sum(axis=0)
     base = (origin * weight).sum(axis=1) / number  # Large map coordinates would cost digits.

@@ -33,7 +33,10 @@ class ProximityField:
 
 
 def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the mean distance (...) m of points (..., 3) from R > 0 rays (R, 3), (R, 3) unit: the cost of Eq. 1 over R."""
+    """Return the mean distance (...), m, of points (..., 3) from R > 0 rays: the cost of Eq. 1 over R.
+
+    origins: (R, 3) m. directions: (R, 3) unit.
+    """
     flat = points.reshape(-1, 3)
     centre = flat.mean(axis=0)  # Squares of large map coordinates would hide small distances.
     p, m = flat - centre, origins - centre
@@ -49,10 +52,10 @@ def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
 
 
 def proximity_field(origins: Floats, directions: Floats, size: int = 101, reach: float | None = None) -> ProximityField:
-    """Return the field of one object with R >= 2 rays (R, 3), (R, 3) unit. A slice has `size` x `size` points.
+    """Return the field of one object with R >= 2 rays. A slice has `size` x `size` points.
 
-    reach: half the edge of a slice, m. None derives it from the distances of the rays. Parallel rays have no minimum.
-    Their slices then lie 1 m ahead, at the point of `solve_eq1`.
+    origins: (R, 3) m. directions: (R, 3) unit. reach: half the edge of a slice, m. None derives it from the distances of the
+    rays. Parallel rays have no minimum. Their slices then lie 1 m ahead, at the point of `solve_eq1`.
     """
     minimum = solve_eq1(origins, directions, np.zeros(len(origins), dtype=np.int64), 1)[0][0]
     off = np.linalg.norm(np.cross(minimum - origins, directions), axis=1)

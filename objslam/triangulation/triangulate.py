@@ -21,8 +21,8 @@ from objslam.triangulation.lines import Lines
 from objslam.triangulation.point_to_lines import least_squares, minimise_distances
 
 _LARGE = 200_000
-"""The number of rays from which on torch does the work, on CUDA if there is a card. Below it, numpy on one core is as fast.
-numpy also saves the import of torch (1.4 s) and the start of CUDA. The best limit depends on the card."""
+"""With at least this many rays, torch does the work, on CUDA if there is a card. With fewer, numpy on one core is as fast,
+and saves the import of torch (1.4 s) and the start of CUDA. The best limit depends on the card."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _triangulate(
     judged: bool,
     backend: Backend,
 ) -> Triangulation:
-    """Triangulate checked rays, as `triangulate` does."""
+    """Triangulate rays that are already checked. The arguments are those of `triangulate`."""
     where, base, bundle = _sorted_bundle(m, n, index, count, noise, position_sigma, backend)
     xp = module_of(base)
     if settings.consensus:

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from mutations import ROUNDS, altered, as_json, mutated, survives
 from synthetic_result import clusters, synthetic_result
 
+from objslam.api.result import Result
 from objslam.config import Output, Settings
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
 from objslam.io.odometry_parquet import Motions, dump_motions
@@ -41,6 +42,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     summary |= {
         "calibration": {"parameters": {"odometry.scale": error}, "traded_off": [["a", "b"]]},
         "seconds": {"solve": 1.0},
+        "assessment": {"level": "check", "reasons": ["half of the boxes are cut"]},
     }
     summary |= {
         "dropped": {"box": 1},
@@ -80,6 +82,14 @@ JSON_FILES = (files.SUMMARY, files.EVALUATION, files.OBJECTS, files.TRUTH_OBJECT
 def test_altered_json(result: Path, name: str, data: st.DataObject) -> None:
     made = data.draw(altered(json.loads((result / name).read_text())))
     read_everything(with_file(result, name, as_json(made)))
+
+
+def test_optional_keys_that_are_missing(result: Path) -> None:
+    summary = json.loads((result / files.SUMMARY).read_text())
+    del summary["calibration"]["traded_off"], summary["assessment"]["reasons"]
+    out = with_file(result, files.SUMMARY, as_json(summary))
+    assert read_everything(out) == read_everything(result)
+    assert Result.load(out).assessment.reasons == ()
 
 
 @pytest.mark.parametrize("name", [*JSON_FILES, files.TRAJECTORY, files.CONFIG, files.RAYS, files.MOTIONS])

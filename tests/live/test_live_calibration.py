@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from driving import feed
 from test_mixed_paths import ORDERS, heard
 from test_mixed_paths import drive as hear
 from test_session import make_log
@@ -57,19 +58,8 @@ def file(tmp_path_factory):
     return path
 
 
-def push(session, log, begin=0, end=None):
-    if begin == 0:
-        session.push_camera(log.cameras[0].camera)
-    for _, frame, one in list(events(log))[begin:end]:
-        one(session)
-        if frame:
-            assert session.wait(LIMIT), session.failure
-    assert session.wait(LIMIT), session.failure  # for the poses after the last frame
-    return session
-
-
 def drive(log, settings, **more):
-    return push(Session(settings, patient=True, **more).start(), log)
+    return feed(Session(settings, patient=True, **more).start(), log)
 
 
 def rmse(found, log):
@@ -122,7 +112,7 @@ def test_a_session_killed_around_a_calibration_goes_on_to_the_same_map(log, tmp_
     whole.abort()
     session = Session(settings, tmp_path / "killed", patient=True).start()
     for number, _ in enumerate(list(events(log))):
-        push(session, log, number, number + 1)
+        feed(session, log, number, number + 1)
         m = session._mapper.state
         if m.errors if killed_at.startswith("after") else m.next_id.keyframe >= 83:
             break
@@ -130,7 +120,7 @@ def test_a_session_killed_around_a_calibration_goes_on_to_the_same_map(log, tmp_
     session.abort()
     again = Session(settings, tmp_path / "killed", resume=True, patient=True).start()
     assert again._mapper.state.errors == m.errors
-    push(again, log, number + 1)
+    feed(again, log, number + 1)
     snapshot = again.snapshot()
     again.abort()
     assert snapshot.counters["calibrations"] == expected.counters["calibrations"]

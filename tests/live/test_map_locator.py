@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from driving import feed
 from waiting import LIMIT
 
 from objslam.config import Odometry, load_settings
@@ -53,19 +54,8 @@ def another_day(first, localization=None):
     return moved_log(simulate(preset("demo", **changes, localization=localization), 102), UNKNOWN)
 
 
-def push(session, log, begin=0, end=None):
-    if begin == 0:
-        session.push_camera(log.cameras[0].camera)
-    for _, frame, one in list(events(log))[begin:end]:
-        one(session)
-        if frame:
-            assert session.wait(LIMIT), session.failure
-    assert session.wait(LIMIT), session.failure
-    return session
-
-
 def drive(log, known, **more):
-    return push(Session(SETTINGS, patient=True, known=known, **more).start(), log)
+    return feed(Session(SETTINGS, patient=True, known=known, **more).start(), log)
 
 
 def errors(found, log):
@@ -129,17 +119,17 @@ def test_a_session_goes_over_into_the_map(first, known, localization):
 def test_a_killed_session_is_found_again_in_the_same_place(first, known, tmp_path):
     log = another_day(first)
     end = 3 * len(list(events(log))) // 4
-    session = push(Session(SETTINGS, patient=True, known=known).start(), log, end=end)
+    session = feed(Session(SETTINGS, patient=True, known=known).start(), log, end=end)
     whole = session.snapshot()
     session.abort()
     assert whole.in_map.objects
     for at, found in ((end // 6, False), (5 * end // 6, True)):
         file = tmp_path / f"{at}.objslam"
-        killed = push(Session(SETTINGS, file, patient=True, known=known).start(), log, end=at)
+        killed = feed(Session(SETTINGS, file, patient=True, known=known).start(), log, end=at)
         place = killed.snapshot().in_map
         assert (place is not None and place.objects > 0) == found
         killed.abort()
-        again = push(Session(SETTINGS, file, resume=True, patient=True, known=known).start(), log, begin=at, end=end)
+        again = feed(Session(SETTINGS, file, resume=True, patient=True, known=known).start(), log, begin=at, end=end)
         resumed = again.snapshot()
         again.abort()
         assert resumed.in_map == whole.in_map

@@ -172,10 +172,10 @@ def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Le
 
 
 def _look_for_journal(file: Path, resume: bool, stack: ExitStack) -> None:
-    """With `resume`, check that a journal exists. Without it, rename an existing journal, and restore this journal at the
-    end if the new session got no message.
+    """Check that a journal to resume exists, or rename the journal of an earlier session.
 
-    If the last session was killed before its first message, the journal that it renamed is restored first.
+    If the new session gets no message, the renamed journal gets its name back when the session ends. If such a session was
+    killed, this happens here, when the next session starts.
     """
     from objslam.errors import OutputError
     from objslam.sources.journal.aside import put_back, restore_after_kill, set_aside

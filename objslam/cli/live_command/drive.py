@@ -33,7 +33,7 @@ class LatestObjects:
         self._out, self._begun, self._refused = out, False, False
 
     def try_write(self, snapshot: Snapshot) -> None:
-        """Write as `write` does, but do not raise an OutputError: warn of the first one, and say when it is over."""
+        """Write as `write` does, but only warn of the first OutputError, and say when writing works again."""
         refused = None
         try:
             self.write(snapshot)
@@ -115,8 +115,8 @@ def finish(
 ) -> RunResult:
     """End the session, write its result, print a summary, and return the result.
 
-    Then the error of the session or `broken`, if any, is raised. An error of the session becomes an ObjslamError. If there
-    is no result, the last snapshot is written to objects.json.
+    If the session ended early, raise its error afterwards, as an ObjslamError. Else raise `broken`, the error that `drive`
+    returned, if any. If there is no result, the last snapshot is written to objects.json.
     """
     from objslam.cli.run import say_result
     from objslam.output.result_folder import write_result

@@ -1,7 +1,7 @@
 """Adapters bring messages to a session, one file per adapter. `ADAPTERS` lists them for `objslam live SOURCE`.
 
-A new adapter needs a file, a row in `ADAPTERS` and a function that makes it. `LiveOptions` inherits its options. A SOURCE
-that is not in the table is a recording. This module imports no heavy library, because `--help` imports it.
+A new adapter needs a file, a row in `ADAPTERS` and a function that makes it. `LiveOptions` must inherit the class of its
+options. A SOURCE that is not in the table is a recording. `--help` imports this module, so it imports no heavy library.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class LiveRosOptions(RosOptions):
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """The DDS domain and network interface, as in `live.dds.network.open_network`."""
+    """The arguments of `live.dds.network.open_network`."""
 
     domain: Annotated[int | None, Option("--domain", "DDS domain. [default: ROS_DOMAIN_ID, else 0]")] = None
     interface: Annotated[str | None, Option("--interface", _INTERFACE)] = None
@@ -70,11 +70,11 @@ class LiveOptions(DdsOptions, SourceOptions):
 
 @dataclass(frozen=True)
 class Feed:
-    """An adapter with its helpers. views: the functions that receive each snapshot. close: the functions to call at the end.
+    """An adapter, with functions that the session calls for it.
 
-    image: the function that returns the image of a camera, by its name, at a stamp, s. None if the adapter has no images.
-    odom_frame: the function that returns the name of the odometry's frame, None if the session may not publish its pose.
-    ticks: the functions to call ten times a second.
+    views: each receives every snapshot. close: called at the end. ticks: called ten times a second. image: returns the image
+    of a camera, by its name, at a stamp, s. None if the adapter has no images. odom_frame: returns the name of the
+    odometry's frame, or None if --publish-tf must not publish where this frame is.
     """
 
     adapter: Adapter
@@ -122,7 +122,7 @@ def _rclpy(sink: Sink, settings: Settings, options: LiveRosOptions) -> Feed:
 def _ros(
     sink: Sink, settings: Settings, options: LiveRosOptions, make: Callable[[RosMessages, TopicChoice], Adapter]
 ) -> Feed:
-    """Return the feed of an adapter for ROS messages, with a detector if the options name one. make: returns the adapter."""
+    """Return the feed of an adapter for ROS messages, with a detector if the options name one. make: makes the adapter."""
     from objslam.live.ros.detector_worker import DetectorWorker
     from objslam.live.ros.message_handler import RosMessages
     from objslam.live.ros.topic_discovery import TopicChoice
@@ -144,7 +144,7 @@ def _ros(
 
 ADAPTERS = {
     "dds": LiveSource("a ROS 2 robot", _dds, DdsOptions),
-    "rclpy": LiveSource("the same, as a ROS node", _rclpy, LiveRosOptions),
+    "rclpy": LiveSource("a ROS 2 robot, through a ROS node", _rclpy, LiveRosOptions),
     "stdin": LiveSource("JSON lines", _stdin),
 }
 """The sources of `objslam live` by name."""

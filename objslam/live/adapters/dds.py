@@ -15,9 +15,9 @@ from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
 _LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
-_TAKE = 200  # The most messages of one call to a reader. A larger number makes fewer calls, and takes more memory.
+_TAKE = 200  # The most messages that one call takes from a reader. A larger number makes fewer calls, and costs memory.
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
-_MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images bring a warning. A larger value warns more often.
+_MIN_BUFFER = 2 << 20  # With a smaller socket buffer, bytes, raw images bring a warning. A larger value warns more often.
 _Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
 
@@ -115,7 +115,7 @@ class DdsAdapter:
                 if reader is not None:
                     self._readers[key] = reader
                     opened.append(reader)
-        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # Transforms and calibrations first.
+        order = {type_: rank for rank, type_ in enumerate(LATCHED)}  # Boxes need transforms and calibrations before them.
         self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].of.type, len(order))))
         return opened
 
@@ -170,10 +170,10 @@ class DdsAdapter:
                 return
 
     def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
-        """Return whether a message is for this reader, by the handle of its publisher.
+        """Return whether this reader pushes a message of the publisher with this handle.
 
-        A best-effort reader receives from the reliable publishers too, so two readers may receive one message. If the
-        publisher is unknown, the reader with the strictest QoS takes the message.
+        Two readers may receive one message, because a best-effort reader receives from reliable publishers too. If the
+        publisher is unknown, the reader with the strictest QoS pushes the message.
         """
         if handle not in self._publications:
             self._look_around(found)

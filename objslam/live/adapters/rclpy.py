@@ -19,7 +19,7 @@ class RclpyAdapter:
     """Subscribes to the topics of the wanted types, while publishers come and go. Raises ObjslamError without rclpy.
 
     ROS does not name the publisher of a message, so each topic has one subscription. It is reliable if all publishers are
-    reliable. If one is not, it is best-effort, which receives from all of them.
+    reliable. Else it is best-effort, because such a subscription receives from all publishers.
     """
 
     messages: RosMessages

@@ -2,9 +2,9 @@
 
 {"type": "camera", "name": "front", ...the keys of camera.yaml...}
 {"type": "odometry", "stamp": 12.5, "translation": [x, y, z], "rotation_xyzw": [x, y, z, w]}    odom_T_base
-{"type": "localization", ...the same...}    map_T_base
-{"type": "mount", "camera": "front", ...the same...}    base_T_camera from this stamp on
-{"type": "detections", "camera": "front", ...a line of detections.jsonl...}
+{"type": "localization", ...the keys of odometry...}    map_T_base
+{"type": "mount", "camera": "front", ...the keys of odometry...}    base_T_camera from this stamp on
+{"type": "detections", "camera": "front", ...the keys of detections.jsonl...}
 
 A planar pose has "x", "y", "yaw" instead of translation and rotation. Odometry and localization may have a "covariance" of
 36 numbers, as in ROS. With a single camera, "camera" and "name" may be left out. The camera is then called "camera".
@@ -31,7 +31,7 @@ from objslam.live.interface import Sink
 _CAMERA = "camera"
 _LONGEST = 1 << 20  # The longest line, bytes. Longer lines are dropped. A larger number costs memory.
 _CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
-_WAIT = 0.1  # The time until a stop is noticed, s. A larger value notices it later.
+_WAIT = 0.1  # The longest time until a stop is noticed, s.
 
 
 @dataclass

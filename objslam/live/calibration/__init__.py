@@ -1,1 +1,1 @@
-"""A live session estimates the errors that all measurements share while it runs. It then corrects its map."""
+"""A running session estimates the errors that all measurements share, such as clock offsets. Then it corrects its map."""

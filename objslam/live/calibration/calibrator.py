@@ -1,4 +1,4 @@
-"""Calibrate a session while it runs: when a worker estimates the shared errors, and when the estimate corrects the map."""
+"""Decides when a running session estimates its shared errors, such as clock offsets, and when these correct the map."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
 
 _GROWTH = 1.5
-"""The growth factor of the number of keyframes between two calibrations. A larger factor calibrates more rarely. With any
-factor above 1, the work of all calibrations together grows linearly with the session."""
+"""A calibration begins when the number of keyframes has grown by this factor since the last one began. As the intervals
+grow, the time of all calibrations is proportional to the number of keyframes. A larger factor calibrates more rarely."""
 _DELAY = 0.15
-"""The keyframes between the start of a calibration and the correction of the map, as a share of the keyframes at the start.
-With a larger share, the correction comes later, but its keyframe depends less on the speed of the machine."""
+"""The map is corrected when the number of keyframes has grown by this share since the calibration began. If the worker is
+done by then, the map does not depend on the machine's speed. A larger share suits slower machines, but corrects later."""
 _CHANGED = 1.0
-"""The change of an error, in standard deviations, from which the map is corrected. With a larger value, corrections are
-rarer."""
+"""The map is corrected if an error has changed by more than this, in standard deviations. A larger value corrects more
+rarely."""
 
 
 def observed(found: Calibration, now: Floats) -> Calibration:
-    """Return a calibration in which the errors that the session cannot observe stay at their values `now` (P,).
+    """Return a calibration in which errors that the session does not observe keep their present values, `now` (P,).
 
-    The other errors get their most probable values, given those that stay. If unobservable errors did not stay, noise would
-    move the map with each calibration.
+    Otherwise, noise would move the map with each calibration. Observed errors get their most probable values, given the
+    kept ones.
     """
     stay = found.sigma > OBSERVABLE * found.prior
     if not stay.any():
@@ -49,11 +49,10 @@ def observed(found: Calibration, now: Floats) -> Calibration:
 
 
 class Calibrator:
-    """Decides after each keyframe whether a calibration begins or takes effect.
+    """Decides after each keyframe whether a calibration begins (_GROWTH) or corrects the map (_DELAY).
 
-    A calibration begins at fixed numbers of keyframes. It takes effect a fixed share of keyframes later. If the worker is
-    not done by then, a `patient` session waits for it. Any other session goes on until the worker is done. Each calibration
-    that takes effect is recorded with the number of keyframes, so that a resumed session does the same.
+    If the worker is late, a `patient` session waits for it, and any other session goes on. The journal receives each applied
+    calibration with its keyframe, so that a resumed session applies it there.
     """
 
     def __init__(
@@ -65,23 +64,23 @@ class Calibrator:
         name: str,
         patient: bool,
     ) -> None:
-        """Prepare for a session. record: writes to the journal, and returns False if it refuses. name: of the log.
+        """Prepare for a session. record: writes a calibration to the journal, and returns whether it may be applied.
 
-        patient: whether the session may wait for the worker.
+        name: of the log. patient: whether the session may wait for the worker.
         """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
-        self._asked: tuple[int, Request] | None = None  # The number of keyframes, and the request for the worker.
+        self._asked: tuple[int, Request] | None = None  # The keyframes when a calibration began, and what the worker got.
         self._worker: Worker | None = None
         self._known: deque[CalibrationMessage] = deque()
         self._replaying = False
 
     def expect(self, known: Iterable[CalibrationMessage]) -> None:
-        """Apply these calibrations of a journal when they are due. Until `begin`, start no new ones."""
+        """Apply each of these calibrations of a journal at its keyframe. Start no new ones until `begin`."""
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:
-        """Continue after the journal of a resumed session. A calibration that has not taken effect starts again."""
+        """Continue after the journal of a resumed session. Repeat a calibration that had begun but not been applied."""
         self._replaying = False
         if self._asked is not None:
             self._worker = Worker(self._asked[1])
@@ -106,9 +105,9 @@ class Calibrator:
             self._worker.close()
 
     def _ask(self, number: int) -> None:
-        """Begin a calibration of all keyframes. Nothing begins if no shared errors are estimated or there are no objects.
+        """Begin a calibration with all keyframes, if shared errors are to be estimated and there are objects.
 
-        The noise is not estimated here. It stays as in the settings until the end of the session.
+        The noise is not estimated. It stays as in the settings until the end of the session.
         """
         m = self._mapper.state
         found = collect(m, self._name, count_dropped=False)

@@ -1,4 +1,4 @@
-"""The keyframes and rays of a session as a log has them, and as a function of the errors that all measurements share."""
+"""Collects the keyframes and rays of a session in the form that offline mapping takes."""
 
 from dataclasses import dataclass, replace
 
@@ -16,13 +16,13 @@ from objslam.mapping.solution import seen_something
 
 @dataclass(frozen=True)
 class Collected:
-    """The data that a session has collected, in the form of offline mapping.
+    """The data of a session in the form of offline mapping.
 
-    keyframes: in time order, as measured. rays: the rays of the keyframes, as measured. association: of these rays. ids:
-    (N,) the session's ids of the objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths
-    and cameras. errors: the same keyframes and rays as a function of the shared errors, None if neither errors nor noise are
-    estimated. theta: (P,) the present values of the shared errors, as `corrections` returns them, None without errors. If
-    the session corrects an error but does not estimate it, the keyframes, rays and log are corrected already.
+    keyframes, rays: as measured, the keyframes in time order. association: of the rays. ids: (N,) the session's ids of the
+    objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths and cameras. errors: gives the
+    keyframes and rays for any values of the shared errors. None if neither errors nor noise are estimated. theta: (P,) the
+    present values of the errors, None without `errors`. An error that the session knows and does not estimate is already
+    corrected in keyframes, rays and log.
     """
 
     keyframes: Keyframes
@@ -40,7 +40,7 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
     """Collect the keyframes, the rays, the association and the estimate of a session. name: the name of the log.
 
     If there is a localisation, keyframes that it does not cover are left out, as in offline mapping. count_dropped: whether
-    they are counted. Tracks with enough rays become objects too, but a solve may leave them unresolved.
+    to count the left out keyframes and their boxes. Tracks with enough rays become objects too.
     """
     m.graph.refresh()
     k, r = m.keyframes, m.rays
@@ -88,7 +88,7 @@ def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> S
 
 
 def corrections(m: MapState, errors: SharedErrors) -> Floats:
-    """Return the present values (P,) of the errors. An error that the session does not correct has its expected value."""
+    """Return the present values (P,) of the errors. An error that the session does not correct yet gets its prior mean."""
     return np.array([m.errors.get(n, mean) for n, mean in zip(errors.names, errors.mean.tolist(), strict=True)])
 
 
@@ -98,7 +98,7 @@ def as_measured(m: MapState, rows: Ints) -> Keyframes:
 
 
 def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
-    """Return the rays in these rows (R,) before their correction. keyframe: (R,) index of each ray's keyframe."""
+    """Return the rays in these rows (R,) without corrections. keyframe: (R,) index of each ray's keyframe."""
     longer = 1 + m.errors.get("range_scale", 0.0)
     rays = offline_rays(m, rows, keyframe)
     direction = rays.direction
@@ -109,7 +109,7 @@ def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
 
 
 def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
-    """Return the rays in these rows (R,) as in offline mapping. keyframe: (R,) index of each ray's keyframe."""
+    """Return the rays in these rows (R,), corrected, as `Rays`. keyframe: (R,) index of each ray's keyframe."""
     names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
     columns = {name: getattr(m.rays, name)[rows] for name in names}
     _, bias = range_noise(columns["range"], m.camera_of_rays(rows), m.sent_cameras, m.given)
@@ -119,7 +119,7 @@ def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
 def recorded_log(m: MapState, name: str, keyframes: Keyframes) -> Log:
     """Return the paths and cameras of a session as received, without its detections.
 
-    keyframes: as they were measured. They give the poses of moving cameras.
+    keyframes: as measured. They give the mounts of cameras that move on the robot.
     """
     return Log(
         name=name,
@@ -140,7 +140,7 @@ def _mount(keyframes: Keyframes, camera: int) -> Trajectory | None:
 
 
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
-    """Return the object id (R,) of each ray, -1 if it has none, and the labels (N,) and positions (N, 3) by object id.
+    """Return the object id (R,) of each ray, -1 if it has none, and labels (N,) and positions (N, 3) indexed by object id.
 
     A landmark keeps its id. A track with enough rays gets an id above those of the landmarks.
     """

@@ -17,16 +17,16 @@ from objslam.live.mapper.localization import chain_keyframes
 from objslam.live.mapper.state import MapState
 
 _AT_ONCE = 400
-"""The most keyframes with which the corrected graph is solved at once. With more, it is rebuilt in slices and linearised
-again a few times. A larger number delays the next image for longer."""
+"""The most keyframes of a graph that is solved at once after its correction. A larger graph is rebuilt in slices, between
+frames. A larger number delays the next frame for longer."""
 _ITERATIONS = 8
-"""The most iterations of the solve at once. More iterations delay the next image for longer."""
+"""The most iterations of the solve after a correction. More iterations delay the next frame for longer."""
 
 
 def recalibrate(m: MapState, calibration: Calibration) -> None:
-    """Correct the errors of a calibration in the map. They replace the values of the same errors before.
+    """Correct the map by a calibration, whose values replace earlier values of its errors.
 
-    The new map depends only on the old map and on the calibration, so that a resumed session makes the same map.
+    The new map depends only on the old map and the calibration, so that a resumed session makes it again.
     """
     before = m.errors
     m.errors = before | dict(zip(calibration.names, calibration.values.tolist(), strict=True))
@@ -74,14 +74,14 @@ def _remeasure_keyframes(m: MapState) -> None:
 
 
 def _errors(m: MapState, log: Log, keyframes: Keyframes, rows: Ints) -> tuple[SharedErrors, Floats]:
-    """Return keyframes of a log as a function of the corrected errors, and the values (P,) of these errors."""
+    """Return the errors that the session corrects, for these keyframes of a log, and their present values (P,)."""
     names, theta = tuple(m.errors), np.array(list(m.errors.values()))
     none = offline_rays(m, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
     return SharedErrors(log, keyframes, none, m.given, names, theta, np.eye(len(names))), theta
 
 
 def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
-    """Correct the rays, which were corrected by the errors `before`. Return whether any ray may have changed."""
+    """Correct the rays by the new errors instead of the errors `before`. Return whether any ray may have changed."""
     rays, camera = m.rays, m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe)]
     longer = _ratio(m, before, "range_scale")
     focal = [_ratio(m, before, f"{one.name}.focal") for one in m.cameras]
@@ -99,8 +99,8 @@ def _ratio(m: MapState, before: dict[str, float], name: str) -> float:
 def _carried(m: MapState, drifted: Floats) -> Floats:
     """Return the drift (N + T, 6, 6) of landmarks and tracks on the corrected course.
 
-    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object gets the new drift of the first keyframe
-    whose old heading drift was at least that of the object.
+    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object gets the new drift of the keyframe at
+    which the old heading drift reached the object's.
     """
     order = m.time_order()
     passed = np.maximum.accumulate(drifted[order][:, 2, 2])
@@ -125,7 +125,7 @@ def _shift_times(m: MapState, times: Floats) -> None:
 
 
 def _move_start(m: MapState, before: Floats) -> None:
-    """Move the whole map with the first keyframe, and fix it there. before: (4, 4) its camera pose before the correction."""
+    """Move the whole map as the correction moved the first keyframe, and fix that keyframe. before: (4, 4) its old pose."""
     now = m.keyframe_arrays(np.zeros(1, dtype=np.int64)).map_T_camera[0]
     m.graph.drop_absolute()
     m.move(now @ inverse(before))
@@ -149,9 +149,9 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
 
 
 def _solve(m: MapState) -> None:
-    """Move the estimate to the corrected measurements, at once or over the next keyframes.
+    """Solve the graph with the corrected measurements. If it is large or the solve fails, rebuild it in slices.
 
-    The next full solve tests the rays again. Before that, they may still look like the rays of two objects.
+    Only the next full solve tests for outliers, because until then the rays of one object may look like those of two.
     """
     m.schedule.relinearise_soon()
     if len(m.keyframes) <= _AT_ONCE:

@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 _PATIENT = 600.0
 """The longest time, s, that a calibration may take. A larger value waits longer for a process that hangs."""
 _NICE = 10
-"""How much nicer than the session the process is, as in `os.nice`. A larger number slows the process down more."""
+"""The niceness of the process, added to the session's (`os.nice`). A larger number leaves more CPU time to the session."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
 class Request:
-    """The input of a calibration. errors: with the keyframes and rays. theta: (P,) the values at which the solve starts.
+    """The input of a calibration. The solve starts at the values theta (P,) of the errors and at the poses map_T_camera.
 
-    association: of the rays. map_T_camera: (K, 4, 4) poses of the keyframes at which the solve starts.
+    errors: gives keyframes and rays for any values of the errors. association: of the rays. map_T_camera: (K, 4, 4).
     """
 
     errors: SharedErrors
@@ -87,11 +87,11 @@ class Worker:
         return not self._thread.is_alive()
 
     def result(self) -> Calibration | None:
-        """Wait for the process, and return the calibration. None if there is none, or if the process failed."""
+        """Wait for the process, and return its calibration. None if the errors cannot be estimated or the process failed."""
         self._thread.join()
         if not self._answer:
             return None
-        found: Calibration | None = pickle.loads(self._answer)  # noqa: S301 - from this program itself
+        found: Calibration | None = pickle.loads(self._answer)  # noqa: S301 - this program wrote it
         return found
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ class Worker:
 def main() -> None:
     """Read a request from stdin, and write its calibration to stdout."""
     os.nice(_NICE)
-    request: Request = pickle.load(sys.stdin.buffer)  # noqa: S301 - from this program itself
+    request: Request = pickle.load(sys.stdin.buffer)  # noqa: S301 - this program wrote it
     answer = pickle.dumps(request.solve())
     sys.stdout.buffer.write(answer)
 

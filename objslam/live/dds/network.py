@@ -99,7 +99,7 @@ def _settings(interface: str | None) -> tuple[str, str]:
     if interface is None and os.environ.get(_URI):
         return _URI, os.environ[_URI]
     if interface in (None, LOOPBACK):
-        # A loopback interface may lack multicast. So participants look for each other at the ports of all indices.
+        # A loopback interface may lack multicast. So participants are searched for at the ports of all participant indices.
         peers = '<Peers><Peer address="127.0.0.1"/></Peers>'
         index = "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>99</MaxAutoParticipantIndex>"
         chosen = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces><AllowMulticast>false</AllowMulticast>'
@@ -137,7 +137,7 @@ def _keep_inside(sockets: set[int]) -> None:
             if own.type == socket.SOCK_DGRAM:
                 try:
                     own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
-                except OSError as error:  # Kernels before 5.7 need a privilege.
+                except OSError as error:  # Before Linux 5.7, this needs a privilege.
                     raise ObjslamError(
                         f"the DDS sockets cannot be bound to the loopback interface ({error.strerror})",
                         hint=f"open them to the network with --interface {AUTO}",
@@ -145,7 +145,7 @@ def _keep_inside(sockets: set[int]) -> None:
 
 
 def _listen(reading: int, unread: Counter[str]) -> None:
-    """Count the payloads that the library rejects when it checks their types. reading: the pipe with its log."""
+    """Count the payloads that the library rejects, from its log. reading: the file descriptor of a pipe with this log."""
     with os.fdopen(reading, errors="replace") as lines:
         for line in lines:
             if match := _FAILED.search(line):

@@ -13,8 +13,8 @@ from objslam.output.export.map_messages import MapMessages
 _TYPE = "tf2_msgs/msg/TFMessage"
 _QUEUE = 100  # The most transforms that wait for a slow subscriber, as in tf2. A larger number costs memory.
 _AHEAD = 0.2
-"""How far a transform is dated ahead of the newest pose, s. Localisers do so, because tf2 does not extrapolate. The
-transforms are 0.1 s apart, so 0.2 s bridge one late transform. With a larger value, an old correction is used for longer."""
+"""Each transform is dated this far ahead of the newest pose, s, because tf2 does not extrapolate. Transforms are 0.1 s
+apart, so 0.2 s bridge a late one. A larger value keeps an old transform in use for longer."""
 
 
 class TransformPublisher:

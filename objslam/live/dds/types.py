@@ -84,7 +84,7 @@ def _make_field(store: Typestore, description: Any, made: dict[str, type]) -> An
     from cyclonedds import idl
     from rosbags.interfaces import Nodetype
 
-    types: Any = idl.types  # It is untyped, because its generics are made at run time.
+    types: Any = idl.types  # Untyped, because its generics are made at run time.
     kind, detail = description
     if kind == Nodetype.NAME:
         return _make_struct(store, detail, made)

@@ -14,7 +14,7 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # How many mounts of a camera are kept. With more, its frames may arrive later. More cost memory.
+_MOUNTS = 4096  # The mounts that are kept for each camera. With more, frames may arrive later. More cost memory.
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class FrameView:
 class BearingExtractor:
     """Numbers cameras and labels in the order of arrival, and converts boxes to bearings, corrected for the shared errors.
 
-    The lists of cameras and labels are those of the map. New cameras and labels are appended to them.
+    It appends new cameras and labels to the lists of the map.
     """
 
     def __init__(self, m: MapState) -> None:

@@ -1,7 +1,7 @@
-"""The course of the robot: its path, joined from odometry and localisation, in the coordinate frame of the first pose.
+"""The course of the robot: odometry and localisation joined to one path, in the frame of its first pose (`start`).
 
-Localisation replaces missing odometry. A gap, or a change between the two, begins a new piece of the course. Localisation
-also places a new piece relative to the pieces before.
+Each of the two is a path, and gaps divide a path into stretches. The course is a chain of pieces. A piece is one stretch, or
+a localisation that replaces missing odometry. If possible, localisation also places a piece relative to earlier ones.
 """
 
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable, PathTable
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 
-_KEPT = 3.0  # The time beyond live.max_late for which poses are kept, s, for frames that wait in a queue. More costs memory.
+_KEPT = 3.0  # Poses are kept for live.max_late and this time, s, for frames in a queue. A larger value costs memory.
 _LOCALIZED = -1  # The stretch number of every pose from localisation, because all these poses share one coordinate frame.
 
 
@@ -27,9 +27,8 @@ _LOCALIZED = -1  # The stretch number of every pose from localisation, because a
 class Placed:
     """The pose of the robot at the stamp of an image, from the odometry or from the localisation.
 
-    piece: the number of the piece of the course. The path measures the motion between two images of one piece. map_T_base:
-    (4, 4) the pose as its path gives it, in the frame odom or map. start_T_base, drift: the pose (4, 4) and its accumulated
-    drift (6, 6) on the course.
+    piece: the number of the piece. The motion between two images of one piece is measured. map_T_base: (4, 4) the pose in
+    the frame of its path, odom or map. start_T_base: (4, 4) the pose on the course. drift: (6, 6) its accumulated drift.
     """
 
     by_odometry: bool
@@ -41,10 +40,10 @@ class Placed:
 
 @dataclass(frozen=True)
 class _Piece:
-    """One stretch of a path, placed on the course.
+    """A piece of the course.
 
-    stretch: the number of the stretch of the odometry, or _LOCALIZED. start_T_path: (4, 4) the first pose of the path on the
-    course. drift: (6, 6) what is added to the path's own drift, to get the drift on the course.
+    stretch: the number of the stretch of the odometry, or _LOCALIZED. start_T_path: (4, 4) places the first pose of the path
+    on the course. drift: (6, 6) is added to the path's own drift, to get the drift on the course.
     """
 
     stretch: int
@@ -55,8 +54,8 @@ class _Piece:
 class Course:
     """The paths of odometry and localisation, and the course that they form.
 
-    driven, localized: the whole odometry and localisation, as received. odometry, localization: the poses of the last
-    seconds. The odometry in it is corrected for its shared errors.
+    driven, localized: the whole odometry and localisation, as received. odometry, localization: their poses of the last
+    seconds, this odometry corrected for its shared errors.
     """
 
     def __init__(self, settings: Settings, correction: OdometryCorrection | None = None) -> None:
@@ -88,9 +87,9 @@ class Course:
     ) -> None:
         """Correct the odometry by new values of its errors, and move the pieces of the course and the keyframes accordingly.
 
-        errors: by name. corrected: the whole odometry, corrected by these errors. keyframes: all keyframes, with their new
-        stamps and their new map_T_base. Their start_T_base and drift change here. A piece that does not continue the frame
-        of the piece before keeps the pose of its first keyframe.
+        errors: by name. corrected: the whole odometry, corrected by these errors. keyframes: with their new stamps and
+        map_T_base. This function changes their start_T_base and drift. A piece that is placed anew, not in the frame of the
+        piece before, keeps the pose of its first keyframe.
         """
         said = self.driven.trajectory()
         self._correction = OdometryCorrection(errors, said, corrected)
@@ -139,11 +138,11 @@ class Course:
         )
 
     def ready(self, stamp: float) -> bool:
-        """Return whether later messages cannot change the result of `place` for a frame with this stamp.
+        """Return whether all poses that `place` needs for a frame with this stamp have arrived.
 
-        When the localisation continues for poses.max_gap without odometry, the localisation gives the pose of the frame. A
-        frame on a new piece of the odometry waits until the localisation reaches the start of the piece, or is behind the
-        odometry by more than poses.max_gap.
+        If the odometry has not reached the frame, the frame waits until the localisation has continued alone for
+        poses.max_gap, and has reached the frame. The first frame after a gap of the odometry waits until the localisation
+        reaches the end of the gap, or is more than poses.max_gap behind.
         """
         odometry, localization = self.odometry, self.localization
         if odometry.newest < stamp:
@@ -189,14 +188,14 @@ class Course:
             return _Piece(stretch, np.eye(4), np.zeros((6, 6)))
         old, goes_on = self._pieces[last.piece], path is self.odometry and last.by_odometry
         localized = np.flatnonzero(keyframes.localized & (keyframes.stamp <= stamp))
-        if goes_on and not len(localized):  # Without localisation the odometry counts across its gaps.
+        if goes_on and not len(localized):  # Without localisation, the odometry also gives the motion in its gap.
             return _Piece(stretch, old.start_T_path, old.drift)
         both = min(stamp, self.localization.newest)
         on, there = path.at(both), self.localization.at(both)
         if len(localized) and on is not None and there is not None and (path is self.localization or on.stretch == stretch):
             row = localized[keyframes.stamp[localized].argmax()]
             start_T_base = keyframes.start_T_base[row] @ inverse(keyframes.map_T_base[row]) @ there.pose
-            drift = 2 * last.drift - keyframes.drift[row]  # Relative to `last`, its error is the drift since the keyframe.
+            drift = 2 * last.drift - keyframes.drift[row]  # The drift of `last`, plus the drift from the keyframe to `last`.
             return self._lay(stretch, start_T_base, drift, path.from_start(on.pose), on.drift, self._noise)
         on = path.at(stamp)
         assert on is not None

@@ -17,12 +17,14 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # The largest distance to a candidate, per largest distance from which it was seen. More costs time.
-_NEAR = 10.0  # Up to this distance (m), a landmark is never too far to be a candidate. A larger distance costs time.
-_ROUGH = 3.0  # A prediction is rough if its image area is this many times that of a ray's noise. More removes fewer matches.
-_CLEAR = 6.0  # The least difference in cost of the two best rough candidates. A larger value leaves more boxes undecided.
-_WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value trusts more single boxes.
-_BY_LABEL = 4.0  # The factor on the gate if every label is one object. A larger factor keeps more rays after a drift.
+_BEYOND = 1.5  # Candidates are at most this factor times the largest observed distance away. A larger factor costs time.
+_NEAR = 10.0  # Landmarks in view and nearer than this (m) are always candidates. A larger distance costs time.
+_ROUGH = 3.0
+"""A candidate is rough if its uncertainty fills more than this many times the image area of a ray's noise. With a larger
+value, fewer candidates are rough."""
+_CLEAR = 6.0  # The least difference in cost of the two best candidates, if both are rough. More matches fewer rays.
+_WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value matches more boxes.
+_BY_LABEL = 4.0  # The gate is this factor wider if every label is one object. A larger factor keeps more rays after a drift.
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def match(
 ) -> Ints:
     """Return the index in `predicted` of the landmark or track of each ray (n,), -1 for a ray without one.
 
-    Long unseen tracks are excluded, unless the camera pose in the map is certain. Long unseen landmarks must be compatible
+    `long_unseen` tracks are excluded, unless the camera pose in the map is certain. Long unseen landmarks must be compatible
     with each other (`jointly_compatible`). map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. labels:
     number of labels. gate: share of the right matches that pass the gate. landmark_of_track: id of the last landmark of each
     detector track. novelty: recent share of boxes without a landmark.
@@ -89,7 +91,7 @@ def match(
         again = Landmarks(places[at], own[at], noises[at], accepts[at])
         unknown = unknown_density(some, rows[at], predicted, novelty)
         sure = back[jointly_compatible(some, again, uncertainty.against(to[at], then[at]), map_T_camera, unknown)]
-        if len(sure) < len(back):  # Assign again, to unseen landmarks only by the matches that passed.
+        if len(sure) < len(back):  # Assign again. Long unseen landmarks may only get the rays that proved compatible.
             keep = ~unseen[edges.landmark] | (np.isin(edges.ray, sure) & (chosen[edges.ray] == edges.landmark))
             chosen = _best(_some(edges, keep), cost[keep], count, len(places), unmatched)
     return np.where(chosen >= 0, rows[chosen], -1)
@@ -150,7 +152,7 @@ def _possible(
 
 
 def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
-    """Return the candidate of each ray (n,), or -1, such that the total cost is least, as `best_assignment` for one frame.
+    """Return the candidate of each ray (n,), or -1, such that the total cost is least.
 
     cost: (E,) of the edges, which may be negative. rays, places: the numbers of rays and of candidates. unmatched: the cost
     of a ray without a candidate.
@@ -167,9 +169,10 @@ def _some(edges: Edges, keep: Bools) -> Edges:
 
 
 def _clear(edges: Edges, sigma: Floats, to: Floats, landmark: Bools) -> Edges:
-    """Remove ambiguous or too uncertain matches of roughly predicted landmarks. `loop_closure` can find them later.
+    """Remove matches with rough landmarks (_ROUGH) if they are ambiguous (_CLEAR) or too uncertain (_WIDEST).
 
-    sigma: (n,) rad, of the rays. to: (m, 3) m from the camera to each candidate. landmark: (m,) False for a track.
+    Loop closure may match these landmarks later. sigma: (n,) rad, of the rays. to: (m, 3) m from the camera to each
+    candidate. landmark: (m,) False for a track.
     """
     rough = (edges.vague > 2 * np.log(_ROUGH)) & landmark[edges.landmark]
     if not rough.any():

@@ -7,16 +7,16 @@ from objslam.live.mapper.localization import chain_keyframes
 from objslam.live.mapper.state import MapState
 
 _NEWEST = 1 / 3  # The newest keyframes that stay, as a share of live.max_keyframes. A larger share removes more old ones.
-_OLDEST = 1 / 30  # The oldest keyframes that stay, as a share of live.max_keyframes. They relate the map to the start.
+_OLDEST = 1 / 30  # The oldest keyframes that stay, as a share of live.max_keyframes. They tie the map to its start.
 _SHARE = 0.25  # The share of live.max_keyframes that one culling removes. With more, culling is rarer and takes longer.
 _AGAIN = 0.1  # The new keyframes before the next culling, as a share of live.max_keyframes. With more, culling is rarer.
 _ENOUGH = 10  # The rays that every landmark keeps. A larger number keeps more keyframes and more certain landmarks.
-_LEAST = 3  # The rays that every landmark keeps if _ENOUGH keeps too many keyframes. Three rays fix a position.
-_CROWDED = 1.2  # The factor on live.max_keyframes above which landmarks keep _LEAST rays. A larger factor costs memory.
+_LEAST = 3  # The rays that every landmark keeps if too many keyframes stay (_CROWDED). Three rays still fix a position.
+_CROWDED = 1.2  # If _ENOUGH keeps more than this times live.max_keyframes, _LEAST applies. A larger value costs memory.
 
 
 def cull_keyframes(m: MapState) -> None:
-    """Remove old keyframes, if the map has more than live.max_keyframes, first where the keyframes are closest together.
+    """Remove old keyframes if there are more than live.max_keyframes. Begin where they are closest together.
 
     One call never removes two consecutive keyframes. The motions before and after a removed keyframe become one motion. The
     next culling waits for some new keyframes (_AGAIN).

@@ -7,7 +7,7 @@ import numpy as np
 from objslam.config import Live
 from objslam.core.arrays import Floats
 
-_STANDING = 10  # The keyframes of all cameras while they stand still. More average the detector's noise, and cost time.
+_STANDING = 10  # The most keyframes of one stop, without new labels. More average the detector's noise, and cost time.
 
 
 class KeyframeSelector:
@@ -40,7 +40,7 @@ class KeyframeSelector:
         self._last[camera] = start_T_camera
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, the count restarts."""
+        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, the stop has ended."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0

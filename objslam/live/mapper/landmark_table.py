@@ -14,10 +14,10 @@ from objslam.live.mapper.tables import GrowingTable, column
 from objslam.live.mapper.tracks import Track
 
 _FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
-_HELD = 1e-4  # The information (m^-2) added to each landmark. Parallel rays give none along them. More makes it too certain.
+_HELD = 1e-4  # Information (m^-2) that keeps covariances of parallel rays finite. A larger value makes them too small.
 _INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
 _NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
-_FURTHER = 1.1  # A landmark is expected up to this factor times its largest observed distance. More counts more misses.
+_FURTHER = 1.1  # A landmark is expected up to this factor times its `far`. A larger factor counts more misses.
 _NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has this id, and -1 means no landmark.
 
 
@@ -26,8 +26,8 @@ class LandmarkTable(GrowingTable):
 
     position: m, in map. information: m^-2, from the rays. drift: odometry drift at the last observation. first, last:
     stamps, s, of the first and last observation. label: number. seen: number of frames that showed the landmark. expected:
-    number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared deviations
-    of its rays, in variances. rejected: number of its rays outside the gate.
+    number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared normalised
+    residuals of its rays, clipped. rejected: number of its rays outside the gate.
     """
 
     id: Ints = column(np.int64)
@@ -45,20 +45,20 @@ class LandmarkTable(GrowingTable):
 
 
 def noise(landmarks: LandmarkTable, rows: Ints) -> Floats:
-    """Return the factor (n,) on the nominal noise of the rays of each landmark."""
+    """Return the factor (n,) on the nominal noise of the rays of each landmark, from their residuals."""
     seen = landmarks.seen[rows] + POOLED_WITH_PROMISE
     return np.sqrt((landmarks.squared[rows] / 2 + POOLED_WITH_PROMISE) / seen).clip(*NOISE_FACTORS)
 
 
 def covariances(landmarks: LandmarkTable, rows: Ints) -> Floats:
-    """Return the covariances (n, 3, 3), m^2, of landmarks by their rays alone, as if all camera poses were known."""
+    """Return the covariances (n, 3, 3), m^2, of landmarks, as if all camera poses were known exactly."""
     return np.linalg.inv(landmarks.information[rows] + _HELD * np.eye(3)) + _FLOOR**2 * np.eye(3)
 
 
 def in_view(
     landmarks: LandmarkTable, camera: Camera, map_T_camera: Floats, margin: float = _INNER, reach: float = 0.0
 ) -> Bools:
-    """Return which landmarks (N,) a camera should see, by their pixels and by the distances from which they were seen.
+    """Return which landmarks (N,) a camera should see: those inside its image, not much further away than ever observed.
 
     map_T_camera: (4, 4). margin: the share of the image along its edge that is excluded. A negative margin extends the
     image. reach: m, the distance up to which every landmark should be seen.

@@ -13,13 +13,13 @@ from objslam.live.mapper.landmark_table import in_view
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
-_JUMP = np.radians(2.0)  # The residual (rad) above which the map relinearises soon. With a larger one, it settles later.
-_TRACKS = 4096  # The detector tracks whose landmark is stored. With more, a track id is recognised after a longer absence.
+_JUMP = np.radians(2.0)  # The residual (rad) above which the graph relinearises soon. A larger one relinearises more rarely.
+_TRACKS = 4096  # The detector tracks whose landmark is stored. With more, a track id is known after a longer absence.
 
 
 @dataclass(frozen=True)
 class LandmarkUpdate:
-    """The observations of the newest keyframe, which is in the graph.
+    """The observations of the newest keyframe, when they are in the graph.
 
     rays: all rays of its frame. matched: (m,) the indices of rays with a landmark. rows: (m,) the rows of their landmarks
     in the table. tracks: all tracks with a ray of the frame.
@@ -32,7 +32,7 @@ class LandmarkUpdate:
 
 
 def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
-    """Count the landmarks that the newest keyframe shows or should show, and update those that it shows by its rays."""
+    """Count which landmarks the newest keyframe should show and which it shows. Update the latter by its rays."""
     landmarks, keyframes, rays, rows = m.landmarks, m.keyframes, update.rays, update.rows
     pose = m.graph.pose(int(keyframes.id[-1]))
     seen = in_view(landmarks, m.cameras[keyframes.camera[-1]], pose)

@@ -37,7 +37,7 @@ def localize(m: MapState) -> bool:
         m.graph.add_absolute(k, localizations(one, m.settings, k, planar)[0])
         if first:
             moved = True
-            if len(np.unique(m.keyframes.piece)) > 1:  # With localisation, motions across gaps of the odometry do not count.
+            if len(np.unique(m.keyframes.piece)) > 1:  # Motions across gaps of the odometry are no longer needed.
                 chain_keyframes(m)
             m.graph.rebuild()
     m.localization.pending = left
@@ -47,8 +47,8 @@ def localize(m: MapState) -> bool:
 def chain_keyframes(m: MapState) -> None:
     """Connect consecutive keyframes by their motion. The caller must rebuild the graph.
 
-    If the odometry did not measure a motion, a weak factor takes its place. If the later keyframe and some
-    keyframe before it are localised, there is no factor, because absolute poses relate the two.
+    If the odometry did not measure a motion, a weak factor replaces it. No factor is needed if the later keyframe and some
+    earlier keyframe are localised, because their absolute poses relate the two.
     """
     k, order = m.keyframes, m.time_order()
     every = m.keyframe_arrays(order)

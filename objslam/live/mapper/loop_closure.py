@@ -17,15 +17,15 @@ from objslam.live.mapper.landmark_update import merge_landmarks, remove_landmark
 from objslam.live.mapper.pose_uncertainty import gathered, long_unseen
 from objslam.live.mapper.state import MapState
 
-_ANCHORS = 3  # The past keyframes that are tried as the start of the loop. More keyframes take longer.
-_NEAR = 0.25  # The correction (m) below which landmarks merge without a solve. A larger value leaves more to iSAM2.
-_TURNED = 0.05  # The heading correction (rad) below which landmarks merge without a solve. More leaves more to iSAM2.
+_ANCHORS = 3  # How many past keyframes are tried as the start of the loop. More keyframes take longer.
+_NEAR = 0.25  # A correction above this (m) bends the path before landmarks merge. A larger value leaves more to iSAM2.
+_TURNED = 0.05  # A heading correction above this (rad) bends the path before landmarks merge, as one above _NEAR.
 _AROUND = 6.0  # Other landmarks within this radius (m) of recognised ones match again. Cameras see about as far in a hall.
-_ERA = 15.0  # The most time (s) between the last sights of recognised landmarks and of those _AROUND. With more, more match.
+_ERA = 15.0  # Landmarks _AROUND match again if seen within this time (s) of the recognised ones. A longer time matches more.
 _ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
-_BENT = 0.02  # The error (m) of the corrected path, added to the noise of rays. A larger error accepts more rays.
+_BENT = 0.02  # The assumed error (m) of the corrected path, added to the noise of rays. A larger error accepts more rays.
 
 
 def close_loop(m: MapState) -> None:
@@ -70,7 +70,7 @@ def _recognise(m: MapState, one: Ints, two: Ints, possible: Bools, newest: int) 
 def _planar(m: MapState, before: int, now: int) -> Floats:
     """Return a fast upper bound (3, 3) on the covariance of x, y (m) and yaw (rad) between keyframes in two rows.
 
-    It is the smaller of two bounds: by the drift between the two, and by the uncertainty of the newest pose in the map.
+    It is the smaller of two bounds: the drift between the keyframes, and the uncertainty of the newest pose in the map.
     """
     k = m.keyframes
     turn = np.kron(np.eye(2), m.graph.pose(int(k.id[now]))[:3, :3])
@@ -111,7 +111,10 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 
 
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
-    """Give landmarks around rows `old` (P,) the drift of the earliest one in rows `now` (P,), so that they match again."""
+    """Let the landmarks around those in rows `old` (P,) match rays again, although they are long unseen.
+
+    They get the drift of the first seen landmark in rows `now` (P,), as if they had been last seen with it.
+    """
     landmarks = m.landmarks
     drift = landmarks.drift[now[np.argmin(landmarks.first[now])]]
     since = gathered(drift, landmarks.drift)
@@ -123,7 +126,10 @@ def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
 
 
 def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Distribute the correction over the path, merge rows `now` (P,) into `old` (P,), and solve or restore the map."""
+    """Distribute the correction over the path, merge rows `now` (P,) into `old` (P,), and solve the map.
+
+    If too few rays are inliers after that, restore the old map.
+    """
     landmarks, k, rays = m.landmarks, m.keyframes, m.rays
     m.graph.refresh()
     saved = m.graph.save()

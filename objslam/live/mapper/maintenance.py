@@ -21,21 +21,21 @@ from objslam.live.mapper.track_promotion import AGREE, SLACK, fit_if_observable
 from objslam.mapping.labels import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
-_GROWING = 3  # The keyframe of each period at which tracks and keyframes are dropped. Not _CLOSING, to spread the delay.
-_CLOSING = 6  # The keyframe of each period after which landmarks are merged and removed.
-_BREATH = 2  # The period of early relinearisations, in keyframes. With a larger period, the map settles later.
+_GROWING = 3  # The keyframe of each period after which tracks and keyframes are dropped and all rays are tested.
+_CLOSING = 6  # The keyframe of each period after which landmarks are merged and removed. Not _GROWING, to spread delay.
+_BREATH = 2  # The period of relinearisations after a large change, in keyframes. A larger period settles the map later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
-_GROWTH = 1.5  # The growth of the number of keyframes between full solves. A larger factor keeps first errors for longer.
+_GROWTH = 1.5  # A full solve follows when keyframes have grown by this factor. A larger one keeps early errors longer.
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
-_LARGE = 400  # The number of keyframes above which a rebuild in slices replaces the full solve. More delay the next frame.
+_LARGE = 400  # With more keyframes, a rebuild in slices replaces the full solve. A larger number delays the next frame more.
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
 _VISITS = 6
-"""The least number of changes between inliers and outliers that shows two objects of a label. A drifted path gives one run
-of outliers. A larger number keeps one object for longer."""
+"""The least number of changes between inliers and outliers, in time order, that shows two objects of a label. Drift makes
+one run of outliers, so two changes. A larger number needs more visits to both objects."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
-_AROUND = 0.15  # The border around the image, as a share of the image. A wider border prepares the graph for more landmarks.
-_USUAL = 0.75  # The quantile of the landmarks' `far` up to which any of them may be seen soon. More prepares more landmarks.
+_AROUND = 0.15  # The camera may soon see this share of the image beyond its edge. A larger share prepares more landmarks.
+_USUAL = 0.75  # Any landmark may be seen from this quantile of all landmarks' `far`. A larger value prepares more landmarks.
 
 
 def maintain(m: MapState) -> None:
@@ -43,7 +43,7 @@ def maintain(m: MapState) -> None:
     m.graph.continue_rebuild()
     number, schedule = m.next_id.keyframe, m.schedule
     due = number % _EVERY == 0 or (schedule.relinearisations > 0 and number % _BREATH == 0)
-    relinearise = due and not m.graph.is_rebuilding  # A rebuild linearises at the current estimate anyway.
+    relinearise = due and not m.graph.is_rebuilding  # A rebuild relinearises anyway.
     if relinearise:
         schedule.relinearisations = max(0, schedule.relinearisations - 1)
     m.graph.prepare(_coming(m), relinearise)
@@ -60,7 +60,7 @@ def maintain(m: MapState) -> None:
 
 
 def _coming(m: MapState) -> Ints:
-    """Return the ids (n,) of the landmarks that the camera of the newest keyframe sees, or may see soon."""
+    """Return the ids (n,) of the landmarks that the camera of the newest keyframe should see, or may see soon."""
     landmarks, keyframes = m.landmarks, m.keyframes
     if not len(landmarks.id):
         return landmarks.id
@@ -70,9 +70,9 @@ def _coming(m: MapState) -> Ints:
 
 
 def _polish_if_grown(m: MapState) -> None:
-    """If the graph has grown by `_GROWTH`, solve it and test all rays again.
+    """If the graph has grown by `_GROWTH`, solve it, and test which rays are outliers.
 
-    A large graph is not solved. It is rebuilt in slices, as a small one is if its rays changed.
+    If the graph is large, it is rebuilt in slices instead of solved. If the test changes rays, it is also rebuilt.
     """
     if m.next_id.keyframe < max(_FIRST, _GROWTH * m.schedule.solved) or not len(m.landmarks):
         return
@@ -92,7 +92,8 @@ def _polish_if_grown(m: MapState) -> None:
 def _reconsider(m: MapState) -> bool:
     """Reject rays that are outliers now, restore rejected rays that are inliers now, and return whether any ray changed.
 
-    If every label is one object, a landmark with few inliers is triangulated again. A label with two objects ends this mode.
+    While every label is one object (`by_label`), a landmark with few inliers is triangulated again. If the rays of a label
+    show two objects, `by_label` becomes False.
     """
     rays, landmarks = m.rays, m.landmarks
     m.graph.refresh()
@@ -128,7 +129,7 @@ def _reconsider(m: MapState) -> bool:
 def _two_of_a_label(m: MapState, obs: Observations, row: Ints, support: Bools) -> bool:
     """Return whether the rays (R,) of some landmark show two objects.
 
-    They do if they alternate between inliers and outliers, and the outliers fit one point. The rays are in time order. row:
+    They do if inliers and outliers alternate (_VISITS), and the outliers fit one point. obs: the rays, in time order. row:
     (R,) the row of each ray's landmark. support: (R,) which rays are inliers.
     """
     against = np.bincount(row[~support], minlength=len(m.landmarks))
@@ -149,7 +150,7 @@ def _forget_tracks(m: MapState) -> None:
 
 
 def _merge_duplicates(m: MapState) -> None:
-    """Merge near landmarks of one label like `duplicates.merge_unseen_together`, but with fast bounds on covariances."""
+    """Merge near landmarks of one label that no or few frames show together, if they are probably one object (`_one`)."""
     landmarks = m.landmarks
     if len(landmarks) < 2:
         return
@@ -177,9 +178,9 @@ def _merge_duplicates(m: MapState) -> None:
 
 
 def _one(way: Floats, spread: Floats, density: float) -> bool:
-    """Return whether two landmarks are one object. way: (3,) m, from one to the other. spread: (3, 3) m^2, its covariance.
+    """Return whether two landmarks are one object, and not two neighbours.
 
-    density: landmarks of the label per m^2 of the map.
+    way: (3,) m, from one to the other. spread: (3, 3) m^2, the covariance of `way`. density: landmarks of the label per m^2.
     """
     squared = float(way @ np.linalg.solve(spread, way))
     area = 2 * np.pi * np.sqrt(np.linalg.det(spread[:2, :2]))
@@ -187,7 +188,7 @@ def _one(way: Floats, spread: Floats, density: float) -> bool:
 
 
 def _drifted(m: MapState, rows: Ints) -> Floats:
-    """Return an upper bound (3, 3) on the covariance between two landmarks, from the drift between their observations."""
+    """Return an upper bound (3, 3), m^2, on the covariance that drift adds to the way between two landmarks."""
     k, landmarks = m.keyframes, m.landmarks
     newest = int(np.argmax(k.stamp))
     pose = m.graph.pose(int(k.id[newest]))

@@ -46,7 +46,7 @@ class Mapper:
         self._extractor = BearingExtractor(self.state)
         self._selector = KeyframeSelector(settings.live)
         self._predictor = PosePredictor(self.state)
-        self._predicted: PredictedLandmarks | None = None  # For the next frame. None after the map has changed.
+        self._predicted: PredictedLandmarks | None = None  # For the next keyframe. None if the map has moved since.
 
     def feed(self, message: Message) -> None:
         """Process a pose, a camera or a mount. Other messages change nothing."""
@@ -65,7 +65,7 @@ class Mapper:
             self._extractor.add_mount(message)
 
     def is_ready(self, stamp: float) -> bool:
-        """Return whether later messages cannot change the pose of a frame with this stamp on the course."""
+        """Return whether all poses for a frame with this stamp have arrived (`Course.ready`)."""
         return self.state.course.ready(stamp)
 
     def corrected_stamp(self, frame: FrameMessage) -> float:
@@ -95,7 +95,7 @@ class Mapper:
             return None
         prediction = self._predictor.predict(before, stamp, placed, view.base_T_camera, start_T_camera)
         pose = prediction.map_T_camera
-        if not shown:  # A frame without boxes is evidence against the landmarks in view, but it is no keyframe.
+        if not shown:  # A frame without boxes only counts against the landmarks in view.
             m.landmarks.expected[in_view(m.landmarks, m.cameras[view.camera], pose)] += 1
             return None
         self._selector.accept(view.camera, start_T_camera, shown)

@@ -8,17 +8,17 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.rotation import skew
 
 HORIZON = 0.06
-"""The heading drift (rad, one sigma) above which a landmark counts as long unseen. It moves a landmark at 5 m by 0.3 m,
-which may be the distance to a neighbour. A larger drift trusts single boxes for longer."""
-_PLACED = 0.1  # The sigma (m) of the camera position below which old tracks match again. A larger value matches more.
+"""A landmark is long unseen if the heading has drifted by more than this (rad, one sigma) since the last sight. This drift
+moves a landmark at 5 m by 0.3 m, perhaps onto a neighbour. With a larger value, single boxes match for longer."""
+_PLACED = 0.1  # The sigma (m) of the camera position below which long unseen tracks match. A larger value matches more.
 
 
 @dataclass(frozen=True)
 class PoseUncertainty:
     """The uncertainty of the camera pose of a frame, in rad and m, rotation first.
 
-    drift: (6, 6) covariance that the odometry has accumulated, on the course. camera_from_drift: (6, 6) adjoint from the
-    course to the camera frame. pose: (6, 6) covariance of the pose in map, in the camera frame. It is NaN if unknown.
+    drift: (6, 6) covariance that the odometry has accumulated, in the frame of the course. camera_from_drift: (6, 6) adjoint
+    from that frame to the camera frame. pose: (6, 6) covariance of the pose in map, in the camera frame, NaN if unknown.
     """
 
     drift: Floats
@@ -34,7 +34,7 @@ class PoseUncertainty:
     def of_landmarks(self, to: Floats, then: Floats, map_T_camera: Floats) -> Floats:
         """Return the covariances (n, 3, 3), m^2, that the camera pose adds to landmarks relative to the camera.
 
-        Each is the smaller of two covariances: by the drift since the landmark was seen, and by the pose in the map.
+        Each is the smaller of two covariances: from the drift since the landmark was seen, and from the pose in the map.
         to: (n, 3) m from the camera to each landmark, in map. then: (n, 6, 6) drift when each landmark was last seen.
         """
         turn = map_T_camera[:3, :3]
@@ -50,8 +50,8 @@ class PoseUncertainty:
     def against(self, to: Floats, then: Floats) -> Floats:
         """Return the covariance (6, 6) of the camera pose relative to several landmarks together, in the camera frame.
 
-        It is the smaller of the drift since the longest unseen landmark and the covariance of the pose in the map. to, then:
-        as in `of_landmarks`.
+        It is the smaller of two: the drift since the longest unseen landmark was seen, and that of the pose in the map. to:
+        (n, 3) m from the camera to each landmark. then: (n, 6, 6) drift when each landmark was last seen.
         """
         oldest = then[np.trace(then, axis1=1, axis2=2).argmin()]
         since = self.camera_from_drift @ gathered(self.drift, oldest[None])[0] @ self.camera_from_drift.T
@@ -69,7 +69,7 @@ def gathered(now: Floats, then: Floats) -> Floats:
 
 
 def long_unseen(now: Floats, then: Floats) -> Bools:
-    """Return which objects (n,) are long unseen, because the heading drift since then is above HORIZON.
+    """Return which objects (n,) are long unseen (HORIZON).
 
     now: (6, 6) current drift. then: (n, 6, 6) drift when each object was last seen.
     """

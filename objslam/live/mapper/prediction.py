@@ -12,17 +12,17 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""The keyframes between two slow queries of the covariance. Between two queries, the odometry adds to the covariance. More
-keyframes make it larger."""
+"""Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is added
+to it, which overestimates it. A larger number overestimates it more."""
 
 
 @dataclass(frozen=True)
 class PosePrediction:
     """The predicted camera pose (4, 4) of a frame in map, and its uncertainty.
 
-    camera_T_start: (4, 4) start of the course in the camera frame. motion: id of the previous keyframe, motion (4, 4) from
-    its camera, and covariance (6, 6) of the motion in the new camera frame. It is None without a previous keyframe, or if
-    only localisation gives the pose.
+    camera_T_start: (4, 4) start of the course in the camera frame. motion: the id of the previous keyframe, the motion
+    (4, 4) from its camera to the new one, and the covariance (6, 6) of this motion in the new camera frame. None without a
+    previous keyframe, or if the pose is from localisation.
     """
 
     map_T_camera: Floats
@@ -89,7 +89,7 @@ class PosePredictor:
         return self._covariances[keyframe]
 
     def _motion_floor(self, base_T_camera: Floats) -> Floats:
-        """Return `odometry.motion_floor` of a mount. It is cached for the last mount."""
+        """Return `odometry.motion_floor` (6, 6) of a mount, from a cache of one mount."""
         mount, planar, floor = self._floor
         on_plane = self._state.course.odometry.planar
         if mount is not base_T_camera or planar != on_plane:

@@ -35,9 +35,9 @@ class NextIds:
 
 @dataclass
 class LocalizationState:
-    """The state of the localisation. received: the number of its poses. pending: ids of keyframes that wait for its pose.
+    """The state of the localisation. pending: the ids of the keyframes that wait for a localised pose.
 
-    planar: whether all its poses so far lie in one plane.
+    received: the number of poses so far. planar: whether all of them lie in one plane.
     """
 
     received: int = 0
@@ -49,8 +49,8 @@ class LocalizationState:
 class PairEvidence:
     """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
-    together: number of frames with both landmarks. apart: for a pair that was tested and not merged, the number of frames
-    with its less seen landmark at the test, divided by 5. When this has changed, the pair is tested again.
+    together: the number of frames that showed both landmarks. apart: only for pairs that were tested and not merged: a fifth
+    of the frames that had shown the less seen landmark. Once this number has grown, the pair is tested again.
     """
 
     together: Counter[tuple[int, int]] = field(default_factory=Counter)
@@ -66,9 +66,9 @@ class PairEvidence:
 class MaintenanceSchedule:
     """When the maintenance tasks last ran.
 
-    solved, culled: the number of keyframes at the last full solve, and at the last culling. relinearisations: the number of
-    early relinearisations still to do. compared: ids of the recently seen landmarks and number of the long unseen ones at
-    the last search for loops, None before the first search.
+    solved, culled: the number of keyframes at the last full solve, and at the last culling. relinearisations: how many early
+    relinearisations remain. compared: the input of the last search for loops, None before the first: the ids of the recently
+    seen landmarks, and the number of long unseen ones.
     """
 
     solved: int = 0
@@ -91,9 +91,10 @@ class MapState:
     exponential average over about 50 frames. pose_covariance: (6, 6) of the newest keyframe's predicted pose, in its camera
     frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
     the course. rng: seeded by the settings.
-    given, settings: the settings before and after the noise of the odometry is scaled by its errors. sent_cameras, cameras:
-    the cameras as received, and without their errors. errors: by name, the errors that are corrected in all measurements.
-    calibration: the last estimate of these errors, None without one.
+
+    errors: the shared errors that are corrected in all measurements, by name. calibration: their last estimate, None without
+    one. given: the settings as given. settings: with odometry noise that is scaled by the errors. sent_cameras: as received.
+    cameras: corrected.
     """
 
     settings: Settings
@@ -134,7 +135,7 @@ class MapState:
         return np.argsort(self.keyframes.stamp, kind="stable")
 
     def keyframe_arrays(self, rows: Ints) -> Keyframes:
-        """Return the keyframes in these rows (n,) as in offline mapping."""
+        """Return the keyframes in these rows (n,) as `Keyframes`."""
         k = self.keyframes
         localized, reckoned = bool(k.localized.any()), bool(k.by_odometry[rows].any())
         return Keyframes(
@@ -161,8 +162,7 @@ class MapState:
     def bearings(self, at: Ints) -> Bearings:
         """Return the rays in rows (n,) for the graph.
 
-        The range noise includes the bias that the ranges of a landmark share. It grows with their number, because a bias
-        does not average out.
+        The ranges of a landmark share a bias, which does not average out. So the noise of each grows with their number.
         """
         rays = self.rays
         sigma = rays.range_sigma[at]
@@ -190,7 +190,7 @@ class MapState:
         self.read_positions()
 
     def move(self, new_T_old: Floats) -> None:
-        """Move the whole map by a pose (4, 4). Before, the caller must remove the factors of absolute poses."""
+        """Move the whole map by a pose (4, 4). The caller must first remove the factors of absolute poses."""
         self.graph.move(new_T_old)
         turn, landmarks = new_T_old[:3, :3], self.landmarks
         landmarks.position[:] = landmarks.position @ turn.T + new_T_old[:3, 3]
@@ -204,6 +204,6 @@ class MapState:
                 track.move(new_T_old)
 
     def tell_apart_within_labels(self) -> None:
-        """Allow several objects of one label, and drop the tracks whose rays have only the label in common."""
+        """Allow several objects per label, and drop the tracks that were grouped by label alone."""
         self.by_label = False
         self.tracks = [track for track in self.tracks if not track.by_label]

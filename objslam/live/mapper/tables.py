@@ -10,8 +10,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.types import Trajectory
 
 _MOST_POSES = 131_072
-"""The number of poses of a path above which some are dropped: 11 minutes at 200 Hz. A larger number keeps old paths finer,
-and takes 136 bytes a pose."""
+"""The number of poses of a path above which some are dropped: 11 minutes at 200 Hz. A larger number keeps long paths finer,
+for 136 bytes per pose."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
 
@@ -21,7 +21,7 @@ def column(kind: DTypeLike, *shape: int) -> Any:
 
 
 class GrowingTable:
-    """A table. Each column is an attribute, an array (n, *shape) with one entry per row, which may be changed in place.
+    """A table. Each column is an attribute: an array (n, *shape) with one entry per row. Entries may be changed in place.
 
     Subclasses declare columns with `column`. `add` and `keep` replace all arrays.
     """
@@ -71,9 +71,8 @@ class GrowingTable:
 class PathTable(GrowingTable):
     """The poses of a path in the order of their stamps, as the robot sent them.
 
-    Above _MOST_POSES, some are dropped, evenly over time, so that a long session takes little memory. The time between the
-    poses that stay is always shorter than a gap. If this leaves too many poses, the limit doubles. max_gap: s, the shortest
-    gap.
+    Above _MOST_POSES, some are dropped, evenly over time, to save memory. No new gap may arise, so the limit doubles if too
+    many poses must stay. max_gap: s, the shortest time between two poses that is a gap.
     """
 
     stamp: Floats = column(np.float64)
@@ -94,7 +93,7 @@ class PathTable(GrowingTable):
         return Trajectory(self.stamp.copy(), self.pose.copy()) if len(self) else None
 
     def _thin(self) -> None:
-        """Keep one pose in each period, and the poses at gaps. The period doubles each time, up to a quarter of a gap."""
+        """Keep one pose per period, and the poses at gaps. The period at least doubles each time, up to max_gap / 4."""
         usual = (self.stamp[-1] - self.stamp[0]) / len(self)
         self._spacing = min(max(2 * self._spacing, 2 * usual), self._widest)
         period = np.floor((self.stamp - self.stamp[0]) / self._spacing)
@@ -108,7 +107,7 @@ class KeyframeTable(GrowingTable):
     """The keyframes in the order of arrival, with columns as in `types.Keyframes` and `course.Placed`.
 
     camera_T_start: the start of the course in the camera frame. localized: whether map_T_base is from the localisation.
-    sent, mount: stamp and base_T_camera as received. stamp and base_T_camera are corrected by the shared errors.
+    stamp, base_T_camera: corrected for the shared errors. sent, mount: the same two as received.
     """
 
     id: Ints = column(np.int64)

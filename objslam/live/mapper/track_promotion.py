@@ -16,18 +16,18 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
 AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share makes landmarks later, and fewer false ones.
-SLACK = 0.02  # The assumed error (m) between poses of one stretch. A larger one accepts rays that pass a point less closely.
-_AGREE_BY_LABEL = 0.5  # The share of inliers for rays with only the label in common. A larger share makes landmarks later.
-_AGAIN = 1.2  # The growth factor of the rays or the spread after which a track is tried again. A smaller factor costs time.
-_EARLY = 0.4  # The share of joint.min_parallax_deg that suffices if the position is certain. More makes landmarks later.
-_SURE = 0.05  # A position is certain if its sigma is below this share of its distance. More makes more false landmarks.
+SLACK = 0.02  # The assumed error (m) between camera poses of one track. With a larger one, more rays are inliers.
+_AGREE_BY_LABEL = 0.5  # AGREE for tracks that were grouped by label alone. A larger share makes landmarks later.
+_AGAIN = 1.2  # A track is tried again when its rays or its spread have grown by this factor. A smaller factor costs time.
+_EARLY = 0.4  # This share of joint.min_parallax_deg suffices if the position is certain. A larger share delays landmarks.
+_SURE = 0.05  # A position with a sigma below this share of its distance is certain. A larger share accepts more false ones.
 _MOST_TRACKS = 150  # The most tracks. Each track is predicted and matched in every frame, so more tracks take longer.
 
 
 def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
     """Turn the tracks whose rays are sufficient into landmarks, and return the other tracks.
 
-    The triangulation takes as long as an association. The graph adds the landmarks at its next update.
+    The graph adds the landmarks at its next update.
     """
     rest: list[Track] = []
     for track in tracks:
@@ -62,7 +62,7 @@ def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
 
 
 def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> PointFit | None:
-    """Return the position of a track's object if `fit_if_observable` finds one. A failed track must grow first."""
+    """Return the position of a track's object if `fit_if_observable` finds one. If not, the track must grow (_AGAIN)."""
     live, rays = settings.live, len(track.rays)
     unchanged = rays < _AGAIN * track.tried and track.spread < _AGAIN * track.tried_spread
     if rays < live.min_rays or unchanged:
@@ -78,11 +78,10 @@ def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: 
 def fit_if_observable(
     obs: Observations, least: int, share: float, settings: Settings, rng: np.random.Generator, early: bool = False
 ) -> PointFit | None:
-    """Triangulate rays in map. Return None if there are too few inliers, the position is uncertain, or the parallax is low
-    without ranges.
+    """Triangulate rays in map, or return None.
 
-    least: least number of inliers. share: least share of inliers. early: whether less parallax suffices if the position is
-    certain.
+    It is None if fewer inliers than `least` or a smaller share of inliers than `share` is found, if the position is
+    uncertain, or if the parallax is low without ranges. early: whether less parallax suffices if the position is certain.
     """
     fit = fit_point(obs, rng, SLACK)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:
@@ -99,8 +98,8 @@ def fit_if_observable(
 def prune_tracks(m: MapState) -> None:
     """Remove and count the tracks above the limit.
 
-    Labels with most tracks lose tracks first. Within a label, tracks with fewer than live.min_rays rays go first, and among
-    equals the longest unseen ones.
+    The labels with the most tracks lose tracks first. Of one label, tracks with fewer than live.min_rays rays go first, then
+    the longest unseen ones.
     """
     if len(m.tracks) <= _MOST_TRACKS:
         return

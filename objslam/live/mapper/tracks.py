@@ -11,11 +11,11 @@ from objslam.association.refinement import refine_damped
 from objslam.core.arrays import Floats, Ints
 from objslam.graph.isam2 import IncrementalGraph
 
-_DEPTH = 2.5  # The assumed distance (m) of an object seen from one place only, about the middle of a room.
-_DEPTH_SIGMA = 2.0  # The standard deviation (m) of a track along its last ray. A larger value relies more on the rays.
-_DAMPING = 1e-3  # The information (m^-2) of a track's previous position in all directions. More makes it move less.
+_DEPTH = 2.5  # The first guess of a track's distance (m) without a range: about the middle of a room.
+_DEPTH_SIGMA = 2.0  # The prior's sigma (m) of a track along its last ray. With a larger one, rays move the track more.
+_DAMPING = 1e-3  # The prior's information (m^-2) in all directions. With more, rays move the track less.
 _STEPS = 3  # The Gauss-Newton steps from a track's previous position, which is near. More steps take longer in every frame.
-_RECENT = 30  # The newest rays that define a track's position. More rays average more noise over a longer drift.
+_RECENT = 30  # The newest rays that define a track's position. More rays average noise better, but span more drift.
 _LONGEST = 200  # The most rays of a track. Above it, every second ray of the older half goes. More cost memory and time.
 
 TrackRay = tuple[int, int, Floats, float, float, float]
@@ -26,11 +26,10 @@ TrackRay = tuple[int, int, Floats, float, float, float]
 class Track:
     """The rays of one object that is not a landmark yet.
 
-    label: its number. by_label: whether its rays were grouped by label alone. Such a track is not dropped when it is long
-    unseen. first, last: stamps, s, of its first and last observation. drift: (6, 6) odometry drift at the last observation.
-    position, covariance: (3,) m and (3, 3) m^2 in map, from the camera poses at the time of each ray. spread: rad, the
-    widest angle between a ray and the first ray. tried, tried_spread: the number of rays and the spread at the last attempt
-    to make a landmark.
+    label: the number of its label. by_label: whether its rays were grouped by label alone. first, last: stamps, s, of its
+    first and last observation. drift: (6, 6) odometry drift at the last observation. position, covariance: (3,) m and (3, 3)
+    m^2 in map, from the camera poses at the time of each ray. spread: rad, the widest angle between a ray and the first ray.
+    tried, tried_spread: the number of rays and the spread at the last attempt to make a landmark.
     """
 
     id: int
@@ -88,7 +87,7 @@ class Track:
         self.realign(graph)
 
     def realign(self, graph: IncrementalGraph) -> None:
-        """Place its rays at the current camera poses of the graph, after these poses have moved."""
+        """Place its rays at the current camera poses of the graph."""
         obs = self.sight(graph)
         lines = np.column_stack([obs.origin, obs.direction, obs.sigma, obs.range, obs.range_sigma])
         self._lines = list(lines[-_RECENT:])
@@ -104,7 +103,7 @@ class Track:
 
 
 def update_positions(tracks: Sequence[Track]) -> None:
-    """Triangulate the newest rays of every track in one batch, with a weak prior on the distance along the last ray."""
+    """Triangulate the newest rays of all tracks in one batch, with their previous positions as weak priors."""
     if not tracks:
         return
     number = np.array([len(t._lines) for t in tracks])

@@ -11,7 +11,7 @@ from objslam.core.geometry import interpolate, inverse
 from objslam.core.types import Trajectory
 from objslam.frontend.odometry_drift import add_step, gathered_drift
 
-_PLANAR = 1e-6  # The tolerance (m, rad) of a planar path, as in `geometry.is_planar`. A larger value accepts more paths.
+_PLANAR = 1e-6  # The tolerance (m, rad) of a planar path. A larger value accepts more paths.
 
 
 class OnPath(NamedTuple):

@@ -26,8 +26,8 @@ class Boxes:
 
     stamp: s. frame: the camera's tf frame, "" if unknown. arrived: the time of arrival, s, by any clock. boxes: (B, 4), raw
     px. points: centre and corners (5, 3) of a tag, m, in the camera frame, by the index of the box that is computed from
-    them. size: (width, height) of the image, px, None if unknown. whole: as in `types.Detections`. image: (H, W, 3) uint8
-    BGR, None if not available.
+    them. size: (width, height) of the image, px, None if unknown. whole: True if no box is cut off at the image's edge.
+    image: (H, W, 3) uint8 BGR, None if not available.
     """
 
     topic: str

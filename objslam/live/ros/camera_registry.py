@@ -98,7 +98,7 @@ class Cameras:
         self.settle(boxes.arrived)
 
     def settle(self, now: float) -> None:
-        """Push the boxes whose cameras are now known. Drop boxes that waited too long. now: as `Boxes.arrived`, s."""
+        """Push the boxes whose cameras are now known. Drop boxes that waited too long. now: s, on the clock of `arrived`."""
         still: deque[Boxes] = deque()
         held: set[str] = set()
         for boxes in self._waiting:

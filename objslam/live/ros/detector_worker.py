@@ -25,7 +25,7 @@ _FAILED, _ENDED = "image that the detector failed on", "image that arrived after
 class DetectorWorker:
     """Runs a detector on offered images, and delivers its boxes.
 
-    For each topic, only the newest image waits. While it waits, the detector finishes at most one image of each topic.
+    For each topic, only the newest image waits. The topics take turns.
     """
 
     def __init__(self, detector: Detector, clock: Callable[[], float] = time.monotonic) -> None:
@@ -47,9 +47,8 @@ class DetectorWorker:
         """Take an image message without blocking. stamp: s."""
         with self._ready:
             ended = self._ended
-            late = self._waiting.get(
-                topic
-            )  # The newer image keeps its place. At the end of the queue it might never be next.
+            # The newer image takes the place of the older one. At the end of the queue it might never be next.
+            late = self._waiting.get(topic)
             full = late is None and len(self._waiting) >= _MAX_TOPICS
             if not full and not ended:
                 self._waiting[topic] = message, stamp

@@ -122,7 +122,7 @@ class RosMessages:
             self.ledger.warn(message)
 
     def _takes(self, role: str, source: str) -> bool:
-        """Return whether a source is used for a role: the one that the user chose, else the first to arrive."""
+        """Return whether a source is used as odometry or localization: the one that the user chose, else the first one."""
         if self.sources.setdefault(role, source) == source:
             return True
         if source != TF:
@@ -208,7 +208,7 @@ class RosMessages:
             self._sink.push_localization(stamp, self._tf.at(world, base, stamp))
 
     def _news(self, top: str, base: str) -> float | None:
-        """Return the newest stamp, s, of the transform top_T_base. None if it is not new or all transforms are static."""
+        """Return the newest stamp, s, of top_T_base in tf. None if it has not changed, or if all transforms are static."""
         before, self._tf_stamp = self._tf_stamp, self._tf.newest(top, base)
         return None if self._tf_stamp == before else self._tf_stamp
 

@@ -24,8 +24,8 @@ class TopicChoice:
     def wanted(self, offered: Mapping[str, str], messages: RosMessages, settled: bool) -> set[str]:
         """Return the wanted topics. offered: the types of all topics, by name.
 
-        settled: whether probably all topics are known. Then one topic is chosen for the odometry, by the shortest name, and
-        one for the images, as `_colour` sorts them, unless the user chose. A warning names the other topics that fit.
+        settled: whether probably all topics are known. Only then, if the user did not choose, one topic is chosen for the
+        odometry (the shortest name) and one for the images (`_colour`). A warning names the other topics that fit.
         """
         names = sorted(offered, key=lambda name: (len(name), name))
         picked = {name for name in names if self._plain(name, offered[name])}

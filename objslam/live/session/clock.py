@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
-_SURE = 5  # The older poses in a row that show that the clock was set back. A larger number is surer, but slower.
-_BACK = 0.5  # The least step back, s, that shows a clock set back. A pose that is back by less counts as late.
-_LEAP = 60.0  # The least step ahead that a second pose must confirm, s. With a larger one, a wrong stamp does more harm.
-_KEPT = 8  # The most earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
-_MISSED = 0.005  # The assumed time between the poses around a change of the clock, s. It is a period of odometry at 200 Hz.
+_SURE = 5  # The clock was set back if this many poses in a row are older than the path. A larger number is surer but slower.
+_BACK = 0.5  # A pose older than the path by less than this, s, is only late. A larger value ignores larger steps back.
+_LEAP = 60.0  # A stamp this far ahead, s, must be confirmed by the next pose. A larger value accepts more wrong stamps.
+_KEPT = 8  # The earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
+_MISSED = 0.005  # The assumed time, s, from the last pose before a step back to the next: a period of odometry at 200 Hz.
 
 
 @dataclass
@@ -27,10 +27,10 @@ class Clock:
     _shifts: list[float] = field(default_factory=list)  # Earlier values of `shift`, the newest last.
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """Return a new pose's stamp in session time, or None, and whether the clock was set back.
+        """Return a new pose's stamp in session time, None if the pose is refused, and whether the clock was set back.
 
-        The stamp is None for a pose that is late or repeated, and for the first poses after the clock was set back, which
-        look late. It is also None for a pose that leaps ahead, unless the previous pose leapt to about the same time.
+        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too. A pose that
+        leaps ahead is refused, unless the previous pose leapt to about the same time.
         """
         time = stamp + self.shift
         if self.newest + _LEAP < time and math.isfinite(self.newest):
@@ -56,7 +56,7 @@ class Clock:
         return self.newest, True
 
     def place(self, stamp: float, oldest: float, latest: float) -> float:
-        """Return a stamp that does not set the clock, in session time. oldest, latest: session time, s.
+        """Return a stamp in session time, and leave the clock as it is. oldest, latest: session time, s.
 
         The newest shift that puts the stamp between `oldest` and `latest` is used. If none does, the present one is used.
         """
@@ -67,7 +67,7 @@ class Clock:
 
 
 class Lead:
-    """Chooses the path whose stamps set the clock. path: this leading path, None before the first pose.
+    """Chooses the path whose stamps set the clock. path: the chosen path, None before the first pose.
 
     The odometry leads. The localisation leads before the first odometry, and when it continues for max_gap, s, without
     odometry.
@@ -81,10 +81,10 @@ class Lead:
         self.path: PathKind | None = None
 
     def choose(self, path: PathKind, at: float) -> bool:
-        """Update the leading path for a new pose of a path. at: its session time, s. Return whether the pose may be used.
+        """Choose again for a new pose of a path, and return whether the pose may be used. at: session time of the pose, s.
 
-        A path that leads again continues from its own newest stamp. If a localisation leaps far ahead, a second one in a row
-        must confirm that the odometry is silent, because the stamp of a single one may be wrong.
+        A path that leads again continues from its own newest stamp. A single localisation whose stamp leaps far ahead is
+        refused, because the stamp may be wrong. The next one confirms that the odometry is silent.
         """
         silent = at > self._odometry_until + self._max_gap
         if path != self.path and (path == "odometry" or self.path is None or silent):

@@ -58,7 +58,7 @@ class FrameQueue:
         while self._waiting and self._mapper.is_ready(self._waiting[0][0]):
             worked = True
             stamp, _, frame, came = self._waiting.pop(0)
-            # If the clock of a camera is behind, its frames wait longer for their poses.
+            # If a camera's clock is behind, its frames have to wait longer for their poses, so their limit is longer.
             limit = self._limit + max(0.0, stamp - frame.stamp)
             if measured and not self._patient and time.perf_counter() - came > limit:
                 self._counters.drop_frame(frame, _RARE_POSES if arrival - came > limit else TOO_SLOW)

@@ -27,17 +27,17 @@ from objslam.sources.journal.records import (
     PoseMessage,
 )
 
-_JUMP = 0.1  # The allowed step, m, beyond the distance at live.max_speed. A larger value takes more restarts for motion.
-_TURN = 0.3  # The allowed turn, rad, beyond the turn by _TURNS_PER_M. A larger value takes more restarts for motion.
-_TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value takes more restarts for motion.
-_ZERO = 0.05  # After a gap, an odometry pose below this size, m and rad, is a restart. A larger value detects more restarts.
-_FAR = 0.1  # The least size of the pose before the gap, m or rad, for _ZERO. A larger value takes more restarts for motion.
+_JUMP = 0.1  # A step longer by this, m, than live.max_speed allows is a restart. A larger value misses more restarts.
+_TURN = 0.3  # A turn larger by this, rad, than _TURNS_PER_M allows is a restart. A larger value misses more restarts.
+_TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
+_ZERO = 0.05  # After a gap, odometry nearer to 0 than this, m and rad, is a restart. A larger value finds more restarts.
+_FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or rad. A larger value finds fewer restarts.
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _WAIT = 2.0
-"""If a stamp leads the path by more than this, s, earlier shifts of the clock are tried. A larger value takes more stamps
-from before a change of the clock for new ones."""
+"""A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
+larger value misses more of these stamps."""
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 _ALONE = "with a stamp far ahead, which the next one did not confirm yet"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
@@ -47,9 +47,10 @@ class Intake:
     """A `Sink` that checks messages and delivers the valid ones.
 
     It converts stamps to session time, in which the stamps of the path always increase. After a restart of the robot's
-    odometry, it converts the new poses, so that they continue the old path. The thread that pushes calls deliver(message,
-    arrival), for one message at a time. arrival: s, by `time.perf_counter`. `deliver` returns whether it accepts the
-    message, and counts what it refuses.
+    odometry, it converts the new poses, so that they continue the old path.
+
+    deliver(message, arrival): takes one message at a time, in the thread that pushes. arrival: s, by `time.perf_counter`. It
+    returns whether it accepts the message, and counts the refused ones.
     """
 
     def __init__(self, settings: Settings, counters: Counters, deliver: Callable[[Message, float], bool]) -> None:
@@ -58,8 +59,8 @@ class Intake:
         self._clock = Clock()
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
-        self._stamps: dict[str, dict[float, None]] = {}  # By camera, in the order of arrival.
-        self._start_T_odom = np.eye(4)  # The present frame of the robot's odometry in that of its first odometry.
+        self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
+        self._start_T_odom = np.eye(4)  # From the odometry's frame since its last restart to its first frame.
         self._last: dict[PathKind, PoseMessage] = {}
         self._lead = Lead(self._clock, settings.poses.max_gap)
 
@@ -198,7 +199,7 @@ class Intake:
             return True
 
     def _place(self, stamp: float) -> float:
-        """Return the session time of a stamp that does not set the clock."""
+        """Return the session time of a mount, of a frame, or of a pose on the path that does not set the clock."""
         return self._clock.place(stamp, self.newest - self._settings.live.max_late, self.newest + _WAIT)
 
     def _continuous(self, at: float, odom_T_base: Floats) -> Floats:

@@ -22,9 +22,9 @@ _FEW = 60  # The most rays that give the parallax of an object, as the widest an
 def describe_landmark(m: MapState, row: int, position: Floats, covariance: Floats, *, from_graph: bool = False) -> MapObject:
     """Describe the landmark in a row of `m.landmarks`, at a position (3,) m with a covariance (3, 3) m^2.
 
-    If its residuals are larger than their sigmas, the covariance grows with their mean square. The box offsets are added.
-    from_graph: whether the covariance includes the drift of the map. If it is too large, the covariance relative to the last
-    keyframe that saw the landmark then decides whether the landmark is resolved.
+    If the mean square of its normalised residuals is above 1, it multiplies the covariance. Box offsets are added.
+    from_graph: whether the covariance includes the drift of the map. If it is then too large, the landmark is still resolved
+    if its covariance relative to the last keyframe that saw it is small.
     """
     landmarks, rays, j = m.landmarks, m.rays, int(m.landmarks.id[row])
     mine = np.flatnonzero((rays.owner == j) & rays.used)
@@ -90,9 +90,9 @@ def _rms_deg(obs: Observations, position: Floats) -> float:
 
 
 def _offsets(m: MapState, at: Ints, obs: Observations, position: Floats, extent: Floats) -> Floats:
-    """Return the covariance (3, 3), m^2, that the box offsets add to a position. The settings give the offsets' share.
+    """Return the covariance (3, 3), m^2, that box offsets (rays.box_sigma) add to the position (3,), m, of an object.
 
-    at: the rows of the object's rays. obs: these rays in the map.
+    at: the rows of its rays. obs: these rays in the map. extent: (2,) m, its width and height.
     """
     share = m.settings.rays.box_sigma
     if share == 0:

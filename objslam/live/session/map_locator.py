@@ -27,14 +27,14 @@ _EVERY, _AT = 10, 9
 """The period of the search in keyframes, and the keyframe in each period. A longer period finds the map later. The keyframe
 differs from those of the maintenance, to spread the delay."""
 _MOST = 40
-"""The most landmarks of a search, the last seen ones. With more, a smaller share of them must be in the prior map,
-and a frame waits longer. A search of 40 in a map of 1,000 objects takes 0.1 s."""
+"""A search compares at most this many landmarks, the last seen ones. More delay the next frame for longer: 40 landmarks in a
+map of 1,000 objects take 0.1 s."""
 _GROWTH = 1.2
 """A search with the same landmarks is repeated when the number of keyframes has grown by this factor, because the landmarks
 are more exact by then. A larger factor searches more rarely."""
 _SAME_PLACE = 0.5
-"""Two registrations agree if they move the middle of the same landmarks to places that are at most this far apart, m. A
-larger value keeps a wrong place for longer."""
+"""A new registration replaces the old one if it moves the middle of the matched landmarks by more than this, m. A larger
+value keeps a wrong place for longer."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class MapLocator:
 
     def __init__(self, known: PriorMap | None, mapper: Mapper, counters: Counters) -> None:
         self._known, self._mapper, self._counters = known, mapper, counters
-        if known is not None:  # The landmarks of a session are where rays meet, and not the centres of bodies.
+        if known is not None:  # Landmarks are where rays meet. Objects of a map may be at the centres of bodies instead.
             self._known = replace(known, objects=at_ray_points(known.objects))
         self._last: _Search | None = None
         self._matched: dict[int, int] = {}  # By id of a landmark: the index of its object in the prior map.
@@ -82,7 +82,7 @@ class MapLocator:
     def in_map(self, snapshot: Snapshot) -> Snapshot:
         """Return a snapshot with `told`, and in the frame of the prior map if the session is tied to one.
 
-        Objects that the prior map has get their ids there. The ids of the other objects are raised by its first free id.
+        Matched objects get their ids in the prior map. The first free id of the prior map is added to all other ids.
         """
         frame = map_T_graph(self._mapper.state.graph)
         snapshot = replace(snapshot, in_map=self.told)
@@ -159,7 +159,7 @@ class MapLocator:
 def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
     """Return the resolved landmarks in these rows, and their covariances (n, 3, 3), m^2, in the graph.
 
-    The covariances are relative to the newest keyframe, because the drift until then is the same error for all landmarks.
+    The covariances are relative to the newest keyframe, because earlier drift moves all landmarks alike.
     """
     newest = int(m.keyframes.id[m.keyframes.stamp.argmax()])
     m.graph.refresh()

@@ -30,10 +30,10 @@ from objslam.sources.journal.records import CalibrationMessage, FrameMessage, Me
 
 _MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
 _IDLE = 0.05
-"""The longest sleep of the idle thread, s. A snapshot is also made if no frame came for this time. A larger value makes
+"""The longest sleep of the thread, s. If no frame came for this time, a requested snapshot is made. A larger value makes
 snapshots later."""
 _SHORT = 0.015  # If the last messages took less than this, s, a snapshot follows at once. A larger value delays more frames.
-_LONG = 0.5  # If a caller waits longer than this, s, a snapshot follows any frame. A larger value makes snapshots later.
+_LONG = 0.5  # If a caller waits longer, s, a snapshot follows even slow frames. A larger value makes snapshots later.
 _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 
@@ -155,7 +155,10 @@ class Session(Intake):
                 self.counters.ledger.warn(str(error))
 
     def _enqueue(self, message: Message, arrival: float) -> bool:
-        """Put a message into journal and queue, or into neither. A note is only journalled. Return whether accepted."""
+        """Put a message into journal and queue, or into neither, and return whether it was accepted.
+
+        A note, which stores the state of the clock and of the odometry's frame, only goes into the journal.
+        """
         with self._changed:
             if self._stopping:
                 self.counters.drop("messages after the end of the session")
@@ -167,7 +170,7 @@ class Session(Intake):
             if self._journal is not None:
                 try:
                     self._journal.write(message)
-                except OutputError as error:  # The message is too long. Disk errors only end the journal.
+                except OutputError as error:  # The message is too long. A disk error is not raised, but ends the journal.
                     self.counters.drop(f"messages that could not be written to the journal: {error.message}")
                     return False
             if not note:

@@ -23,9 +23,9 @@ class Describer:
     """Describes the objects of a map, and keeps each description until its object is seen again."""
 
     def __init__(self) -> None:
-        # Of each landmark by id: its rays and its last stamp, s, when it was described, and the description.
+        # By landmark id: the number of its rays and its last stamp, s, when it was described, and the description.
         self._described: dict[int, tuple[tuple[int, float], MapObject]] = {}
-        # Of each track by id: its number of rays when it was described, and the description.
+        # By track id: the number of its rays when it was described, and the description.
         self._waiting: dict[int, tuple[int, MapObject]] = {}
         self._tied = False  # Whether the covariances of the descriptions are relative to a prior map.
 
@@ -67,8 +67,8 @@ class Describer:
     def _covariance(self, m: MapState, j: int) -> Floats:
         """Return the covariance (3, 3), m^2, of landmark j, along the axes of the session.
 
-        It is relative to the prior map, if the session is tied to one. If it is not, or if that covariance is unknown, it is
-        relative to the frame of the session.
+        It is relative to the prior map if the session is tied to one and this covariance is known. Else it is relative to
+        the frame of the session.
         """
         covariance = covariance_in_map(m.graph, j) if self._tied else np.full((3, 3), np.nan)
         return covariance if np.isfinite(covariance).all() else m.graph.point_covariance(j)
@@ -82,7 +82,7 @@ class Describer:
 
 
 def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) -> Snapshot:
-    """Return a snapshot of a map. lag: as in `Snapshot`, s. whole: as in `Describer.map`."""
+    """Return a snapshot of a map. lag: `Snapshot.lag`, s. whole: ignore the time budget of the descriptions."""
     return Snapshot(
         stamp=float(m.keyframes.stamp.max()) if len(m.keyframes) else np.nan,
         map=describer.map(m, whole),
@@ -107,7 +107,7 @@ def _path(m: MapState) -> Trajectory:
 
 
 def _map_T_odom(m: MapState) -> Floats | None:
-    """Return `Snapshot.map_T_odom`. The odometry is the received one, with its errors, as tf has no other."""
+    """Return `Snapshot.map_T_odom` (4, 4) for the odometry as received, which tf has. None in a gap of the odometry."""
     k, driven = m.keyframes, m.course.driven
     if not len(k) or not len(driven):
         return None

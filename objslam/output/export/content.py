@@ -16,7 +16,7 @@ from objslam.results.read import load_map, load_motions, load_trajectory
 _SEMI_MAJOR = 6_378_137.0  # This is the semi-major axis of the WGS 84 ellipsoid, m.
 _FLATTENING = 1 / 298.257223563  # This is the flattening of the WGS 84 ellipsoid.
 _E2 = _FLATTENING * (2 - _FLATTENING)  # This is the squared eccentricity of the WGS 84 ellipsoid.
-_ROUNDS = 6  # A latitude takes this many iterations. Each divides the error by 150, so 2 suffice near the ground.
+_ROUNDS = 6  # The iterations of a latitude. Each divides the error by 150, so 2 suffice near the ground, and 6 anywhere.
 
 
 @dataclass(frozen=True)

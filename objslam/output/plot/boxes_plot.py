@@ -1,4 +1,4 @@
-"""Draw the boxes of a detector on a photo, with their labels on plates that avoid each other."""
+"""Draw the boxes of a detector on a photo, with labels on plates (filled rectangles) that avoid each other."""
 
 from collections.abc import Sequence
 

@@ -33,7 +33,7 @@ def blank(width: int, height: int) -> Image:
 
 
 def draw_segments(image: Image, ends: Floats, colour: Colour, opacity: float) -> None:
-    """Draw segments (n, 2, 2), px, 1 px wide (Wu 1991). Where k of them overlap, (1 - opacity)^k of the image is left."""
+    """Draw segments (n, 2, 2), px, 1 px wide (Wu 1991). Where k overlap, (1 - opacity)^k of the image shows through."""
     height, width = image.shape[:2]
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     cover = np.zeros(height * width)
@@ -46,8 +46,8 @@ def draw_segments(image: Image, ends: Floats, colour: Colour, opacity: float) ->
 
 
 def _pixels_of(ends: Floats, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Floats]]:
-    """Yield x, y and the cover, in [0, 1], of the pixels of segments (n, 2, 2), px, in portions. Each step of 1 px along a
-    segment covers two pixels beside each other."""
+    """Yield, in batches, the pixels x, y that segments (n, 2, 2), px, touch, and the covered share of each pixel. A segment
+    touches two neighbouring pixels per px of its length."""
     along = ends[:, 1] - ends[:, 0]
     steep = np.abs(along[:, 1]) > np.abs(along[:, 0])
     ends = np.where(steep[:, None, None], ends[..., ::-1], ends)  # the first coordinate grows faster
@@ -96,7 +96,7 @@ def _dashes(points: Floats, dash: float, gap: float, size: tuple[int, int]) -> l
     begin, way = points[:-1], np.diff(points, axis=0)
     piece = np.linalg.norm(way, axis=1)
     length = np.append(0.0, np.cumsum(piece))
-    with np.errstate(divide="ignore", invalid="ignore"):  # a piece along an axis never meets the edges beside it
+    with np.errstate(divide="ignore", invalid="ignore"):  # a piece parallel to an edge divides by 0
         meets = np.sort(
             np.nan_to_num([-begin / way, (np.array(size) - begin) / way], nan=0.0, posinf=2.0, neginf=-2.0), axis=0
         )
@@ -175,7 +175,7 @@ def encode_png(image: Image) -> bytes:
     few = Picture.fromarray(np.ascontiguousarray(image[..., ::-1])).quantize(
         256, method=Picture.Quantize.FASTOCTREE, dither=Picture.Dither.NONE
     )
-    # The method makes white a shade darker. The first pixel is paper, so its colour becomes white again.
+    # `quantize` makes white a shade darker. The first pixel is background, so its palette entry is set back to white.
     palette, paper = few.getpalette() or [], int(np.asarray(few)[0, 0])
     palette[3 * paper : 3 * paper + 3] = [255, 255, 255]
     few.putpalette(palette)

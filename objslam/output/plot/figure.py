@@ -16,7 +16,7 @@ Colour = tuple[float, float, float]
 @dataclass(frozen=True)
 class Segments:
     """Thin segments (n, 2, 2), m. The more of them overlap, the darker they are. opacity: of one segment, in [0, 1]. name:
-    as in `Line`."""
+    in the legend, "" for no entry."""
 
     ends: Floats
     colour: Colour
@@ -26,7 +26,7 @@ class Segments:
 
 @dataclass(frozen=True)
 class Line:
-    """A line through points (n, 2), m. width: px. name: of the legend's entry, empty without one."""
+    """A line through points (n, 2), m. width: px. name: in the legend, "" for no entry."""
 
     points: Floats
     colour: Colour
@@ -37,8 +37,8 @@ class Line:
 
 @dataclass(frozen=True)
 class Marks:
-    """Marks of one size (px) at points (n, 2), m. rim: the colour of the rim of a dot. name: as in `Line`. turn: rad, the
-    direction in which a triangle points, counterclockwise from the right."""
+    """Marks of one size (px) at points (n, 2), m. rim: the colour of the rim of a dot. name: in the legend, "" for no entry.
+    turn: rad, the direction in which a triangle points, counterclockwise from the right."""
 
     points: Floats
     kind: Literal["dot", "cross", "triangle"]
@@ -60,7 +60,7 @@ class Area:
 
 @dataclass(frozen=True)
 class Label:
-    """A text in the box (4,) x1, y1, x2, y2, px of the map's area. leader: (2, 2) px, a line to its dot, None without."""
+    """A text in the box (4,) x1, y1, x2, y2, px of the map's area. leader: (2, 2) px, a line to its dot, or None."""
 
     text: str
     colour: Colour

@@ -7,7 +7,7 @@ from objslam.core.arrays import Bools, Floats
 _ANGLES = np.linspace(0, 2 * np.pi, 24, endpoint=False)  # Candidate positions of a label lie in these directions, rad.
 _RADII = np.array([9.0, 15.0, 24.0, 38.0, 56.0, 80.0, 110.0, 145.0, 185.0])
 """The candidate positions of a label lie at these distances, px, from its dot. A larger distance costs more."""
-_DOT = 6.0  # No label covers the square around a dot. Half the side of this square has this length, px.
+_DOT = 6.0  # Half the side, px, of the square around a dot that no label covers.
 _PAD = 2.0  # Labels keep this distance, px, from each other.
 _CROWDED = 60.0  # Dots within this distance, px, crowd a dot. The labels of the most crowded dots are placed first.
 _FAR = 14.0  # A label gets a leader line if it is farther than this, px, from its dot.
@@ -78,7 +78,7 @@ def _candidates(anchor: Floats, size: Floats) -> tuple[Floats, Floats]:
 def _counts(points: Floats, frame: Floats) -> Floats:
     """Return the number of points (P, 2) below and left of each corner of the pixels of an area: a summed-area table.
 
-    A picture of hundreds of objects has 100,000 points to avoid. Compared one by one with the candidates, they take minutes.
+    With this table, `_covered` is fast. Testing each of 100,000 points, as of hundreds of objects, would take minutes.
     """
     edges = [np.arange(np.floor(low), np.ceil(high) + 2) for low, high in frame.T]
     table = np.histogram2d(points[:, 0], points[:, 1], edges)[0]

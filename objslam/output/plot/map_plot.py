@@ -53,9 +53,7 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     margin = 0.07 * float((high - low).max()) + 0.05
     low, high = low - margin, high + margin
     scale = _LONG_SIDE / float((high - low).max())
-    wider = (
-        np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
-    )  # a narrow map has room at its sides
+    wider = np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
     low, high = low - wider, high + wider
     below, dots = _objects(result, plane, points)
     shapes = [*_rays(result, plane), *_paths(result, plane), *below]
@@ -184,8 +182,8 @@ def _footprint(o: MapObject, body: Body) -> Floats:
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge towards it, and the distance (F,) between
-    both, all in m."""
+    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
+    between both, all in m."""
     centre, half = (low + high) / 2, (high - low) / 2
     at = centre + (points - centre) * (_EDGE / (np.abs(points - centre) / half).max(axis=1, initial=1e-9))[:, None]
     return at, np.linalg.norm(points - at, axis=1)

@@ -1,4 +1,4 @@
-"""The cards of the page: what it says and draws of each object."""
+"""The cards of the page: what the page shows of each object."""
 
 import re
 from dataclasses import dataclass
@@ -65,9 +65,9 @@ def make_cards(
 ) -> list[Card]:
     """Return the cards, sorted by label and id. The times on a card count from the first ray of the result, s.
 
-    rays: all rays of the result. crops: the pictures by the id of the object. errors: by the same id, the distance from the
-    matching true object, m, and a text that names this object. path: (K, 3) positions of the robot, m in map. up: the axis
-    of the map that points up.
+    rays: all rays of the result. crops: the pictures by object id. errors: by object id, the distance from the matching true
+    object, m, and a text that names the true object. path: (K, 3) positions of the robot, m in map. up: the axis of the map
+    that points up.
     """
     begin, end = (float(rays.stamp.min()), float(rays.stamp.max())) if len(rays) else (0.0, 0.0)
     residual_deg = np.degrees(rays.residual)

@@ -156,7 +156,7 @@ def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None)
 
 
 def _evaluation(out: Path) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:
-    """Return the error, m, and the match, as text, of each matched object by id. Return also the content of evaluation.json.
+    """Return, by id of each matched object, its error, m, and a text that names its match. Return also evaluation.json.
 
     If this file does not exist, this function compares the map with the ground truth as `objslam eval` does by default. If
     there is no ground truth either, there are no errors, and the content is None.

@@ -75,9 +75,9 @@ def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoin
 
 
 def look_at(target: Floats, back: Floats, distance: float, up: Up = "z") -> ViewPoint:
-    """Return the view point at a distance, m, from a target (3,), m in map. `back` (3,): from there to the view point.
+    """Return the view point at a distance, m, from a target (3,), m in map.
 
-    up: the axis of the map that points up.
+    back: (3,) the direction from the target to the view point. up: the axis of the map that points up.
     """
     axes = _axes(back, up_vector(up))
     return ViewPoint(target - distance * axes[2], target, axes, _VIEW[1] / 2 / np.tan(_FOV / 2), up_vector(up))

@@ -1,4 +1,4 @@
-"""Upright ellipsoids as the bodies of objects: geometry, the fit to the edges of boxes, and the choice of a shape.
+"""The bodies of objects, upright ellipsoids and cuboids: geometry, the fit to the edges of boxes, and the choice of a shape.
 
-numpy only. A body is nine numbers, and all objects of a map are solved in one batch.
+A body has seven parameters. All objects of a map are solved in one batch, in numpy.
 """

@@ -23,12 +23,11 @@ class BoxEdges:
     """The four edges of B boxes as planes.
 
     body: (B,) the object of each box. origin: (B, 3) m, the camera in map. normal: (B, 4, 3) unit, in map, away from the
-    box.
-    turn: (B, 4) rad per px, by how much a plane turns if its edge moves. sigma: (B,) px, the noise of an edge. shift: (B,)
-    px, noise that moves a box as a whole, such as that of the pose. bound: (B, 4) whether an edge is at the image's border,
-    so that the object may reach farther. size: (B,) px, the geometric mean of the sides of each box. direction: (B, 3) unit,
-    in map, through the centre of the box. range: (B,) m along it to the surface, NaN if unknown. range_sigma: (B,) m.
-    range_bias: (B,) m, the error that ranges share.
+    box. turn: (B, 4) rad per px, by how much a plane turns if its edge moves. sigma: (B,) px, the noise of an edge. shift:
+    (B,) px, noise that moves a whole box, such as pose noise. bound: (B, 4) whether an edge is at the image's border, so
+    that the object may reach farther. size: (B,) px, the geometric mean of the sides of each box. direction: (B, 3) unit, in
+    map, through the centre of the box. range: (B,) m along `direction` to the surface, NaN if unknown. range_sigma: (B,) m.
+    range_bias: (B,) m, the error that all ranges of a body share.
     """
 
     body: Ints
@@ -59,14 +58,14 @@ def tangent_planes(
     """Return normals (B, 4, 3) in map, turns (B, 4), rad per px, and which boxes (B,) have all four planes.
 
     boxes: (B, 4) px of the raw image. map_T_camera: (B, 4, 4). contact: (B, 4) px, where each edge touches the image of the
-    body, as y of a vertical edge and as x of a horizontal one. The default is the middle of each edge. In a distorted image
-    an edge is a curve of rays. Its plane holds the ray of the contact and the direction of the edge there.
+    body: y on a vertical edge, x on a horizontal one. The default is the middle of each edge. The contact matters only in a
+    distorted image. There an edge is curved, and its plane is the tangent at the contact.
     """
     low, high = boxes[:, :2], boxes[:, 2:]
     middle = (low + high) / 2
     if contact is None:
         contact = middle[:, [1, 0, 1, 0]]
-    pixel = np.stack([boxes, contact], axis=-1)  # Vertical edges have x first. Horizontal edges have y first.
+    pixel = np.stack([boxes, contact], axis=-1)  # (x, y) for vertical edges, but (y, x) for horizontal edges.
     pixel[:, 1::2] = pixel[:, 1::2, ::-1]
     along = _ACROSS[:, ::-1] * _STEP
     parts = [pixel, pixel - along, pixel + along, pixel - _ACROSS * _STEP, pixel + _ACROSS * _STEP]
@@ -84,7 +83,7 @@ def tangent_planes(
 def contacts(camera: Camera, boxes: Floats, map_T_camera: Floats, touched: Floats) -> Floats:
     """Return where (B, 4), px, the edges of boxes (B, 4) touch the image of a body, given the points (B, 4, 3) in map.
 
-    A point that is not in front of the camera gives the middle of its edge. Other points are moved to the edge's ends.
+    A point that is not in front of the camera gives the middle of its edge. A point beyond the edge gives its nearest end.
     """
     local = np.einsum("bij,bki->bkj", map_T_camera[:, :3, :3], touched - map_T_camera[:, None, :3, 3])
     ahead = local[..., 2] > 0

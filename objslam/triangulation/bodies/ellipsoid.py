@@ -12,7 +12,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats
 
 _ROUND = 1e-3
-"""The aspect below which a series replaces quotients by it. A larger value loses digits of the series."""
+"""A series replaces a division by the aspect, sqrt(q^2 + s^2), below this. With a larger value, the series is less exact."""
 _LEAST = 1e-9
 """The least length (m) of a divisor. A larger length distorts small bodies."""
 

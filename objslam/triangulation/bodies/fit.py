@@ -1,4 +1,4 @@
-"""Fit upright ellipsoids to the boxes of objects: robust, damped Gauss-Newton steps for all objects at once."""
+"""Fit bodies to the boxes of objects: robust, damped Gauss-Newton steps for all objects at once."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 _ITERATIONS = 40
 """The most steps of a fit. Ten are usual. More steps are slower."""
 STILL = 1e-9
-"""The decrease of the cost that a step promises at which a body is at rest. The cost is half a sum of squared deviations. A
-larger decrease ends sooner."""
+"""The fit of a body ends when the linear model of a step predicts a smaller decrease of the cost, half the sum of squared
+deviations. A larger decrease ends sooner."""
 _UPHILL = 1e-3
-"""The share by which a step may raise the cost. The steps hold the distance in the residuals fixed, so at the optimum they
-may raise the cost by a trace. A larger share accepts worse steps."""
+"""The share by which a step may raise the cost. The derivatives leave out that the distance to a body changes, so steps near
+the optimum may raise the cost slightly. A larger share accepts worse steps."""
 _DAMPING = (1e-3, 1e-9, 1e6)
 """The first, least and most damping of a step, as a share of the curvature. More damping makes shorter steps."""
 _LONGEST = 0.7
 """The longest step of a logarithm or an angle (rad). A longer step may leave the region in which the linear model holds."""
 _REMAIN = 0.7
-"""The share of moving bodies below which the others are left out of the next steps. A larger share copies more often."""
+"""If a smaller share of the bodies than this is unfinished, only they get more steps. A larger share copies more often."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Prior:
 
 @dataclass(frozen=True)
 class Weights:
-    """How much the boxes count.
+    """How much the residuals of boxes count.
 
-    variance: (B, 5) of each residual. Residuals that share an error count as few, so their variance is larger than that of
-    one residual. spread: (B, 5) the standard deviation of one residual. robust: whether residuals beyond their spread count
-    less (Cauchy's weight).
+    spread: (B, 5) the standard deviation of a residual. variance: (B, 5) the variance with which it counts. This is larger
+    than spread^2 if residuals share an error, so that they count as few. robust: whether residuals far beyond their spread
+    count less (Cauchy's weight).
     """
 
     variance: Floats
@@ -52,7 +52,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class Fit:
-    """The best bodies. values: (N, 7). weight: (B, 5) of each residual, one over its variance. found: (B,) its residuals.
+    """The best bodies. values: (N, 7). found: the residuals of the B boxes. weight: (B, 5) of each residual, 1 / variance.
 
     information: (N, 7, 7) of boxes and prior. prior: (N, 7, 7) of the prior alone.
     """
@@ -74,7 +74,7 @@ def fit(
     still: float = STILL,
     most: int = _ITERATIONS,
 ) -> Fit:
-    """Return the most probable bodies (N, 7) of one kind from a start. most: of the steps. still: see `STILL`."""
+    """Return the most probable bodies of one kind. start: (N, 7). still: as `STILL`. most: the most steps."""
     values = start.copy()
     moving = np.arange(len(start))
     damping = np.full(len(start), _DAMPING[0])
@@ -105,9 +105,9 @@ def _steps(
     kind: Kind,
     limits: tuple[int, int, float],
 ) -> tuple[Floats, Floats, Bools, int]:
-    """Return bodies and dampings after steps, which bodies are at rest, and the number of steps. It ends if many are.
+    """Take steps until few bodies are unfinished. Return bodies, dampings, which bodies are finished, and the steps so far.
 
-    limits: the number of steps so far, the most steps, and the promised decrease of the cost at rest.
+    limits: the number of steps so far, the most steps, and the value for `STILL`.
     """
     steps, most, enough = limits
     order, still = np.argsort(edges.body, kind="stable"), np.zeros(len(values), dtype=bool)
@@ -154,7 +154,7 @@ def _weight(now: Residuals, weights: Weights) -> Floats:
     if not weights.robust:
         return weight
     squared = now.use * (now.value / weights.spread) ** 2
-    # A box of another thing is wrong in all its edges, so the four residuals of a box share one deviation.
+    # If a box is of another thing, all its edges are wrong, so all four residuals of a box get one weight.
     squared[:, : ROWS - 1] = squared[:, : ROWS - 1].sum(axis=1, keepdims=True) / 2
     return np.asarray(weight / (1 + squared / CAUCHY_K**2))
 
@@ -179,7 +179,7 @@ def _normal(
 
 
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
-    """Return half the sum of squares (N,) of each body, with its prior, at given weights (Cauchy's loss lies below it)."""
+    """Return half the weighted sum of squares (N,) of each body, with its prior. The weights are fixed, also robust ones."""
     off = values - prior.mean
     own = np.bincount(body, (weight * now.use * now.value**2).sum(axis=1), len(values))
     return np.asarray(0.5 * own + 0.5 * np.einsum("ni,nij,nj->n", off, prior.information, off))

@@ -1,4 +1,4 @@
-"""What is believed of the size of a body before its boxes count: its apparent size, its label, known sizes."""
+"""The priors of bodies: from the apparent size of each object, from other objects of its label, and from known sizes."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from objslam.triangulation.bodies.fit import Prior
 from objslam.triangulation.bodies.shapes import PARAMETERS
 
 _POSITION = 20.0
-"""The standard deviation (m) of a centre around the point. A larger value leaves more to the boxes."""
+"""The standard deviation (m) of a centre around the triangulated point. With a larger value, boxes decide more."""
 _SIZE = 0.7
-"""The standard deviation of the logarithm of a half axis around its apparent value. 0.7 is a factor of 2. A larger value
-leaves more to the boxes, and lets an object that is seen from one side become deep or flat."""
+"""The standard deviation of the logarithm of a half axis around its apparent value. 0.7 is a factor of 2. With a larger
+value, an object that is seen from one side may become very deep or flat."""
 _ASPECT = 0.35
-"""The standard deviation of the two numbers of the aspect. The median ratio of the horizontal half axes is then 2.3. A
+"""The standard deviation of the two aspect parameters q and s. The median ratio of the horizontal half axes is then 2.3. A
 larger value allows longer objects."""
 _YAW = np.pi / np.sqrt(12)
 """The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
 _DOT = 1e-4
 """The half axes (m) of an ellipsoid that stands for a point."""
 _LIKE = 2.0
-"""The number of bodies of a label at which their spread weighs as much as the spread above. A larger number learns
-slower."""
+"""With this many bodies of a label, the spread of their sizes weighs as much as _SIZE and _ASPECT. A larger number trusts
+the label less."""
 _LEAST = 0.1
-"""The least standard deviation of the logarithm of a size that a label tells. A smaller value trusts the label more."""
+"""The least standard deviation of the logarithm of a half axis, given the label. A smaller value trusts the label more."""
 _TIE = 1e-3
-"""The standard deviation of the logarithms by which the half axes of a sphere differ. It is practically none."""
+"""The standard deviation, practically 0, of the logarithms by which the half axes of a sphere differ."""
 
 
 def weak_prior(points: Floats, half: Floats) -> Prior:
@@ -42,9 +42,8 @@ def weak_prior(points: Floats, half: Floats) -> Prior:
 def label_prior(weak: Prior, values: Floats, covariance: Floats, label: Ints, cuboid: Bools) -> Prior:
     """Return the prior that the bodies of each label have in common (empirical Bayes; Efron and Morris 1973).
 
-    values, covariance: (N, 7), (N, 7, 7) of bodies that were fitted with the weak prior. label: (N,). cuboid: (N,) which
-    bodies are cuboids. The result is for ellipsoids. A label with one body, and
-    the label -1, keep the weak prior.
+    values, covariance: (N, 7), (N, 7, 7) of bodies that were fitted with the prior `weak`. label: (N,). cuboid: (N,) which
+    bodies are cuboids. The result is for ellipsoids. A label with one body, and the label -1, keep the prior `weak`.
     """
     mean, variance = weak.mean.copy(), 1 / np.einsum("nii->ni", weak.information).copy()
     for one in np.unique(label):
@@ -60,7 +59,7 @@ def label_prior(weak: Prior, values: Floats, covariance: Floats, label: Ints, cu
             mean[mine, at] = (weight * own).sum() / weight.sum()
             variance[mine, at] = between + 1 / weight.sum()
         squares = (values[mine, 4:6] ** 2 - np.einsum("nii->ni", covariance[mine, 4:6, 4:6])).mean(axis=1)
-        one_number = values[mine, 4] ** 2 - covariance[mine, 4, 4]  # The yaw of a cuboid is a number of its own.
+        one_number = values[mine, 4] ** 2 - covariance[mine, 4, 4]  # A cuboid has one aspect parameter, q, and a yaw.
         squares = np.where(cuboid[mine], one_number / 2, squares).mean()
         aspect = (len(mine) * max(float(squares), 0.0) + _LIKE * _ASPECT**2) / (len(mine) + _LIKE)
         variance[mine, 4:6] = max(aspect, _LEAST**2)
@@ -74,7 +73,7 @@ def known_sizes(
 ) -> Prior:
     """Return the prior with known sizes (length, width, height), m, of labels. names: the label of each body.
 
-    The yaw of a body stays free: its aspect is drawn towards the known one in the direction that the fit has found.
+    The yaw of a body stays free, because only its aspect is drawn towards the known one, at the yaw that the fit has found.
     """
     mean, information = prior.mean.copy(), prior.information.copy()
     for body, name in enumerate(names):
@@ -98,7 +97,7 @@ def sphere_prior(prior: Prior) -> Prior:
     tie[[3, 6]] = 1.0, -1.0
     mean = prior.mean.copy()
     mean[:, 4:6] = 0.0
-    # The tie draws the difference of the two logarithms to zero, and their own priors stay.
+    # The tie makes the horizontal and the upward half axis equal. Their mean comes from the two own priors.
     precision = information[:, [3, 6], [3, 6]]
     common = (precision * mean[:, [3, 6]]).sum(axis=1) / precision.sum(axis=1)
     mean[:, 3] = mean[:, 6] = common
@@ -106,7 +105,7 @@ def sphere_prior(prior: Prior) -> Prior:
 
 
 def cuboid_prior(prior: Prior, start: Floats) -> Prior:
-    """Return the prior of cuboids (N, 7) with the sizes and aspects that a prior of ellipsoids has. Their yaw is free."""
+    """Return the prior of cuboids with the sizes and aspects of a prior of ellipsoids. start: (N, 7) gives the mean yaws."""
     mean, information = prior.mean.copy(), prior.information.copy()
     towards = np.stack([np.cos(2 * start[:, 5]), np.sin(2 * start[:, 5])], axis=1)
     mean[:, 4], mean[:, 5] = (prior.mean[:, 4:6] * towards).sum(axis=1), start[:, 5]

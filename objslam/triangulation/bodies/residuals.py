@@ -2,8 +2,8 @@
 
 A plane with the outward unit normal n through the camera m touches the body with the centre c and the support h(n) if
 n . (c - m) + h(n) = 0. An ellipsoid with the matrix M has h = sqrt(n^T M n), so this is the equation of its dual quadric
-(Hartley and Zisserman 2004, section 8.3). The left side divided by the distance of the touched point is the angle by which
-the body reaches beyond the plane.
+(Hartley and Zisserman 2004, section 8.3). If the left side is not 0, it is the length, m, by which the body reaches beyond
+the plane. Divided by the distance of the touched point, it is an angle.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Residuals:
     """The residuals of B boxes.
 
     value: (B, 5), predicted minus measured: the shift in x and y (px), half of the width and of the height (px), and the
-    range (m). Where an edge is a bound, the two edges of its axis stand in the places of shift and size. by: (B, 5, 7)
-    their derivatives by the parameters of the bodies. use: (B, 5) whether a residual counts. sigma: (B, 5) its noise.
+    range (m). If an edge of an axis is a bound, the two edges of this axis replace its shift and its size. by: (B, 5, 7)
+    derivatives of `value` by the parameters of the bodies. use: (B, 5) whether a residual counts. sigma: (B, 5) its noise.
     """
 
     value: Floats
@@ -47,7 +47,7 @@ def edge_gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floa
 
 
 def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
-    """Return the residuals of bodies (N, 7) of one kind. Their derivatives hold the distance of the touched points fixed."""
+    """Return the residuals of bodies (N, 7) of one kind. The derivatives treat the distance to touched points as fixed."""
     gap, by_gap, points = edge_gaps(edges, values, kind)
     scale = np.maximum(np.linalg.norm(points - edges.origin[:, None], axis=2) * edges.turn, _LEAST)  # m per px
     off, by = gap / scale, by_gap / scale[..., None]
@@ -66,7 +66,7 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
 
 
 def nominal_noise(edges: BoxEdges) -> Floats:
-    """Return the noise (B, 5) of the residuals, before the log tells it."""
+    """Return the noise (B, 5) of the residuals by the settings, before it is estimated from the log."""
     edge, sigma = edges.sigma / np.sqrt(2), np.empty((len(edges), ROWS))
     sigma[:, :2], sigma[:, 2:4] = np.hypot(edge, edges.shift)[:, None], edge[:, None]
     row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])

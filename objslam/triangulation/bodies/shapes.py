@@ -1,4 +1,4 @@
-"""The two kinds of bodies, an upright ellipsoid and an upright cuboid: what tangent planes and rays find of them.
+"""The two kinds of bodies, an upright ellipsoid and an upright cuboid, with the same functions for both.
 
 Both have seven parameters: the centre x, y, z (m), a number p and two numbers of the horizontal section, and the logarithm k
 of the half axis upwards. p is the mean logarithm of the horizontal half axes. `support` returns how far tangent planes are
@@ -22,12 +22,13 @@ PARAMETERS = 7
 class Kind:
     """One kind of bodies.
 
-    support: from parameters (B, 1, 7) and unit normals (B, 4, 3) to the distances (B, 4), m, of tangent planes from the
-    centre, their derivatives (B, 4, 4) by the last four parameters, and the touched points (B, 4, 3), m, from the centre.
-    ranges: from parameters (B, 7), origins (B, 3), m, and directions (B, 3) to the distances (B,), m, of the surface, their
-    derivatives (B, 7), and which rays (B,) hit it. half_axes: from parameters (N, 7) to the half axes (N, 3), m, the long
-    horizontal one first. heading: to the yaw (N,) of the long axis. axes_jacobian: to the derivatives (N, 7, 7) of centre,
-    half axes and yaw.
+    support: takes parameters (B, 1, 7) and unit normals (B, 4, 3). Returns the distances (B, 4), m, of tangent planes from
+    the centre, their derivatives (B, 4, 4) by the last four parameters, and the points (B, 4, 3), m, that they touch,
+    relative to the centre.
+    ranges: takes parameters (B, 7), origins (B, 3), m, and directions (B, 3) of rays. Returns the distances (B,), m, to the
+    surface, their derivatives (B, 7), and which rays (B,) hit it. The others take parameters (N, 7). half_axes: returns the
+    half axes (N, 3), m, the long horizontal one first. heading: the yaw (N,), rad, of the long axis. axes_jacobian: the
+    derivatives (N, 7, 7) of centre, half axes and yaw by the parameters.
     """
 
     support: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]

@@ -1,5 +1,6 @@
-"""Errors that the boxes of a body share. From one side, all boxes of an object err alike, because its outline is no ellipse
-and its detector has habits. So more boxes from this side do not average the error out, and count as few (Kish 1965).
+"""Errors that the boxes of a body share. A side is a direction from which an object is seen. All boxes from one side err
+alike, because the outline is no ellipse and detectors err systematically. Averaging does not help, so they count as few
+(Kish 1965).
 """
 
 from __future__ import annotations
@@ -21,16 +22,16 @@ SIDES = 103
 count as one measurement. A larger number is finer and slower."""
 ALIKE = np.radians(20.0)
 """The angle (rad) between two views of an object at which the errors of its boxes have the correlation 1/2. With a larger
-angle, more views are needed to average them out. On three objects of YCB-Video, it is 5 to 20 degrees for a detector."""
+angle, views must differ more to average the errors out. A detector had 5 to 20 degrees on three objects of YCB-Video."""
 WITHIN = 0.7
-"""The variance of the mean error over one side, as a share of the variance in one direction. Two directions in a side are 10
-degrees apart on average, and their correlation is 0.7. A larger share finds smaller errors."""
+"""The correlation between the errors of two boxes from one side, whose directions differ by 10 degrees on average. So the
+mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
 _SHARES = 41
-"""The number of tried values of the share, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
+"""The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
-"""The largest tried value of the share, in standard deviations of its prior. A larger value admits worse outlines."""
+"""The largest share that `share_of` tries, in standard deviations of its prior. A larger value admits worse outlines."""
 _NOMINAL = 20.0
-"""The number of residuals at which the scatter in the log weighs as much as the nominal noise. A larger number gives the
+"""With this many residuals, their scatter weighs as much as the nominal noise of the settings. A larger number gives the
 nominal noise more weight."""
 
 
@@ -38,8 +39,8 @@ nominal noise more weight."""
 class Sides:
     """The sides from which N bodies were seen. cell: (B,) the side of each box. owner: (C,) the body of each side.
 
-    alike: for each body, the correlation (c, c) between the errors of its c sides. number: (B,) of boxes that share an error
-    with this box.
+    alike: for each body, the correlation (c, c) between the errors of its c sides. number: (B,) how many boxes share the
+    error of each box, weighted by the correlation.
     """
 
     cell: Ints
@@ -68,7 +69,7 @@ def sides_of(edges: BoxEdges, centre: Floats) -> Sides:
 
 
 def some_of_each_side(sides: Sides, most: int) -> Ints:
-    """Return the increasing indices of at most that many boxes of each side, evenly over the order of its boxes."""
+    """Return the indices, increasing, of at most `most` boxes of each side, evenly chosen in the order of the boxes."""
     order = np.argsort(sides.cell, kind="stable")
     number = np.bincount(sides.cell)
     rank = np.empty(len(order), dtype=np.int64)
@@ -98,12 +99,12 @@ def white_factors(now: Residuals, sides: Sides, which: Bools) -> Floats:
 
 
 def spread_of(edges: BoxEdges, factors: Floats, share: Floats) -> Floats:
-    """Return the standard deviations (B, 5) of single residuals: their white noise, and the shared error of a box."""
+    """Return the standard deviations (B, 5) of residuals, from their independent noise and their shared error."""
     return np.sqrt(_white(nominal_noise(edges), factors) ** 2 + _scale(edges, share) ** 2)
 
 
 def effective_variance(edges: BoxEdges, sides: Sides, factors: Floats, share: Floats) -> Floats:
-    """Return the variances (B, 5) with which residuals count, so that all boxes of one side count as one error."""
+    """Return the variances (B, 5) with which residuals count, so that the shared error of a side counts once."""
     number = np.repeat(sides.number[:, None], ROWS, axis=1)
     ranged = np.bincount(edges.body, np.isfinite(edges.range))  # All ranges of a body share their error.
     number[:, -1] = ranged[edges.body]
@@ -122,10 +123,9 @@ def _scale(edges: BoxEdges, share: Floats) -> Floats:
 def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: float, which: Bools) -> Floats:
     """Return the standard deviations (2,) of the errors that the boxes of one side share, as shares of half their size.
 
-    The first is that of their shifts, the second that of their sizes. A detector may get one right and the other wrong.
-    It is the root mean square of the share, given the residuals. The bodies are unknown, so the restricted likelihood is
-    used (Patterson and Thompson 1971). The prior is a half-normal distribution (Gelman 2006). which: (N,) the bodies that
-    count.
+    The first is of the shifts of boxes, the second of their sizes. Each is the root mean square of its posterior. Because
+    the bodies are unknown, the likelihood is the restricted one (Patterson and Thompson 1971). The prior is half-normal
+    (Gelman 2006), with the scale `prior`. which: (N,) the bodies that count.
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = np.tile(-0.5 * (shares / prior) ** 2, (2, 1))

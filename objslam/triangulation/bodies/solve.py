@@ -32,25 +32,25 @@ _POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
 _ROUNDS = 2
 """How often the noise is estimated from the residuals of the last fit. More rounds are slower and change little."""
 _PER_SIDE = 3
-"""The number of boxes from each side that choose the shape and tell the noise. Boxes from one side repeat one error, so more
-are slower and tell little. All boxes count in the last fit."""
+"""The number of boxes from each side by which shape and noise are found. Boxes from one side repeat one error, so more are
+slower and hardly help. The last fit uses all boxes."""
 _RARE = 20.0
-"""The odds against a sphere before the boxes count, because few things are balls. With larger odds, fewer are spheres."""
+"""The prior odds against a sphere, because few things are balls. With larger odds, fewer bodies are spheres."""
 _STEPS = 12
-"""The most steps of a fit that chooses a shape. A fit that needs more is of a shape that its boxes do not show."""
+"""The most steps of a fit that chooses a shape. A fit of the right shape needs fewer. More steps are slower."""
 _ENOUGH = 1e-3
-"""The decrease of the cost, in units of the logarithm of a probability, at which a fit ends. A larger one ends sooner."""
+"""`STILL` for these fits: they end when a step would lower the cost by less. A larger value ends sooner."""
 
 
 @dataclass(frozen=True)
 class Bodies:
     """The bodies of N objects.
 
-    values: (N, 7) parameters of a cuboid or of an ellipsoid (see `shapes`). covariance: (N, 7, 7). shape: (N,) the chosen
-    shape, an index into `SHAPES`. evidence: (4, N) the logarithm of the evidence of each shape. weight: (B,) the robust
+    values: (N, 7) parameters of a cuboid or of an ellipsoid (see `shapes`). covariance: (N, 7, 7). shape: (N,) 0 point, 1
+    sphere, 2 ellipsoid, 3 cuboid. evidence: (4, N) the logarithm of the evidence of each shape. weight: (B,) the robust
     weight of each box. share: (2,) the standard deviations of the errors of shift and size that boxes of one side share, as
-    shares of half their size. factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) the direction to the
-    centre of each body, minus the direction to the centre of its box, in map. It is 0 for a point.
+    shares of half their size. factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to
+    the centre of each body, minus that to the centre of its predicted box, in map. It is 0 for a point.
     """
 
     values: Floats
@@ -86,9 +86,9 @@ class Bodies:
 class _State:
     """The noise, the prior and the bodies of the rounds so far.
 
-    rounds, balls: (N, 7) ellipsoids and spheres. cuboids: one or several starts (N, 7). evidence, shape: as in `Bodies`.
-    best: the better of ellipsoid and cuboid, with its covariance (N, 7, 7). None before the first round. sized:
-    (N,) whether the size is known, so that no sphere is tried.
+    rounds, balls: (N, 7) ellipsoids and spheres. cuboids: (N, 7), the starts of the next fit. evidence, shape: see `Bodies`.
+    best: the better of ellipsoid and cuboid, None before the first round. covariance: (N, 7, 7) of `best`. sized: (N,)
+    whether the size is known, so that no sphere is chosen.
     """
 
     factors: Floats
@@ -118,8 +118,9 @@ def solve_bodies(
 ) -> Bodies:
     """Return the bodies of objects at points (N, 3), m, with apparent half axes (N, 2), m, and labels.
 
-    side: (B,) px, half the length of the image. share: the prior of `Bodies.share`. learn: whether the share and the noise
-    are estimated. bent: whether the images are distorted, so that the planes of the edges depend on the points of contact.
+    names: the label of each object. side: (B,) px, half the length of the image. share: the prior of `Bodies.share`. learn:
+    whether the share and the noise are estimated. sizes: known length, width and height, m, by label. bent: whether the
+    images are distorted, so that `measure` depends on the points.
     """
     edges = measure(None)
     sides = sides_of(edges, points)
@@ -136,7 +137,7 @@ def solve_bodies(
         best = now.best
         if number == _ROUNDS or best is None:
             break
-        # Boxes that show no body, such as marks of one size, say nothing of the noise and the sizes of the others.
+        # An object that fits a point best has no size to learn from, such as a mark that is always drawn at one size.
         own = np.where(now.shape != _POINT, label, -1)
         prior = label_prior(weak, best.values, now.covariance, own, now.shape == _CUBOID)
         if sizes:
@@ -154,7 +155,7 @@ def solve_bodies(
 
 
 def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
-    """Return the state with the best body of each shape, and the most evident shapes."""
+    """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
     weights = _weights(edges, sides, now)
     rounds = fit(edges, now.rounds, now.prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
     if now.best is None:  # The ellipsoid tells the cuboid where to begin.
@@ -201,7 +202,7 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State) -> Bodies:
             loose = cuboid_prior(loose, start)
         tight = sphere_prior(loose) if shape in (_POINT, _SPHERE) else loose
         best = fit(own, start, tight, some, kind, still=_ENOUGH)
-        if tight is not loose:  # A sphere may be an ellipsoid, of which the covariance has to tell.
+        if tight is not loose:  # A sphere may really be an ellipsoid, so its covariance is that of an ellipsoid.
             best = fit(own, best.values, loose, some, kind, most=0)
         values[mine] = best.values
         covariance[mine] = covariance_of(own, best, sides_of(own, best.values[:, :3]), now.factors, now.share)
@@ -216,9 +217,9 @@ def _weights(edges: BoxEdges, sides: Sides, now: _State) -> Weights:
 
 
 def _to_centre(edges: BoxEdges, centre: Floats, gap: Floats) -> Floats:
-    """Return unit directions (B, 3) to centres (N, 3), minus those to the centres of the bodies' boxes.
+    """Return unit directions (B, 3) to the centres (N, 3), m, of bodies, minus those to the centres of predicted boxes.
 
-    gap: (B, 2) px, by which the body's box lies to the right of the seen one, and below it.
+    gap: (B, 2) px, by how much the predicted box lies to the right of the detected one, and below it.
     """
     ray = edges.direction
     predicted = ray.copy()
@@ -256,7 +257,7 @@ def _cuboid_starts(rounds: Floats) -> tuple[Floats, Floats]:
 
 
 def _best_cuboids(edges: BoxEdges, starts: tuple[Floats, ...], prior: Prior, weights: Weights) -> tuple[Fit, Prior]:
-    """Return the most evident cuboids from some starts (N, 7), with their priors."""
+    """Fit cuboids from each of the starts (N, 7). Return those with the most evidence, and their priors."""
     best: tuple[Fit, Prior, Floats] | None = None
     for start in starts:
         own = cuboid_prior(prior, start)
