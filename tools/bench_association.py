@@ -22,7 +22,7 @@ from peers.drives import drives
 from peers.krylov import locate
 from peers.street import Street, simulate_street
 
-from objslam.association.known_poses.global_association import associate_globally
+from objslam.association.global_association import associate_globally
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera

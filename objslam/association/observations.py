@@ -95,7 +95,7 @@ def observe(
     origin, direction = rays.in_map(map_T_camera)
     known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
     range_, range_sigma = (np.where(known, values, np.nan) for values in (rays.range, rays.range_sigma))
-    lines = Observations.of_lines(origin, direction, sigma[ray], range_, np.hypot(range_sigma, position_sigma), rays.label)
+    lines = Observations.of_lines(origin, direction, sigma[ray], range_, range_sigma, rays.label)
     size = size_per_metre(rays, keyframes, cameras)
     obs = replace(lines, frame=frame, position_sigma=position_sigma, size=size, box=rays.box, track=rays.track_id)
     return obs, ray, keyframe

@@ -119,9 +119,9 @@ def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Float
 
 def velocity_gain(
     obs: Observations, ray: Ints, index: Ints, position: Floats, noise: Floats, stamps: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Fit a velocity to each point. Return the sum (N,) of squared deviations that the velocity explains, the share (N,) of
-    all squared deviations that this is, and the distance (N,) m that each point moves while its rays see it.
+) -> tuple[Floats, Floats]:
+    """Fit a velocity to each point. Return the share (N,) of the squared deviations that the velocity explains, and the
+    distance (N,) m that each point moves while its rays see it.
 
     Pairs and points are as in `refine`. stamps: (P,) s of the rays.
     """
@@ -145,7 +145,7 @@ def velocity_gain(
     gain = (moving * right).sum(axis=1) - (resting * right[:, :3]).sum(axis=1)
     total = np.maximum(np.bincount(index, np.einsum("pi,pi->p", offset, offset) / spread, count), 1e-9)
     first, last = grouped_quantiles(time, index, count, (0.0, 1.0))
-    return gain, gain / total, np.nan_to_num(np.linalg.norm(moving[:, 3:], axis=1) * (last - first))
+    return gain / total, np.nan_to_num(np.linalg.norm(moving[:, 3:], axis=1) * (last - first))
 
 
 def _across(to: Floats) -> tuple[Floats, Floats]:

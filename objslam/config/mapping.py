@@ -30,8 +30,8 @@ class RayNoise(Section):
     min_score: NotNegative = 0.0
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     border: Finite = 1.0
-    """Distance in px from the image edge within which a box counts as cut off. Its centre is not the centre of the object,
-    so the box is dropped and counted. A negative value keeps such boxes."""
+    """Distance in px from the image edge within which a box counts as cut off. The centre of such a box is not the centre of
+    its object, so the box is dropped and counted. A negative value keeps such boxes."""
     border_share: NotNegative = 0.07
     """Distance from the image edge within which a box also counts as cut off, as a share of the box width or height.
     Detectors often end a cut box short of the edge."""
@@ -97,15 +97,19 @@ class AssociationSettings(Section):
     if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global. In
     joint mode, if many rays miss, auto decides again with the noise estimated from the log."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
-    """Number of ray pairs whose points are tested per label in one pass. A larger value finds rarer objects more slowly."""
+    """Number of ray pairs whose points are tested per label in one pass. A larger value is slower and finds rarer
+    objects."""
     gate: Annotated[float, Field(gt=0, lt=1)] = 0.999
     """Share of an object's own boxes that pass the gate on the ray residual. A larger value accepts more wrong boxes."""
     min_existence: Share = 0.5
-    """Existence probability below which an object is dropped. It is computed from detections, missed detections, sizes, and
-    from how unlikely the rays meet by chance. A larger value drops more objects with few rays."""
+    """Existence probability below which an object is dropped. It is computed from detections and missed detections."""
     min_rays: Annotated[int, Field(ge=2)] = 3
-    """Number of rays on which the start of a joint solve builds: one or two more rays are needed before an object enters a
-    map whose poses have not converged. No number decides whether an object exists, min_existence does."""
+    """Minimum number of rays of an object, because two rays of different things often intersect. One or two more rays are
+    needed while the poses have not converged. A larger value finds fewer and more certain objects."""
+    few_rays: bool = True
+    """Search for objects with fewer rays than min_rays, in fixed mode with a localisation. Two rays, or one ray with a
+    depth, are enough where so few hardly meet by chance. The probability of such an object still has to reach
+    min_existence."""
     duplicate_distance: Positive = 1.0
     """Distance in m above which two objects of one label are never merged. A larger value merges more on a drifted path."""
     loop_evidence: Positive = 7.0
@@ -136,8 +140,8 @@ class Bodies(Section):
     """Configure the bodies of objects: upright ellipsoids that fit the edges of their boxes."""
 
     use: bool = True
-    """Give each object the body that its boxes carry. Its position is then the centre of the body. Without bodies, it is the
-    point at which the rays through the centres of its boxes meet."""
+    """Give each object the body that its boxes carry. Its position is then the centre of the body. Without bodies, the
+    position is the point at which the rays through the box centres meet."""
     sizes: dict[str, tuple[Positive, Positive, Positive]] = Field(default_factory=dict)
     """Known length, width and height in m by label. The sizes of other labels are learnt from the log."""
 

@@ -56,5 +56,5 @@ def _triangulate(
         range_sigma=np.hypot(rays.range_sigma, place),
         range_bias=rays.range_bias,
         position_sigma=place,
-        judged=association.existence is not None,
+        judged=association.few_rays,
     )

@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from objslam.association.correlative_alignment import align
-from objslam.association.known_poses.global_association import associate_globally
+from objslam.association.global_association import associate_globally
 from objslam.association.nearest_neighbour import assign
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints

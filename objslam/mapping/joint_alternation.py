@@ -196,7 +196,7 @@ class JointState:
         return float(gain[self.agree].sum() - self.settings.association.min_rays * self.association.count * gain.mean())
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, drifting: bool) -> Association:
-        from objslam.association.known_poses.global_association import associate_globally
+        from objslam.association.global_association import associate_globally
 
         frames, rays = self.frames, self.all_rays
         if self.errors is not None and self.theta is not None:

@@ -31,7 +31,6 @@ from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
-from objslam.mapping.localization_noise import with_pose_noise
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
@@ -68,7 +67,7 @@ def run(
     with _stage("rays", seconds, progress):
         if settings.checks.use:
             diagnosis = diagnose(expected, settings)
-            if not diagnosis.refutable and settings.mode != "fixed":
+            if not diagnosis.refutable:
                 say(diagnosis, ledger)
         frames = build_keyframes(log, settings, ledger)
         if sideways := lies_on_its_side(frames):
@@ -84,12 +83,6 @@ def run(
         errors = shared_errors(log, *seen_something(frames, rays), settings)
         try:
             solution = solve(frames, rays, cameras, settings, ledger, progress, errors=errors)
-            noise = with_pose_noise(frames, rays, cameras, settings, solution.association, ledger)
-            if noise is not settings:
-                settings = noise
-                diagnosis = diagnose(expected, settings) if settings.checks.use else diagnosis
-                errors = shared_errors(log, *seen_something(frames, rays), settings)
-                solution = solve(frames, rays, cameras, settings, ledger, progress, errors=errors)
         except SolveError:
             say(diagnosis, ledger)
             raise

@@ -63,7 +63,7 @@ def triangulate(
     range_sigma: ArrayLike | None = None,
     range_bias: ArrayLike = 0.0,
     position_sigma: float = 0.0,
-    judged: bool = False,
+    judged: ArrayLike | None = None,
 ) -> Triangulation:
     """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
 
@@ -82,8 +82,8 @@ def triangulate(
         ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
         range_bias: (R,) or one number, m, the standard deviation of the error that all ranges of an object share.
         position_sigma: m, the noise of the origins along each axis.
-        judged: whether an association has found that the rays of each object do not meet by chance. Then few rays with much
-            noise can give an object that is ok.
+        judged: (N,) whether the association has found that the rays of an object do not meet by chance. Then few rays with
+            much noise can give an object that is ok.
     Raises:
         ValueError: the arrays do not fit together or are not finite.
         ConfigError: the device does not exist.
@@ -100,8 +100,8 @@ def triangulate(
         if not (shared[np.isfinite(known)] >= 0).all():
             raise ValueError("range_bias must be at least 0")
     with array_backend(settings.device, len(m) >= _LARGE) as backend:
-        given = known, spread, shared
-        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, *given, judged, backend)
+        given = known, spread, shared, np.broadcast_to(False if judged is None else np.asarray(judged, dtype=bool), count)
+        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, *given, backend)
 
 
 def _triangulate(
@@ -116,7 +116,7 @@ def _triangulate(
     ranges: Floats | None,
     range_sigma: Floats | None,
     range_bias: Floats | None,
-    judged: bool,
+    judged: Bools,
     backend: Backend,
 ) -> Triangulation:
     """Triangulate rays that are already checked. The arguments are those of `triangulate`."""
@@ -125,7 +125,7 @@ def _triangulate(
     if settings.consensus:
         jitter = as_tensor(np.random.default_rng(seed).random(settings.hypotheses), backend)
         result, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, jitter)
-        by_chance = (log_nfa >= 0) & (not judged)
+        by_chance = (log_nfa >= 0) & ~as_tensor(judged, backend)
     else:
         use = xp.ones_like(bundle.index, dtype=xp.bool)
         result = minimise_distances(bundle)

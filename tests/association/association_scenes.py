@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from objslam.association.known_poses.global_association import associate_globally
+from objslam.association.global_association import associate_globally
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, project

@@ -8,11 +8,18 @@ from association_scenes import drive, rays_of_boxes, watch
 from scipy.special import comb
 from scipy.stats import betabinom
 
-from objslam.association.known_poses.chance import Strays, chance_odds
-from objslam.association.known_poses.detection_rates import Rates, _beta_binomial, detection_rates
-from objslam.association.known_poses.existence import existence, prior_odds, rest_odds, size_odds
-from objslam.association.known_poses.merging import overlap
+from objslam.association.existence import (
+    Rates,
+    _beta_binomial,
+    chance_odds,
+    detection_rates,
+    existence,
+    prior_odds,
+    rest_odds,
+    size_odds,
+)
 from objslam.association.landmarks import Landmarks, State
+from objslam.association.merging import overlap
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.association.observations import extents, observe
 from objslam.association.visibility import CameraFrames, DetectionHistory, _hidden, detection_history
@@ -167,13 +174,6 @@ def test_where_rates_differ_a_low_one_is_no_proof():
     assert rates.concentration <= 5
 
 
-def beyond_chance(state):
-    """The log odds of the landmarks over strays of the same log."""
-    labels = len(state.unassigned)
-    rates = detection_rates(state.history, state.label, labels)
-    return chance_odds(state, 13.8, Strays.of(state.obs, state.view, labels), rates)
-
-
 def test_more_rays_and_fewer_strays_are_less_like_chance():
     points = np.array([[2.0, 0.2, 0.4]])
     scene = watch(points, straight())
@@ -181,7 +181,7 @@ def test_more_rays_and_fewer_strays_are_less_like_chance():
     odds = []
     for keep in (3, 5, 40):
         few = (np.cumsum(state.matched == 0) <= keep) & (state.matched == 0)
-        odds.append(beyond_chance(replace(state, obs=state.obs.take(few), matched=state.matched[few]))[0])
+        odds.append(chance_odds(replace(state, obs=state.obs.take(few), matched=state.matched[few]), 13.8)[0])
     assert odds[0] < odds[1] <= odds[2]
     rng = np.random.default_rng(0)
     frame, centre = np.sort(rng.integers(0, 80, 4000)), rng.uniform(30, 450, (4000, 2))
@@ -192,7 +192,7 @@ def test_more_rays_and_fewer_strays_are_less_like_chance():
     near = np.linalg.norm(np.cross(to, many.direction), axis=1) < 3.7 * many.sigma * np.linalg.norm(to, axis=1)
     chance = replace(state, obs=many, matched=np.where(near, 0, -1))
     assert near.sum() >= 3
-    assert beyond_chance(chance)[0] < 0
+    assert chance_odds(chance, 13.8)[0] < 0
     assert len(ray) == 4000
 
 
@@ -256,11 +256,10 @@ def test_what_follows_from_a_state_is_computed_once(monkeypatch):
     monkeypatch.setattr(
         "objslam.association.landmarks.detection_history", lambda *given: asked.append(given) or detection_history(*given)
     )
-    strays = Strays.of(state.obs, state.view, len(state.unassigned))
-    assert (existence(state, 13.8, strays) == existence(state, 13.8, strays)).all()
+    assert (existence(state, 13.8) == existence(state, 13.8)).all()
     assert len(asked) == 1
     assert state.keep(np.ones(2, dtype=bool)) is state
-    assert existence(state.keep(np.array([True, False])), 13.8, strays).shape == (1,)
+    assert existence(state.keep(np.array([True, False])), 13.8).shape == (1,)
     assert len(asked) == 2
 
 

@@ -103,20 +103,14 @@ def test_one_object_with_noisy_boxes_stays_one():
     assert noisy.associate().count == 2
 
 
-def test_two_rays_are_an_object_where_strays_are_rare_and_none_where_they_are_dense():
-    """No least number of rays decides, but how closely they meet, and how many boxes of the label lie about."""
-    pair = watch(np.array([[0.1, 0.0, 0.4]]), circle(3), pixel_sigma=1.0)
-    two = pair.rays.take(pair.rays.keyframe < 2)
-    keyframes = replace(pair.keyframes.take(np.arange(2)), stamps=np.array([0.0, 5.0]))
-    found = pair.associate(rays=two, keyframes=keyframes)
-    assert found.count == 1
-    assert (found.object == 0).all()
-    assert found.existence[0] < 0.99  # two rays are no proof
-    rng = np.random.default_rng(0)
-    centre = rng.uniform([12, 12], [627, 467], (4000, 2))
-    frame, label = np.sort(rng.integers(0, 2, 4000)), np.zeros(4000, dtype=np.int64)
-    strays = rays_of_boxes(frame, np.hstack([centre - 6, centre + 6]), label, pair.cameras[0], ("cup",))
-    assert pair.associate(rays=join(two, strays), keyframes=keyframes).count == 0
+def test_an_object_has_as_many_rays_as_the_settings_ask_for():
+    scene = watch(np.array([[0.1, 0.0, 0.4]]), circle(6), pixel_sigma=1.0)
+    count = len(scene.rays)
+    found = [
+        scene.associate(settings=Settings.model_validate({"association": {"min_existence": 0.0, "min_rays": least}})).count
+        for least in (count, count + 1)
+    ]
+    assert found == [1, 0]
 
 
 def shuffled(scene, rng):

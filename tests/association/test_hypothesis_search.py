@@ -6,7 +6,7 @@ import torch
 from association_scenes import rays_of_boxes, watch
 from scipy.optimize import least_squares
 
-from objslam.association.known_poses.hypothesis_search import Search, _Scorer, discover
+from objslam.association.hypothesis_search import Search, _Scorer, discover
 from objslam.association.observations import closest_approach, observe
 from objslam.association.refinement import refine
 from objslam.core.array_module import as_numpy
@@ -72,7 +72,7 @@ def test_a_search_among_few_rays_tries_each_pair_once(count, most, monkeypatch):
         tried.append(np.column_stack([first, second]))
         return closest_approach(obs, first, second)
 
-    monkeypatch.setattr("objslam.association.known_poses.hypothesis_search.closest_approach", counting)
+    monkeypatch.setattr("objslam.association.hypothesis_search.closest_approach", counting)
     discover(obs, SEARCH, np.random.default_rng(0))
     (pairs,) = tried
     assert len(pairs) <= most
@@ -83,7 +83,7 @@ def test_a_search_among_few_rays_tries_each_pair_once(count, most, monkeypatch):
 def test_torch_finds_the_same_points_and_gives_its_threads_back(monkeypatch):
     obs = observed(watch(THREE, circle(20), pixel_sigma=1.0))
     small = discover(obs, SEARCH, np.random.default_rng(0))
-    monkeypatch.setattr("objslam.association.known_poses.hypothesis_search._LARGE", 0)
+    monkeypatch.setattr("objslam.association.hypothesis_search._LARGE", 0)
     before = torch.get_num_threads()
     large = discover(obs, SEARCH, np.random.default_rng(0))
     assert torch.get_num_threads() == before

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.association.existence import detection_rates
 from objslam.association.gating import gated_edges
-from objslam.association.known_poses.chance import Strays, log_places
-from objslam.association.known_poses.detection_rates import detection_rates
-from objslam.association.known_poses.label_fusion import SIZE_RATIO
+from objslam.association.label_fusion import SIZE_RATIO
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations
 from objslam.association.refinement import BEHIND, normalised_residuals, range_costs, refine, squared_offsets, variance
@@ -43,7 +42,7 @@ class _Pairs:
     pair: Ints
 
 
-def merge_targets(state: State, gate: float, strays: Strays, across_labels: bool) -> Ints:
+def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
     """Return the landmark (N,) into which each one merges: itself, or the landmark with more rays if a pair is one object.
 
     across_labels: compare pairs of different labels instead of pairs with one label.
@@ -57,7 +56,7 @@ def merge_targets(state: State, gate: float, strays: Strays, across_labels: bool
         return target
     pairs = _with_rays(a, b, state)
     both_seen, both_expected, seen_a, seen_b = _common_frames(state.history, a, b)
-    gain = _gains(state, gate, strays, pairs, both_seen, both_expected)
+    gain = _gains(state, gate, pairs, both_seen, both_expected)
     apart = _seen_apart(obs, pairs, state.matched)
     should = seen_a * seen_b / np.maximum(both_expected, 1.0)  # The frames with both, if detections are independent.
     gap = np.linalg.norm(state.landmarks.position[a] - state.landmarks.position[b], axis=1)
@@ -113,7 +112,7 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
     return _Pairs(a, b, ray, np.repeat(np.arange(len(a)).repeat(2), length))
 
 
-def _gains(state: State, gate: float, strays: Strays, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
+def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
     """Return the decrease (P,) of -2 ln likelihood by one object instead of two.
 
     It counts the fit of the rays, second boxes in one frame, missed detections, and the number of objects. both_seen,
@@ -136,11 +135,8 @@ def _gains(state: State, gate: float, strays: Strays, pairs: _Pairs, both_seen: 
     duplicate = overlap(r.box[second], r.box[first]) >= _DUPLICATE_OVERLAP  # A second box of one object adds no information.
     one[second] = np.where(duplicate, 0.0, gate)
     two[second] = np.where(duplicate, 0.0, two[second])
+    saved = np.bincount(pairs.pair, two - one, count) + _OBJECT_COST + 3 * np.log(number[a] + number[b])
     rates = detection_rates(history, state.label, len(state.unassigned))
-    places = log_places(state, strays, rates)
-    one_more = 2 * np.maximum(np.minimum(places[a], places[b]), 0.0)  # Where objects are dense, one more is no surprise.
-    price = np.minimum(_OBJECT_COST + 3 * np.log(number[a] + number[b]), one_more)
-    saved = np.bincount(pairs.pair, two - one, count) + price
     misses = rates.cost(history.seen, history.expected, state.label)
     stronger = np.where(number[a] >= number[b], state.label[a], state.label[b])
     seen = history.seen[a] + history.seen[b] - both_seen

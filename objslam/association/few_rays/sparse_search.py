@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.known_poses.chance import Strays, log_volume, ray_odds
+from objslam.association.few_rays.chance import Strays, log_volume, ray_odds
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
 from objslam.core.arrays import Bools, Floats, Ints
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from objslam.association.existence import Rates
 from objslam.association.gating import Edges
-from objslam.association.known_poses.detection_rates import Rates
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations
 from objslam.association.refinement import grouped_sums, range_costs, variance
@@ -35,8 +35,9 @@ _DENSITIES = (1e-4, 10.0)
 where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
 _PRIOR_STRAYS = 1.0
 """The number of strays of each label that are assumed beside those of the log. A larger number keeps fewer landmarks."""
-_LOOK = 1.0
-"""The time, s, after which strays are independent. A larger time drops more of what moves, and of what is seen briefly."""
+_LOOK = np.radians(2.0)
+"""The angle (rad) between two rays at their landmark from which on strays on them are independent. It is the least parallax
+of a position. A larger angle drops more of what moves, and of what is seen from nearly one place."""
 _PRIOR = 0.5
 """The prior share of boxes that see an object. A larger share keeps more landmarks with few rays."""
 
@@ -191,11 +192,6 @@ def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floa
     return np.clip(total + np.log(density[label]) - _looks(state) * np.log(share[label]), -MOST_ODDS, MOST_ODDS)
 
 
-def total_odds(state: State, gate: float, strays: Strays, rates: Rates) -> float:
-    """Return the log odds of all landmarks over stray boxes. All boxes that are no object's count as strays."""
-    return float(_evidence(state, gate, strays, rates).sum())
-
-
 def _evidence(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
     """Return the log odds (N,) of each landmark if all boxes of its label may be strays."""
     held, owner, label = state.assigned, state.owner, state.label
@@ -210,13 +206,15 @@ def _evidence(state: State, gate: float, strays: Strays, rates: Rates) -> Floats
 def _looks(state: State) -> Floats:
     """Return the number (N,) of independent looks at each landmark.
 
-    Strays of one moment are often one thing: an object that moves slowly, or an error that the detector repeats. So a ray
-    counts by the time since the last one, up to 1.
+    Strays from nearly one place are often one thing: an error that the detector repeats in the next image, or an object
+    that moves slowly. So a ray counts by the angle between it and the ray before it, seen from the landmark, up to 1.
     """
     order = np.lexsort((state.obs.frame[state.assigned], state.owner))
-    owner, stamp = state.owner[order], state.view.stamps[state.obs.frame[state.assigned[order]]]
-    since = np.minimum(np.diff(stamp, prepend=-np.inf) / _LOOK, 1.0)
-    counted = np.where(np.diff(owner, prepend=-1) != 0, 1.0, since)
+    owner = state.owner[order]
+    to = state.landmarks.position[owner] - state.obs.origin[state.assigned[order]]
+    to = to / np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-9)
+    turn = np.linalg.norm(np.diff(to, axis=0, prepend=to[:1]), axis=1)
+    counted = np.where(np.diff(owner, prepend=-1) != 0, 1.0, np.minimum(turn / _LOOK, 1.0))
     return np.asarray(np.bincount(owner, counted, state.count).astype(np.float64))
 
 

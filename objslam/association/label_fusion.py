@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from objslam.association.existence import stray_share
 from objslam.association.gating import gated_edges
-from objslam.association.known_poses.existence import stray_share
 from objslam.association.landmarks import State
 from objslam.core.arrays import Bools
 from objslam.core.statistics import grouped_median, poisson_tail

@@ -1,0 +1,160 @@
+"""Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion. A phantom is a
+landmark without an object: rays of different things meet there. A stray ray belongs to no landmark."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.association.landmarks import State
+from objslam.association.refinement import velocity_gain
+from objslam.association.visibility import DetectionHistory
+from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import poisson_tail
+
+_PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
+_CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
+_CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead drops fewer.
+_POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
+_RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
+_MOST_PRIOR = 3.0  # The largest prior odds. A class with few boxes has them. A larger value keeps more weak objects.
+_EXPECTED_STRAYS = 5.0  # Each class is assumed to have this number of stray boxes in addition to the observed ones.
+_LOG_SIZE = 0.7  # The standard deviation of ln size within a class. It is a factor of 2 in size.
+_PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of phantoms. It is a factor of 100 in size.
+_MOST_ODDS = 20.0  # The largest absolute log odds against chance. This limit only keeps them finite.
+_REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
+_WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
+_MOVING = 6  # The number of coordinates of a moving point: those of its position and of its velocity.
+_COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Beta distributions of the detection rates in each class. mean: (L,) of each class. concentration: the sum of the two
+    parameters of a distribution, the same for all classes."""
+
+    mean: Floats
+    concentration: float
+
+    def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
+        """Return -2 ln of the probability (N,) that objects with these labels are `seen` times in `expected` frames."""
+        return -2 * _beta_binomial(seen, expected, self.mean[label], self.concentration)
+
+    def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:
+        """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses."""
+        rate = self.mean[label]
+        phantom = rate * _PHANTOM_SHARE
+        # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
+        as_phantom = _beta_binomial(history.seen, history.expected, phantom, 1 / phantom)
+        return np.asarray(_beta_binomial(history.seen, history.expected, rate, self.concentration) - as_phantom)
+
+
+def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
+    """Estimate the rate of each class (L,) as the median over its boxes. If a class has few boxes, its rate is near the rate
+    of all classes. The concentration is the lowest one whose likelihood is not clearly below the best. The likelihoods allow
+    any object to be a phantom. label: (N,) of the objects. labels: the number L of all labels."""
+    seen, expected = history.seen.astype(float), history.expected
+    own = seen / np.maximum(expected, 1)
+    overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
+    boxes = np.bincount(label, seen, labels)
+    mean = (boxes * _weighted_median(own, seen, label, labels) + _POOLED_BOXES * overall) / (boxes + _POOLED_BOXES)
+    rates = [Rates(np.clip(mean, *_RATE_LIMITS), concentration) for concentration in _CONCENTRATIONS]
+    likelihood = np.logaddexp(0.0, [rate.log_odds(history, label) for rate in rates]).sum(axis=1)
+    return rates[int(np.argmax(likelihood >= likelihood.max() - _CLEAR_LEAD))]
+
+
+def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: float | Floats) -> Floats:
+    """Return ln of the probability (N,) of a sequence of detections and misses, if the rate has a beta distribution."""
+    from scipy.special import betaln
+
+    a, b = concentration * rate, concentration * (1 - rate)
+    return np.asarray(betaln(a + seen, b + expected - seen) - betaln(a, b))
+
+
+def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) -> Floats:
+    """Return the weighted median (count,) of each group: half of the weight lies below it. It is 0 without weight."""
+    result = np.zeros(count)
+    order = np.lexsort((values, group))
+    total = np.cumsum(weight[order])
+    upper = np.append(0.0, total)[np.cumsum(np.bincount(group, minlength=count))]
+    lower = np.append(0.0, upper[:-1])
+    some = upper > lower
+    result[some] = values[order][np.searchsorted(total, ((lower + upper) / 2)[some])]
+    return result
+
+
+def existence(state: State, gate: float) -> Floats:
+    """Return the probability (N,) that each landmark is a static object."""
+    from scipy.special import expit
+
+    return np.asarray(expit(static_odds(state)) * expit(chance_odds(state, gate)))
+
+
+def static_odds(state: State) -> Floats:
+    """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
+    motion."""
+    rates = detection_rates(state.history, state.label, len(state.unassigned))
+    by_rate = prior_odds(state) + rates.log_odds(state.history, state.label)
+    return np.asarray(by_rate + size_odds(state) + rest_odds(state))
+
+
+def chance_odds(state: State, gate: float) -> Floats:
+    """Return the log odds (N,) that the rays of each landmark do not meet by chance.
+
+    Any two stray rays of a class define a point. The number of further strays in the gate of the point is Poisson
+    distributed. Strays are the rays without a landmark, and the rays of landmarks with no more rays than this one.
+    """
+    strays = _no_stronger(state.ray_count, state.label) + state.unassigned[state.label]
+    expected = strays * stray_share(state, gate)
+    points = np.log(np.maximum(strays * (strays - 1) / 2, 1.0))
+    chance = np.log(np.maximum(poisson_tail(state.ray_count - 2, expected), 1e-300))
+    return np.clip(-points - chance, -_MOST_ODDS, _MOST_ODDS)
+
+
+def prior_odds(state: State) -> Floats:
+    """Return the prior log odds (N,) of an object, from the numbers of assigned and unassigned boxes of its class."""
+    odds = np.log((state.label_count.sum(axis=0) + _EXPECTED_STRAYS * _MOST_PRIOR) / (state.unassigned + _EXPECTED_STRAYS))
+    return np.minimum(odds, np.log(_MOST_PRIOR))[state.label]
+
+
+def stray_share(state: State, gate: float) -> Floats:
+    """Return the share (N,) of boxes at random pixels of the images whose rays would pass each landmark within its gate."""
+    angle2 = state.variance / np.maximum(state.distance, 1e-3) ** 2
+    area = np.pi * gate * np.bincount(state.owner, angle2, state.count) / np.maximum(state.ray_count, 1)
+    looks = np.maximum(state.history.inside, state.history.expected)
+    return looks * area / (max(len(state.view.camera), 1) * state.view.solid_angle)
+
+
+def size_odds(state: State) -> Floats:
+    """Return the log odds (N,), at most 0, of an object of the class over a phantom, from the landmark's size.
+
+    Crossing rays of different objects give a wrong distance, and so a wrong size.
+    """
+    own = np.log(np.maximum(state.size, 1e-6))
+    usual = _weighted_median(own, state.ray_count.astype(float), state.label, len(state.unassigned))[state.label]
+    as_object = -0.5 * ((own - usual) / _LOG_SIZE) ** 2 - np.log(_LOG_SIZE * np.sqrt(2 * np.pi))
+    return np.asarray(np.minimum(as_object + np.log(_PHANTOM_LOG_RANGE), 0.0))
+
+
+def _no_stronger(number: Ints, label: Ints) -> Ints:
+    """Return for each landmark the number (N,) of rays of all landmarks of its class that have no more rays than it has."""
+    rank = label * (int(number.max(initial=0)) + 1) + number
+    order = np.argsort(rank)
+    total = np.append(0, np.cumsum(number[order]))
+    first, last = np.searchsorted(label[order], label), np.searchsorted(rank[order], rank, side="right")
+    return np.asarray(total[last] - total[first])
+
+
+def rest_odds(state: State) -> Floats:
+    """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
+
+    Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
+    the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes,
+    which looks like motion. So only a few rays count, and motion within the object's size does not count.
+    """
+    obs, landmarks = state.obs, state.landmarks
+    stamps = state.view.stamps[obs.frame[state.assigned]]
+    explained, way = velocity_gain(obs, state.assigned, state.owner, landmarks.position, landmarks.noise, stamps)
+    size = 2.0 * np.clip(state.ray_count, 1, _COUNTED_RAYS)  # Each ray measures two coordinates.
+    free = np.clip(2.0 * state.ray_count - _MOVING, 0.0, size)  # A velocity fits any three rays.
+    odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * free * np.log(np.clip(1 - explained, 1e-6, 1.0))
+    return np.where(way > _WITHIN_SIZE * state.size, np.minimum(odds, 0.0), 0.0)
