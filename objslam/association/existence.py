@@ -23,7 +23,6 @@ _PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of pha
 _MOST_ODDS = 20.0  # The largest absolute log odds against chance. This limit only keeps them finite.
 _REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
-_MOVING = 6  # The number of coordinates of a moving point: those of its position and of its velocity.
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
@@ -89,12 +88,12 @@ def existence(state: State, gate: float) -> Floats:
     return np.asarray(expit(static_odds(state)) * expit(chance_odds(state, gate)))
 
 
-def static_odds(state: State) -> Floats:
+def static_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
-    motion."""
+    motion. fitted: as in `rest_odds`."""
     rates = detection_rates(state.history, state.label, len(state.unassigned))
     by_rate = prior_odds(state) + rates.log_odds(state.history, state.label)
-    return np.asarray(by_rate + size_odds(state) + rest_odds(state))
+    return np.asarray(by_rate + size_odds(state) + rest_odds(state, fitted))
 
 
 def chance_odds(state: State, gate: float) -> Floats:
@@ -144,17 +143,18 @@ def _no_stronger(number: Ints, label: Ints) -> Ints:
     return np.asarray(total[last] - total[first])
 
 
-def rest_odds(state: State) -> Floats:
+def rest_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
     the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes,
-    which looks like motion. So only a few rays count, and motion within the object's size does not count.
+    which looks like motion. So only a few rays count, and motion within the object's size does not count. fitted: the number
+    of measured coordinates that a moving point explains even by chance. They matter where rays are few.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]
     explained, way = velocity_gain(obs, state.assigned, state.owner, landmarks.position, landmarks.noise, stamps)
     size = 2.0 * np.clip(state.ray_count, 1, _COUNTED_RAYS)  # Each ray measures two coordinates.
-    free = np.clip(2.0 * state.ray_count - _MOVING, 0.0, size)  # A velocity fits any three rays.
-    odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * free * np.log(np.clip(1 - explained, 1e-6, 1.0))
+    left = np.clip(2.0 * state.ray_count - fitted, 0.0, size)
+    odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * left * np.log(np.clip(1 - explained, 1e-6, 1.0))
     return np.where(way > _WITHIN_SIZE * state.size, np.minimum(odds, 0.0), 0.0)

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam import config
-from objslam.association.alternate import alternate, near
 from objslam.association.existence import chance_odds, existence
-from objslam.association.gating import gate_limit
+from objslam.association.gating import alternate, gate_limit, near
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State

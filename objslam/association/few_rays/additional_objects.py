@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam import config
-from objslam.association.alternate import alternate, near
 from objslam.association.existence import detection_rates, static_odds
 from objslam.association.few_rays.chance import Strays, chance_odds, unmatched_costs
 from objslam.association.few_rays.sparse_search import SparseSearch, discover_sparse
-from objslam.association.gating import gate_limit
+from objslam.association.gating import alternate, gate_limit, near
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
 from objslam.association.observations import observe
@@ -22,9 +21,11 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.types import Association, Keyframes, Rays
 
+_MOVING = 6
+"""The number of coordinates of a moving point: those of its position and of its velocity. A velocity explains any three rays."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
-_POWER = 0.5
+_POWER = 0.4
 """The power of the likelihood of strays in a probability. The boxes of near objects mix, so strays are less independent than
 they are taken to be. On simulated streets, 0.5 makes the probabilities as large as the shares of objects that are there. A
 larger power gives more certain objects. The least odds of an object stay 0 with any power."""
@@ -163,7 +164,7 @@ class _Few:
         every = self.joined(found)
         rates = detection_rates(every.history, every.label, len(every.unassigned))
         odds = chance_odds(every, self.gate, self.strays, rates)
-        return np.asarray(expit(static_odds(every)) * expit(_POWER * odds))[self.known.count :]
+        return np.asarray(expit(static_odds(every, fitted=_MOVING)) * expit(_POWER * odds))[self.known.count :]
 
     def joined(self, found: State) -> State:
         """Return the known landmarks, followed by the new ones."""

@@ -57,8 +57,6 @@ class _Density:
 
         Few boxes leave gaps between their kernels. So the fewer boxes lie in a kernel, the more a uniform density weighs.
         """
-        from scipy.ndimage import gaussian_filter1d
-
         pad = 2 * float(noise.max(initial=1e-6))
         low, high = (float(x.min()) - pad, float(x.max()) + pad) if len(x) else (-pad, pad)
         if reach:
@@ -68,7 +66,7 @@ class _Density:
         number = counts.sum(axis=1)
         value = np.empty((labels, _BINS))
         for i, sigma in enumerate((noise / width).tolist()):
-            spread = gaussian_filter1d(counts[i].astype(np.float64), max(sigma, 0.5), mode="nearest")
+            spread = _smoothed(counts[i], max(sigma, 0.5))
             in_kernel = number[i] * min(2 * sigma / _BINS, 1.0)
             value[i] = (spread * in_kernel / max(number[i], 1) + 1 / _BINS) / (1 + in_kernel)
         return cls(low, width, value / value.sum(axis=1, keepdims=True) / width)
@@ -77,6 +75,13 @@ class _Density:
         """Return the density at values x of any shape, among the boxes of labels of a shape that fits."""
         inside = np.abs((x - self.low) / self.width - _BINS / 2) <= _BINS / 2
         return np.where(inside, self.value[label, _bins(x, self.low, self.width)], _OUTSIDE)
+
+
+def _smoothed(counts: Ints, sigma: float) -> Floats:
+    """Return counts (n,) spread by a Gaussian kernel with a standard deviation of `sigma` bins."""
+    half = min(int(4 * sigma) + 1, len(counts))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
+    return np.asarray(np.convolve(np.pad(counts.astype(np.float64), half, "edge"), kernel / kernel.sum(), "valid"))
 
 
 def _bins(x: Floats, low: float, width: float) -> Ints:
