@@ -6,7 +6,7 @@ import errno
 def printable(text: str) -> str:
     """Return a text with each character that is not printable as its escape, such as \\x1b. Line breaks (\\n) stay.
 
-    A name in a log may hold terminal commands or marks that reverse the order of the letters around them.
+    A name in a log may hold terminal commands, or marks that reverse the order of letters.
     """
     if text.isprintable():
         return text

@@ -1,11 +1,12 @@
 """Measure the errors of maps, and whether their sigmas are right, on simulated drives and on recordings.
 
-    python tools/bench_accuracy.py [--drives 100] [--parts simulated mrclam cube]
+    python tools/bench_accuracy.py [--drives 100] [--parts simulated mrclam short cube]
 
 simulated: drives in the demo's room with 12 objects. Each class has a false box in 5 % of the images. The poses are from a
 localisation (fixed) or from odometry alone (joint). The table has the share of objects whose true position is inside their
 95 % ellipsoid, and the errors beside those that the covariances promise. mrclam, cube: the recordings UTIAS MRCLAM 6 and
-TUM fr3_cabinet, from the folder in OBJSLAM_DATA.
+TUM fr3_cabinet, from the folder in OBJSLAM_DATA. short: parts of MRCLAM 6 and 7, of two to five minutes, and the share of
+landmarks whose true place is inside their 95 % ellipsoid.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ import time
 from pathlib import Path
 
 import numpy as np
+from log_parts import part
 from scipy.stats import chi2
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
+from objslam.errors import ObjslamError
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
@@ -31,6 +34,8 @@ from objslam.sources import SourceOptions, read
 RADIUS = 2.0
 """The radius of a match, m. Labels identify the objects here, and a large error must not count as a missed object."""
 ELLIPSOID = float(chi2.ppf(0.95, 3))
+PARTS = ((0, 300), (300, 600), (600, 900), (200, 320), (800, 1000))
+"""The begins and ends, s, of the parts of a drive."""
 CABINET = np.array([-1.520, 0.454])
 """The x and y, m, of the cabinet's centre in the depth images, fused with the true poses."""
 
@@ -103,6 +108,33 @@ def mrclam(data: Path) -> None:
             )
 
 
+def short(data: Path) -> None:
+    """Landmarks of parts of the recorded drives, without and with range, against their own covariances."""
+    print("Parts of UTIAS MRCLAM 6 and 7, joint, after SE(2) alignment")
+    print(f"{'range':>6}{'parts':>7}{'landmarks':>11}{'in 95 %':>9}{'median squared Mahalanobis':>28}{'RMSE m':>8}")
+    for with_range in (False, True):
+        inside, squared, errors = 0, [], []
+        for folder, robots in (("mrclam_ds6", (1, 3, 5)), ("mrclam_ds7", (1, 3))):
+            for robot in robots:
+                whole = read(data / folder, Ledger(), SourceOptions(robot=robot, with_range=with_range))
+                for begin, end in PARTS:
+                    try:
+                        log = part(whole, begin, end)
+                        result = pipeline.run(log, load_settings(None, ("mode=joint",)), Ledger())
+                    except ObjslamError as error:  # One robot saw no landmark in one part.
+                        print(f"{folder} robot {robot}, {begin} to {end} s: {error}", file=sys.stderr)
+                        continue
+                    found = evaluate(result.map, log.truth, align="se2", radius=RADIUS).to_dict()
+                    inside += round(found["inside_95_3d"] * found["matched"])
+                    squared.append(found["mahalanobis_median"])
+                    errors += [one["error"] for one in found["objects"]]
+        print(
+            f"{'yes' if with_range else 'no':>6}{len(squared):7d}{len(errors):11d}{inside / len(errors):9.1%}"
+            f"{np.median(squared):28.2f}{rms(errors):8.3f}",
+            flush=True,
+        )
+
+
 def cube(data: Path) -> None:
     """The cabinet's horizontal error, poses fixed, with depths and without."""
     print("TUM fr3_cabinet (cube_slam), fixed")
@@ -125,18 +157,18 @@ def rms(values: list[float]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--drives", type=int, default=100)
-    parts = ("simulated", "mrclam", "cube")
+    parts = ("simulated", "mrclam", "short", "cube")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     arguments = parser.parse_args()
     if "simulated" in arguments.parts:
         simulated(arguments.drives)
     folder = os.environ.get("OBJSLAM_DATA")
-    for part, name, work in (("mrclam", "mrclam_ds6", mrclam), ("cube", "cube_slam", cube)):
-        if part not in arguments.parts:
+    for chosen, name, work in (("mrclam", "mrclam_ds6", mrclam), ("short", ".", short), ("cube", "cube_slam", cube)):
+        if chosen not in arguments.parts:
             continue
         if folder is None or not (Path(folder) / name).is_dir():
             where = f"no {name} in {folder}" if folder else "OBJSLAM_DATA names no folder"
-            print(f"SKIPPED {part}: {where}", file=sys.stderr)
+            print(f"SKIPPED {chosen}: {where}", file=sys.stderr)
             continue
         work(Path(folder) / name)
 

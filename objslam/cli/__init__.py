@@ -27,7 +27,6 @@ from objslam.errors import ObjslamError, is_out_of_memory, one_line
 app = typer.Typer(
     name="objslam",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Build a 3D map of objects from the log of a robot. Poses and detector boxes become positions with covariances.",
 )
@@ -75,6 +74,8 @@ def main() -> NoReturn:
     """Run a command. Exit codes: 0 success, 1 failure, 2 usage error, 3 the drive is not in the map of --map, 130 Ctrl-C. An
     error is printed as one line on stderr, or with --debug as a traceback."""
     debug = "--debug" in sys.argv
+    if sys.argv[1:2] == ["help"]:  # `objslam help run` is what many tools take.
+        sys.argv[1:] = [*sys.argv[2:], "--help"]
     try:
         app()
     except ObjslamError as error:

@@ -20,15 +20,28 @@ if TYPE_CHECKING:
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """Show a progress bar if stderr is a terminal. Yield a function that updates the bar.
-    It takes the stage name, the number of finished items, and the total number of items, 0 if unknown."""
+    It takes the stage name, the number of finished items, and the total number of items, 0 if unknown. The clock of the bar
+    shows the time of the stage."""
+    screen = console(stderr=True)
+    if not screen.is_terminal:
+        yield lambda stage, done, total: None
+        return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     words = TextColumn("{task.description}", markup=False)
     columns = (SpinnerColumn(), words, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    screen = console(stderr=True)
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
-        task = bar.add_task("reading")
-        yield lambda stage, done, total: bar.update(task, description=printable(stage), completed=done, total=total or None)
+    with Progress(*columns, console=screen, transient=True) as bar:
+        shown = "reading"
+        task = bar.add_task(shown, total=None)
+
+        def show(stage: str, done: int, total: int) -> None:
+            nonlocal shown, task
+            if stage != shown:  # rich stops the clock of a finished task, and never forgets a total.
+                bar.remove_task(task)
+                shown, task = stage, bar.add_task(printable(stage), total=None)
+            bar.update(task, completed=done, total=total or None)
+
+        yield show
 
 
 def report(ledger: Ledger) -> None:

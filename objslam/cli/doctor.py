@@ -34,6 +34,7 @@ def doctor(
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.diagnosis import diagnose
     from objslam.mapping.pipeline import chosen_poses, with_mode_of
+    from objslam.sources.camera_words import doubts_of
 
     settings = settings_of(mode, config, set_)
     ledger = Ledger()
@@ -49,7 +50,11 @@ def doctor(
     messages = [finding.message for finding in found.findings] if solved is None else solved
     for message in messages:
         say(f"wrong: {message}")
-    if not messages:
+    # The boxes show whether a calibration is right. Without enough boxes, its unusual properties are all there is to show.
+    doubts = [] if found.trials else [doubt for c in given.cameras for doubt in doubts_of(c.camera)]
+    for doubt in doubts:
+        say(f"check: {doubt}")
+    if not messages and not doubts:
         refuted = ": the boxes that fit poorly above agree after the joint solve" if found.findings else ""
         say(f"nothing wrong was found{refuted}")
 

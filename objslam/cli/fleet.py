@@ -155,7 +155,7 @@ def _joined(address: str, quiet: bool) -> Iterator[Cluster]:
 
 @contextmanager
 def _silent() -> Iterator[Tell]:
-    yield lambda stage, done, failed, total: None
+    yield lambda stage, done, failed, running, total: None
 
 
 @contextmanager
@@ -170,9 +170,9 @@ def _shown() -> Iterator[Tell]:
     with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
         task = bar.add_task("finding")
 
-        def tell(stage: str, done: int, failed: int, total: int) -> None:
+        def tell(stage: str, done: int, failed: int, running: int, total: int) -> None:
             start, first = began.setdefault(stage, (time.monotonic(), done + failed))
-            line = f"{stage}: " + _progress(done, failed, total, first, time.monotonic() - start)
+            line = f"{stage}: " + _progress(done, failed, running, total, first, time.monotonic() - start)
             bar.update(task, description=line, completed=done + failed, total=total or None)
             tenth = (done + failed) * _TENTHS // max(total, 1)
             if not screen.is_terminal and tenth > told.get(stage, -1):
@@ -182,10 +182,10 @@ def _shown() -> Iterator[Tell]:
         yield tell
 
 
-def _progress(done: int, failed: int, total: int, first: int, seconds: float) -> str:
+def _progress(done: int, failed: int, running: int, total: int, first: int, seconds: float) -> str:
     """Return the progress in words. first: the tasks that had ended at the first call. seconds: the time since then, s."""
     by_now = done + failed - first
-    line = f"{done} of {total} done, {failed} failed, {total - done - failed} to do"
+    line = f"{done} of {total} done, {failed} failed, {running} running, {total - done - failed - running} to do"
     if by_now <= 0 or seconds <= 0:
         return line
     left = (total - done - failed) * seconds / by_now

@@ -116,7 +116,8 @@ def _place(pose: Floats) -> str:
 
 def _numbers(when: Timing, begin: float) -> tuple[str, ...]:
     rate, gap = f"{when.rate:.1f}" if when.rate else "", f"{when.longest_gap:.2f}" if when.count > 1 else ""
-    return rate, gap, f"{when.start - begin:.2f}", f"{when.end - begin:.2f}"
+    start, end = (f"{round(stamp - begin, 2) + 0.0:.2f}" for stamp in (when.start, when.end))  # + 0.0 makes -0.0 positive.
+    return rate, gap, start, end
 
 
 def _span(start: float, end: float) -> str:

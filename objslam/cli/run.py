@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -38,23 +39,28 @@ if TYPE_CHECKING:
 _COLUMNS: Final[dict[str, Callable[[MapObject], str]]] = {
     "id": lambda o: str(o.id),
     "label": lambda o: o.label,
-    "x m": lambda o: f"{o.position[0]:.3f}",
-    "y m": lambda o: f"{o.position[1]:.3f}",
-    "z m": lambda o: f"{o.position[2]:.3f}",
+    "x m": lambda o: _number(o.position[0], 3),
+    "y m": lambda o: _number(o.position[1], 3),
+    "z m": lambda o: _number(o.position[2], 3),
     "sigma m": lambda o: "" if o.sigma is None else f"{o.sigma:.3f}",
+    "size m": lambda o: _size(o),
     "rays": lambda o: str(o.rays),
     "parallax deg": lambda o: f"{o.parallax_deg:.1f}",
-    "rms deg": lambda o: f"{o.rms_deg:.2f}",
+    "rms deg": lambda o: _number(o.rms_deg, 2),
     "status": lambda o: o.status,
 }
-"""The columns of the table of objects, each with the text of its cells."""
-_SPARE = (
-    "parallax deg",
-    "rms deg",
-    "rays",
-    "sigma m",
-    "status",
-)  # Columns that a narrow terminal leaves out, in this order.
+"""The columns of the table of objects, each with the text of its cells. A cell without a value is empty."""
+_SPARE = ("parallax deg", "rms deg", "size m", "rays", "sigma m", "status")
+"""The columns that a narrow terminal leaves out, in this order."""
+_NOISE: Final = {
+    "rays": "rays",
+    "ranges": "ranges",
+    "range_bias": "offset of the ranges",
+    "along": "odometry along",
+    "across": "odometry across",
+    "turning": "odometry in turns",
+}
+"""The words for the factors of the noise. A factor of 1 is not shown: the log does not tell it, or confirms the settings."""
 NOT_LOCALISED = 3
 """The exit code of a run that wrote its result, but was not found in the map that --map names."""
 _WIDE = 10_000  # The width, in characters, of a terminal on which no table is cut, to measure the full width of a table.
@@ -140,12 +146,19 @@ def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...])
 
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
     """Print the objects, a line with the counts and `more`, the names of `removed` files of an older result, and `out`."""
-    console().print(objects_table(result.map.objects, console()))
+    if result.map.objects:
+        console().print(objects_table(result.map.objects, console()))
+    if advice := advice_on_tags(result.map.objects):
+        say(advice)
     if calibration := result.summary.get("calibration"):
-        console().print(calibration_table(calibration))
-    if noise := result.summary.get("noise"):
-        found = {name: factor for name, factor in noise.items() if name != "shrinkage"}
-        say("noise, as a multiple of the settings: " + ", ".join(f"{name} {factor:.2g}" for name, factor in found.items()))
+        if any(of["observable"] for of in calibration["parameters"].values()):
+            console().print(calibration_table(calibration))
+        else:
+            say("errors that all measurements share: this log tells none of them, so their priors count")
+    noise = result.summary.get("noise") or {}
+    factors = {words: f"{noise.get(name, 1.0):.2g}" for name, words in _NOISE.items()}
+    if found := [f"{words} {factor}" for words, factor in factors.items() if factor != "1"]:
+        say(f"noise found in the log, as a multiple of the settings: {', '.join(found)}")
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     say(
@@ -159,6 +172,24 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     if removed:
         say(f"removed the older result from {out}: {', '.join(removed)}")
     say(f"wrote {out}")
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+
+
+def _size(o: MapObject) -> str:
+    """Return length, width and height of the body of an object, or the side of a fiducial. "" for a point."""
+    if o.tag is not None:
+        return f"{o.tag.size:.3f}"
+    return "" if o.body is None else " x ".join(f"{side:.2f}" for side in o.body.size)
+
+
+def advice_on_tags(objects: Sequence[MapObject]) -> str:
+    """Return what to do if the sizes of fiducials are estimated. "" if there are no such fiducials."""
+    if not any(o.tag is not None and o.tag.size_sigma > 0 for o in objects):
+        return ""
+    return "the sides of tags are estimated in the scale of the poses; a known side sets the scale: --set tags.size=METRES"
 
 
 def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:

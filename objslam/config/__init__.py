@@ -1,5 +1,5 @@
-"""The settings: nested sections with a default for every value, changed by YAML files and `--set key=value`. A value that
-describes objects, rooms or robots is a setting, and a value that only a method needs is a constant in the code."""
+"""The settings: nested sections with a default for every value, changed by YAML files and `--set key=value`. Values that
+describe objects, rooms or robots are settings. Values that only a method needs are constants in the code."""
 
 from objslam.config.calibration import CalibrationSettings
 from objslam.config.detector import Detector

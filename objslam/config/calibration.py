@@ -1,4 +1,4 @@
-"""The settings of the calibration: which errors that all measurements share are estimated, and how large they may be."""
+"""The settings of the calibration: which shared errors are estimated, and how large they may be."""
 
 from typing import Literal
 
@@ -15,7 +15,7 @@ class CalibrationSettings(Section):
     are not estimated. true: estimate them too, and in joint mode also without odometry. false: never estimate."""
     file: str | None = None
     """a file of `objslam calibrate`, or the summary.json of a run. Its values and covariance are the prior of its errors. An
-    error in it that is not estimated has its value from the file."""
+    error of the file that is not estimated keeps its value from the file."""
     scale: NotNegative = 0.03
     """share by which all distances of the odometry are too long or too short."""
     turn_scale: NotNegative = 0.05

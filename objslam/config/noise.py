@@ -8,8 +8,8 @@ Estimated = Literal["auto"] | bool
 
 
 class Noise(Section):
-    """Estimate the noise of measurements from the log. For an estimated noise, the other settings are only a prior of the
-    weight `prior`.
+    """Estimate the noise of measurements from the log. The settings of an estimated noise, such as rays.pixel_sigma, are
+    then only a prior of the weight `prior`.
 
     auto: in joint mode, estimate the noise if the log has odometry and the settings of this noise have their defaults. true:
     estimate it even if these settings differ from their defaults. false: never estimate it.

@@ -1,4 +1,4 @@
-"""The ready settings that come with the package, which `--config NAME` takes by name."""
+"""The ready settings of the package. `--config NAME` takes one by its name."""
 
 import os
 from pathlib import Path

@@ -18,7 +18,7 @@ from objslam.config.tags import Tags
 from objslam.config.yaml_text import MAX_YAML, parse_yaml
 from objslam.errors import ConfigError
 
-_SHOWN = 200  # The most letters of a wrong value in a message. A larger number shows more of it.
+_SHOWN = 200  # The most letters of a wrong value in a message.
 
 
 class Settings(Section):
@@ -26,7 +26,7 @@ class Settings(Section):
 
     mode: Literal["auto", "fixed", "joint"] = "auto"
     """fixed: the objects are solved at the given poses. joint: poses and objects are solved together. auto: fixed for a log
-    with a localisation, else joint. Plain odometry drifts, and the covariances of fixed objects leave its drift out."""
+    with a localisation, else joint. fixed leaves the drift of odometry out of the covariances."""
     seed: Annotated[int, Field(ge=0)] = 0
     detector: Detector = Detector()
     poses: mapping.Poses = mapping.Poses()

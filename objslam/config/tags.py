@@ -11,14 +11,14 @@ class Tags(Section):
     use: bool = True
     """Use the corners. false: a fiducial is a point where its diagonals meet, as other objects are."""
     size: Positive | None = None
-    """Side in m of every fiducial, from corner to corner as the detector reports them. It gives the map its scale. null: the
-    size of each fiducial is estimated, in the scale that the poses have."""
+    """Side in m of every fiducial, from corner to corner as the detector reports them. This length gives the map its scale.
+    null: the size of each fiducial is estimated, in the scale that the poses have."""
     sizes: dict[int | str, Positive | None] = Field(default_factory=dict)
     """Sides in m of single fiducials, instead of `size`. A key is the number in the label (12 for tag_12) or a whole label.
     null: the size of this one is estimated."""
     corner_sigma: Positive = 1.0
-    """Standard deviation of a corner per axis in px. A detector finds corners better than that. The rest is what the
-    calibration of a lens leaves. Where the noise of rays is estimated, it has the same factor."""
+    """Standard deviation of a corner per axis in px. It covers the error of the detector, which is smaller, and the error
+    that a lens calibration leaves. An estimated factor on the noise of rays also multiplies this noise."""
 
     def size_of(self, label: str) -> float | None:
         """Return the side (m) of the fiducial with a label, None if it is not known."""

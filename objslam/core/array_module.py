@@ -1,7 +1,7 @@
-"""Functions with which the same code runs on numpy arrays and on torch tensors, and the choice between the two libraries.
+"""Functions that work on numpy arrays and on torch tensors alike, and the choice between the two libraries.
 
-Such code calls the functions of `module_of(array)`, which is numpy or torch. Both libraries take `axis=` and positional
-arguments. This module imports torch only for a batch that torch may compute.
+Such code takes the library of an array from `module_of`, and gives it `axis=` and positional arguments, which both accept.
+torch is imported only if it may be used.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ Backend = Literal["numpy", "cpu", "cuda"]
 
 @contextmanager
 def array_backend(device: str, large: bool) -> Iterator[Backend]:
-    """Give the backend for a value of the setting `triangulation.device`, and prepare its library.
+    """Choose numpy, torch on the CPU or torch on CUDA for a batch, and prepare that library. device: `triangulation.device`.
 
     With "auto" and "cpu", a batch that is not `large` runs in numpy, and torch is not imported. A large batch runs in torch:
     with "auto" on CUDA if torch sees a CUDA device, else on the CPU. If torch is not installed, every batch runs in numpy.
     The setting "cuda" always gives CUDA, and raises ConfigError if torch is not installed or sees no CUDA device.
 
     numpy gives no warnings of divisions by zero, overflows and invalid values, because torch gives none. torch gets one
-    thread, because a thread pool waits actively while other processes need the cores. On two cores, one of which was busy, a
-    run took 4 s with one thread and up to 18 s with two.
+    thread, because the threads of a pool use their cores even while they wait. With one of two cores busy, a run took 4 s
+    with one thread and up to 18 s with two.
     """
     installed = find_spec("torch") is not None
     if device == "cuda" and not installed:
@@ -109,7 +109,7 @@ def take_along(array: Tensor, index: Tensor, axis: int) -> Tensor:
 
 
 def contiguous(array: Tensor) -> Tensor:
-    """Return an array with the same elements that lie in memory in the order of its axes."""
+    """Return an array whose elements are contiguous in memory, in the order of its axes. It is a copy if needed."""
     return np.ascontiguousarray(array) if isinstance(array, np.ndarray) else array.contiguous()
 
 

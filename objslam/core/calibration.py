@@ -1,4 +1,4 @@
-"""Errors that all measurements of a robot share: their names, and their estimate."""
+"""Shared errors: errors that all measurements of a robot have in common, such as a wrong scale of its odometry."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.types import Keyframes, Rays
 
 OBSERVABLE = 0.8
-"""The largest standard deviation of an observable parameter, as a share of the standard deviation of its prior. A larger
-share calls more parameters observable. At this share, the log gives about half as much information as the prior."""
+"""A parameter is observable if its standard deviation is at most this share of the standard deviation of its prior. At 0.8,
+the log gives about half as much information as the prior. A larger share calls more parameters observable."""
 TRADED_OFF = 0.9
-"""The absolute correlation above which two parameters trade off, so that the log hardly tells them apart. With a larger
+"""Two parameters trade off if their absolute correlation is above this value: the log hardly tells them apart. With a larger
 value, fewer pairs trade off."""
 
 SCALES = ("scale", "turn_scale", "range_scale", "focal")
 """The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
 MOST_SCALE = 0.5
-"""The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. Measurements that are
-wrong by half have wrong units, which no calibration should hide."""
+"""The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of more than half
+means a wrong unit, and a calibration should not hide that."""
 
 UNITS = {"clock": "s", "turn_bias": "rad/s", "yaw": "rad", "tilt": "rad", "roll": "rad", "x": "m", "y": "m", "z": "m"}
 """The unit of each kind of parameter. A kind that is not in this table is a share without a unit."""
@@ -37,8 +37,8 @@ def kind(name: str) -> str:
 class Calibration:
     """The estimate of the shared errors. Measurements that are corrected by these values agree best.
 
-    names: P names, as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P).
-    prior: (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None for 0.
+    names: P names, such as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P). prior:
+    (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None if all are 0.
     prior_covariance: (P, P) before the solve, None if the parameters were independent.
     """
 
@@ -99,8 +99,8 @@ class Calibration:
 def combine(calibrations: Sequence[Calibration]) -> Calibration:
     """Combine calibrations of one robot from several logs: their information adds up, and the prior counts once.
 
-    A parameter that only some logs have is estimated from these logs. Its prior is from the first of these logs, conditional
-    on the parameters of the logs before.
+    A parameter that only some logs have is estimated from these logs. Its prior is from the first log that has it,
+    conditional on the parameters that this log shares with earlier logs.
     """
     names = tuple(dict.fromkeys(name for one in calibrations for name in one.names))
     prior, prior_vector, told, told_vector = (np.zeros((len(names),) * axes) for axes in (2, 1, 2, 1))
@@ -110,10 +110,10 @@ def combine(calibrations: Sequence[Calibration]) -> Calibration:
         before = np.linalg.inv(one.before)
         own = np.linalg.inv(one.covariance) - before
         size, axes = np.linalg.eigh((own + own.T) / 2)
-        own = (axes * np.maximum(size, 0.0)) @ axes.T  # rounding must not take information away
+        own = (axes * np.maximum(size, 0.0)) @ axes.T  # Rounding may make information negative.
         told[np.ix_(at, at)] += own
         told_vector[at] += (own + before) @ one.values - before @ one.expected
-        # The chain rule: p(new | known) = p(new, known) / p(known). All three are from the prior of this log.
+        # Earlier logs gave the prior of the known parameters. This log adds p(new | known) = p(new, known) / p(known).
         there = np.flatnonzero(known[at])
         new = before.copy()
         new[np.ix_(there, there)] -= np.linalg.inv(one.before[np.ix_(there, there)])
@@ -127,7 +127,7 @@ def combine(calibrations: Sequence[Calibration]) -> Calibration:
 
 
 class CalibratedMeasurements(Protocol):
-    """The measurements of a log, as logged, and corrected for given values of the shared errors (`at`)."""
+    """The measurements of a log. `at` corrects them for given values of the shared errors."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -159,20 +159,20 @@ class CalibratedMeasurements(Protocol):
 
     @property
     def bounds(self) -> Floats:
-        """(P,) the largest absolute values of the parameters."""
+        """(P,) the largest absolute values that the parameters may take."""
 
     @property
     def noise(self) -> NoiseFactors:
-        """The noise that the measurements have."""
+        """The noise of the measurements, as factors on the nominal noise."""
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated, of `rays`, `ranges` and `odometry`."""
+        """The kinds of noise that are estimated: any of `rays`, `ranges` and `odometry`."""
 
     @property
     def unknown_scales(self) -> frozenset[str]:
-        """The parameters that scale the measured lengths, if every kind of length has one and no absolute pose is measured.
-        The log cannot determine a factor that all these lengths share. The set is empty in all other cases."""
+        """The scale parameters, if the log leaves the scale of its map open, else an empty set. The scale is open if each
+        kind of measured length has a scale parameter, and no absolute pose is measured."""
 
     def take(self, keyframes: Keyframes, rays: Rays) -> Self:
         """Return the same errors for other keyframes and rays of the log."""
@@ -181,11 +181,10 @@ class CalibratedMeasurements(Protocol):
         """Return the same measurements with other noise."""
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
-        """Return four pairs of keyframes and settings, with odometry noise only along the path, only across it, only in
-        turning, and without odometry noise.
+        """Return four pairs of keyframes and settings that split the noise of motions into four components.
 
-        The odometry noise is nominal. Only the last pair has the noise that is not from odometry. values: (P,) the corrected
-        errors.
+        The components are the nominal odometry noise along the path, across it and in turning, and the noise of `planar` in
+        the settings. values: (P,) the corrected errors.
         """
 
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:

@@ -19,7 +19,7 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 }
 """The numbers of distortion coefficients that each model accepts."""
 
-_STEPS, _FINER = 2000, 4  # The angles and the refinements of the grid that finds the fold of a lens. More are more exact.
+_STEPS, _FINER = 2000, 4  # The angles of the grid that finds the fold of a lens, and its refinements. More are more exact.
 _ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More are more exact and slower.
 _LEAST = 1e-9  # The least solid angle of a camera, sr. It keeps a division by the solid angle finite.
 _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step to stop at (rad) and the least divisor.
@@ -27,7 +27,7 @@ _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step
 
 @dataclass(frozen=True)
 class RangeNoise:
-    """The noise of the depths of one sensor. Its fields have the meaning of the settings `depth`.
+    """The noise of the depths of one sensor.
 
     sigma: m, the constant part. sigma_per_m: the part that grows with the distance, m per m. bias: m, the part that all
     ranges of one object share.
@@ -44,7 +44,7 @@ class Camera:
 
     matrix: (3, 3) px. distortion: (D,) coefficients. base_T_camera: (4, 4) the pose of the optical frame in base.
     depth_scale: the units of a depth image per metre. sees_size: whether the boxes show how large the objects are. A box
-    that only marks a bearing does not. depth_noise: the noise of its depths, None if only the settings give it.
+    that only marks a bearing does not. depth_noise: the noise of its depths, None for the noise in the settings `depth`.
     """
 
     name: str
@@ -83,8 +83,7 @@ class Camera:
         """The angle to the optical axis, rad, at which the lens model folds back. It is at most 90 degrees.
 
         Beyond the fold, a larger angle gives a smaller image radius, so the model projects invisible points into the image.
-        A fisheye lens may see beyond 90 degrees, but OpenCV calibrates it with points of z > 0 only. The calibration does
-        not tell whether the lens leaves the image corners dark.
+        A fisheye lens may see beyond 90 degrees, but OpenCV calibrates it with points of z > 0 only.
         """
         if not self.distortion.any():
             return np.pi / 2
@@ -126,7 +125,7 @@ class Camera:
 
 
 def spoken_name(name: str) -> str:
-    """Return the name of a camera in a message: "camera front", and "camera" for a camera that is called camera."""
+    """Return the name of a camera for a message: "camera front", but "camera" for a camera with the name "camera"."""
     return name if name == "camera" else f"camera {name}"
 
 
@@ -184,7 +183,7 @@ def _undistort_newton(camera: Camera, pixels: Floats) -> Floats:
     for _ in range(_TURNS):
         homogeneous = np.column_stack([flat, np.ones(len(flat))])
         again, by = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
-        slope = by[:, 3:5].reshape(-1, 2, 2)  # derivatives by a translation in x and y, which moves the point
+        slope = by[:, 3:5].reshape(-1, 2, 2)  # The derivatives by the translation are those by the point.
         step = (np.linalg.pinv(slope) @ (pixels - again[:, 0])[..., None])[..., 0]
         trial = flat + factor[:, None] * step
         closer = _misses(camera, trial, pixels)
@@ -278,7 +277,7 @@ def _fisheye_radius(camera: Camera) -> Floats:
 def _growth(camera: Camera, angle: Floats) -> Floats:
     """Return how fast (A,) the image radius grows at angles (A,), rad. Beyond the fold this is <= 0.
 
-    It is the derivative by the angle for a fisheye, else the least derivative by the tangent in any direction of the image.
+    For a fisheye it is the derivative by the angle, else the least derivative by tan(angle) over all image directions.
     """
     with np.errstate(all="ignore"):  # A wrong calibration may overflow.
         if camera.fisheye:

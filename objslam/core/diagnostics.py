@@ -20,10 +20,9 @@ class Ledger:
     warnings: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
-        """Add `count` drops for a reason.
+        """Count dropped data under a reason.
 
-        of: the number of data that were checked, None if unknown. where: the file:line or stamp, kept for the first few
-        drops only.
+        of: the number of data that were checked, None if unknown. where: file:line or stamp, kept for the first drops.
         """
         reason = one_line(reason)
         if of is not None:
@@ -54,5 +53,5 @@ class Ledger:
         for reason, count in self.dropped.items():
             places, total = self.examples.get(reason), self.totals.get(reason)
             share = f" of {total} ({100 * count / total:.0f} %)" if total else ""
-            lines.append(f"dropped {count}{share}: {reason}" + (f" (first: {', '.join(places)})" if places else ""))
+            lines.append(f"dropped {count}{share}: {reason}" + (f" (first: {'; '.join(places)})" if places else ""))
         return lines + self.warnings

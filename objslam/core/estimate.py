@@ -14,16 +14,14 @@ class Estimate:
     """The result of a solve with K keyframes, N objects and R rays.
 
     map_T_base: (K, 4, 4). positions: (N, 3) m in map. covariance: (N, 3, 3) m^2, NaN for an object that was not solved.
-    solved: (N,) whether the object was part of the graph. seen_sigma: (N,) m, the standard deviation along the least certain
-    axis of the object's position relative to a camera that saw it. It leaves out the drift of the map up to this camera. It
-    is NaN for an object that was not solved. weight: (R,) robust weight of each ray in [0, 1]. A ray that is rejected or has
-    no object weighs 0. cost_before: error of the graph where the first solve starts. cost_after: error of the graph at the
-    optimum of the last solve. For Eq. 1 the error is the sum of distances, m.
-    calibration: the shared errors that were estimated, or None. The poses belong to measurements without these errors.
-    noise: the estimated noise, None if none was estimated.
+    solved: (N,) whether the object was part of the graph. seen_sigma: (N,) m, the standard deviation of the object's
+    position along its least certain axis, relative to a camera that saw it. It leaves out the drift of the path. NaN for an
+    object that was not solved. weight: (R,) robust weight of each ray in [0, 1]. A ray that is rejected or has no object
+    weighs 0. cost_before: error of the graph at the start of the first solve. cost_after: error of the graph at the optimum
+    of the last solve. For Eq. 1 the error is the sum of distances, m. calibration: the shared errors that were estimated, or
+    None. The poses fit measurements that are corrected by them. noise: the estimated noise, None if none was estimated.
     box_offset: the standard deviation of the error that all box centres of an object share, divided by the object's size.
-    None if boxes have no size.
-    tags: the rotation and the size of each fiducial that has them, by the index of its object.
+    None if boxes have no size. tags: the rotation and the size of each fiducial that has them, by the index of its object.
     """
 
     map_T_base: Floats

@@ -18,8 +18,8 @@ from objslam.core.rotation import (
 )
 
 _ON_A_LINE = 1e-9
-"""Points count as on a line up to this ratio of the second to the first singular value of their cross-covariance. A larger
-ratio takes more point sets for lines. Rounding leaves about 1e-15."""
+"""Points lie on a line if the second singular value of their cross-covariance is at most this share of the first. A larger
+share takes more point sets for lines. Rounding leaves about 1e-15."""
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
@@ -90,8 +90,7 @@ def log_se3(pose: Floats) -> Floats:
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
-    """Return two norms of `log_se3` of poses (N, 4, 4): of its rotation half (N,), rad, and of its translation half (N,),
-    m."""
+    """Return the norms of the halves of `log_se3` of poses (N, 4, 4): rotation (N,), rad, and translation (N,), m."""
     r, t = pose[:, :3, :3], pose[:, :3, 3]
     axis = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1) / 2
     sine = np.sqrt((axis * axis).sum(axis=1))
@@ -102,10 +101,10 @@ def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
 
 
 def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
-    """Return the two norms of `twist_lengths` for the step from one pose (4, 4) to another, ten times faster."""
+    """Return the two numbers of `twist_lengths` for the motion between two poses (4, 4), ten times faster."""
     (a0, a1, a2, ax), (b0, b1, b2, by), (c0, c1, c2, cz) = before[:3].tolist()
     (d0, d1, d2, dx), (e0, e1, e2, ey), (f0, f1, f2, fz) = after[:3].tolist()
-    x, y, z = dx - ax, ey - by, fz - cz  # The step and the axis are in the frame in which both poses are given.
+    x, y, z = dx - ax, ey - by, fz - cz  # The step, like the axis below, is in the frame of the map, not of the body.
     trace = a0 * d0 + b0 * e0 + c0 * f0 + a1 * d1 + b1 * e1 + c1 * f1 + a2 * d2 + b2 * e2 + c2 * f2
     # Half the sum of the cross products of the axes before and after is the rotation axis times the sine of the angle.
     u = (b0 * f0 - c0 * e0 + b1 * f1 - c1 * e1 + b2 * f2 - c2 * e2) / 2
@@ -127,8 +126,8 @@ def exp_se3(twist: Floats) -> Floats:
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return the rotation angles (..., 1, 1) of vectors (..., 3), which of them are small and need a series, and the angles
-    with 1 in place of the small ones."""
+    """Return for rotation vectors (..., 3) three arrays (..., 1, 1): the angles, whether each is so small that a series is
+    needed, and the angles as divisors, with 1 for the small ones."""
     angle = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = angle < 1e-4
     return angle, small, np.where(small, 1.0, angle)
@@ -212,7 +211,7 @@ def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "
 
 
 def _best_rotation(a: Floats, b: Floats) -> tuple[Floats, float]:
-    """Return the rotation (3, 3) that maximises the sum of products of rotated points `a` with `b` (N, 3), and this sum."""
+    """Return the rotation R (3, 3) with the largest sum of dot products of R a and b, both (N, 3), and this sum."""
     u, size, vt = np.linalg.svd(b.T @ a)
     if size[0] > 0 and size[1] <= _ON_A_LINE * size[0]:
         from scipy.spatial.transform import Rotation

@@ -17,7 +17,7 @@ class NoiseFactors:
 
     rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges: `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`.
     along: `odometry.x_per_m` and `odometry.xy_per_rad`. across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the
-    odometry's noise of the heading. shrinkage: the share by which a joint solve makes all lengths too short (0: by nothing).
+    odometry's noise of the heading. shrinkage: the share by which a joint solve makes all lengths too short.
     """
 
     rays: float = 1.0
@@ -29,8 +29,8 @@ class NoiseFactors:
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:
-        """Return the settings with the odometry noise multiplied by its factors. The noise of rays and ranges stays, because
-        `rays_with_noise` multiplies it."""
+        """Return the settings with the odometry noise multiplied by the factors. `rays_with_noise` multiplies the noise of
+        rays and ranges."""
         of = nominal.odometry
         odometry = {
             "x_per_m": of.x_per_m * self.along,
@@ -44,7 +44,7 @@ class NoiseFactors:
         return nominal.model_copy(update={"odometry": of.model_copy(update=odometry)})
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
-        """Return rays with the noise of their directions and of their ranges multiplied by its factors."""
+        """Return rays whose noise of directions and ranges is multiplied by the factors."""
         return replace(
             nominal,
             sigma=nominal.sigma * self.rays,
@@ -69,11 +69,9 @@ NOMINAL = NoiseFactors()
 
 
 def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
-    """Return the standard deviations (n,), m, of ranges (n,), m, and those (n,), m, of the bias that all ranges of an object
-    share.
+    """Return the standard deviations (n,), m, of ranges (n,), m, and of the bias that all ranges of an object share.
 
-    camera: (n,) the index of each range's camera. The ranges of a camera with `depth_noise` have this noise. The ranges of
-    the other cameras have the noise of the settings.
+    camera: (n,) the index of each range's camera. A camera without `depth_noise` has the noise in the settings.
     """
     of = settings.depth
     told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]

@@ -18,10 +18,10 @@ from objslam.core.statistics import SAME_POINT
 Status = Literal["ok", "unresolved"]
 Fate = Literal["new", "confirmed", "moved", "gone"]
 FATES: tuple[Fate, ...] = ("new", "confirmed", "moved", "gone")
-"""What may become of an object from one session to the next."""
+"""The states that an object can have after several sessions."""
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
-_SHOWN = 20  # The most objects in the text of a map. A larger number makes it longer.
+_SHOWN = 20  # The most objects in the text of a map.
 _UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Entries of the covariance in a table row.
 
 COLUMNS: dict[str, str] = {
@@ -50,13 +50,13 @@ class SeenFrom:
 
 @dataclass(frozen=True)
 class Life:
-    """What several sessions say of one object.
+    """The history of one object over several sessions.
 
     state: `new` if one session found it, `confirmed` if a later session found it again, `moved` if a later session found it
-    at another position, or `gone`. probability: that the object is still at its position. sessions_expected, sessions_seen:
-    in how many sessions it was in view, and in how many it was found. looks, detections: in how many camera frames of all
-    sessions it was in view, and in how many it was detected. updated: the time of the last session, s. moved_from: (3,) m,
-    where it was before it moved, None if it did not move.
+    at another position, `gone` if it is no longer there. probability: that the object is still at its position.
+    sessions_expected, sessions_seen: in how many sessions it was in view, and in how many it was found. looks, detections:
+    in how many camera frames of all sessions it was in view, and in how many it was detected. updated: the time of the last
+    session, s. moved_from: (3,) m, where it was before it moved, None if it did not move.
     """
 
     state: Fate
@@ -75,8 +75,8 @@ class TagPose:
 
     xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
     covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size
-    from the settings. other_xyzw: (4,) the second rotation that a flat square leaves open, None if the views rule it out.
-    other_probability: of this second rotation, 0 without one.
+    from the settings. other_xyzw: (4,) a second rotation at which a flat square looks nearly the same, None if the views
+    rule it out. other_probability: of this second rotation, 0 without one.
     """
 
     xyzw: Floats
@@ -102,7 +102,8 @@ class TagPose:
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
 
     def turned(self, rotation: Floats, yaw_sigma: float = 0.0) -> Self:
-        """Return the fiducial in a frame in which its map has a rotation (3, 3), whose yaw has a sigma, rad."""
+        """Return the fiducial after `rotation` (3, 3) turned its map. yaw_sigma: rad, the standard deviation of this
+        rotation's yaw."""
         up = (rotation @ self.rotation)[2]
         return replace(
             self,
@@ -121,10 +122,10 @@ class MapObject:
     these rays and the object. first_seen, last_seen: stamps, s. extent: width and height, m, None if unknown. ray: the
     origin (3,), m, and the direction (3,) of one ray of an unresolved object. labels: the share of each label among the
     boxes. existence: the probability that the object exists. labels and existence are None if the run took all boxes of a
-    label as one object. seen_from: from where it was detected, None if unknown. life: what several sessions say of it, None
-    in the map of a single run. tag: the rotation and size of a fiducial, None for another object. body: its size and
-    heading around the position, None for a point. ray_point: (3,) m, the point at which the rays through the centres of its
-    boxes meet, if the position is the centre of the body.
+    label as one object. seen_from: from where it was detected, None if unknown. life: its history over several sessions,
+    None in the map of a single run. tag: the rotation and size of a fiducial, None for another object. body: its size and
+    heading around the position, None for a point. ray_point: (3,) m, where the rays through the centres of its boxes meet,
+    None if that is the position itself.
     """
 
     id: int
@@ -242,7 +243,7 @@ class ObjectMap:
         return tuple(o for distance, o in self._by_distance(point, label) if distance <= radius)
 
     def in_box(self, low: ArrayLike, high: ArrayLike, label: str | None = None) -> tuple[MapObject, ...]:
-        """Return the objects inside or on a box that has its sides along the axes, with `low` and `high` as corners."""
+        """Return the objects inside or on the box with sides along the axes and the opposite corners `low` and `high`."""
         lower, upper = _point(low), _point(high)
         if lower.shape != upper.shape:
             raise ValueError("both corners must have two coordinates, or both three")
@@ -302,7 +303,7 @@ def _same_objects(ours: tuple[MapObject, ...], theirs: tuple[MapObject, ...]) ->
         columns = [column for column, k in enumerate(its) if theirs[k].label == label]
         squared[np.ix_(rows, columns)] = _mahalanobis([ours[mine[r]] for r in rows], [theirs[its[c]] for c in columns])
     allowed: Bools = squared <= SAME_POINT
-    # A pair that is not allowed costs more than all allowed pairs together.
+    # A pair that is not allowed costs more than all allowed pairs together, so it displaces none of them.
     cost = np.where(allowed, squared, SAME_POINT * (min(squared.shape) + 1))
     pairs = np.column_stack(linear_sum_assignment(cost)).tolist() if allowed.any() else []
     return [(mine[row], its[column]) for row, column in pairs if allowed[row, column]]
@@ -321,7 +322,7 @@ def _fuse(a: MapObject, b: MapObject) -> MapObject:
     """Fuse two measurements of one object. The result has the id and the label of the first."""
     assert a.covariance is not None
     assert b.covariance is not None
-    # This gain is equivalent to adding information, and it also works with a singular covariance.
+    # A Kalman gain gives the same as a sum of information matrices, and also works with a singular covariance.
     gain = a.covariance @ np.linalg.inv(a.covariance + b.covariance + _FLOOR**2 * np.eye(3))
     covariance = (np.eye(3) - gain) @ a.covariance
     share = a.rays / max(a.rays + b.rays, 1)

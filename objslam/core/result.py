@@ -21,10 +21,10 @@ class RunResult:
     the rays in map at the solved poses. residual: (R,) rad, the angle between each ray and its object, NaN without an
     object. weight: (R,) robust weight in [0, 1]. summary: the content of summary.json. path, path_after: the path of the log
     at its full rate, before and after the estimation. trace: the rounds of the estimation. images: the image files of each
-    camera. surface: the surroundings, None without depth images. surface_before: the same at the poses before the
-    estimation, if the settings ask for it. calibration: the shared errors that were estimated, None if none were.
-    residual_before: (R,) rad, the residual of the rays as measured, with the shared errors. None if none were estimated.
-    views: all camera frames on the path, also those without a box, at the solved poses. None if they were not asked for.
+    camera. surface: the surroundings, None without depth images. surface_before: the surroundings at the poses before the
+    estimation, None unless the settings ask for it. calibration: the shared errors that were estimated, None if none were.
+    residual_before: (R,) rad, the residual before the correction of the shared errors, None if none were estimated. views:
+    all camera frames on the path, also those without a box, at the solved poses. None if they were not asked for.
     """
 
     map: ObjectMap

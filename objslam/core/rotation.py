@@ -8,8 +8,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 
 _SMALL = 1e-4
-"""The sine of half a rotation angle below which a series replaces the quotient of the angle and this sine, which becomes
-0 / 0. A larger value makes the series less exact. With this value, its relative error is below 1e-17."""
+"""If the sine of half a rotation angle is smaller than this, a series replaces angle / sine, which tends to 0 / 0. A larger
+value makes the series less exact. At this value, its relative error is below 1e-17."""
 
 
 def _cross_product_map() -> Floats:
@@ -63,7 +63,7 @@ def rotation_from_quaternion(xyzw: Floats) -> Floats:
 def quaternion_from_rotation(rotation: Floats) -> Floats:
     """Return the unit quaternions (..., 4) x, y, z, w with w >= 0 of rotations (..., 3, 3) (Shepperd 1978).
 
-    If w = 0, both q and -q have w >= 0. Then the one is returned whose first number other than 0 is positive.
+    If w = 0, both q and -q have w >= 0. The result is the one whose first number other than 0 is positive.
     """
     # Row i is 4 q[i] q, where q is the quaternion. The row with the largest diagonal entry is the most exact one.
     outer = np.empty((*rotation.shape[:-2], 4, 4))

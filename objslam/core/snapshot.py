@@ -11,7 +11,7 @@ from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 
-NOT_USED = " not used"  # The end of the name, in `Snapshot.counters`, of a kind of messages that the settings do not use.
+NOT_USED = " not used"  # The end of a name in `Snapshot.counters`, such as "odometry not used" if the settings exclude it.
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class CameraFrame:
 
 @dataclass(frozen=True)
 class InPriorMap:
-    """What a session knows about its place in a prior map.
+    """The place of a session in a prior map.
 
-    objects: how many of its objects were found there, 0 while the place is unknown. line: the same and the evidence, as a
-    sentence.
+    objects: how many of its objects were found there, 0 while the place is unknown. line: a sentence for the user, with this
+    number and the evidence, or with the reason why the place is unknown.
     """
 
     objects: int
@@ -49,13 +49,13 @@ class Snapshot:
 
     stamp: the time of the newest keyframe, s, NaN before the first keyframe. map: the objects, as an offline run returns
     them. path: map_T_base of all keyframes. keyframes, rebuilds: how many keyframes there are, and how often the graph was
-    rebuilt. lag: the time, s, from the arrival of the newest frame in the map until the map contained it. update: the median
-    and the 99th percentile of the lag, s, of recent frames. counters: how many messages of each kind were accepted. dropped:
-    how many data were dropped, by reason. frames: the newest keyframe of each camera, without its image. calibration: the
-    shared errors that the session corrects in its measurements, None if it corrects none. map_T_odom: (4, 4) the pose of the
-    odometry's frame in the map at the newest keyframe (REP 105), for the odometry as received. None if the odometry does not
-    cover this keyframe. in_map: the place in a prior map, None without such a map or before the first search for it. Once
-    the place is known, everything is in the frame of the prior map.
+    rebuilt. lag: the time, s, that the newest frame in the map took from its arrival until the map contained it. update: the
+    median and the 99th percentile of the lag of recent frames, s. counters: how many messages of each kind were accepted.
+    dropped: how many data were dropped, by reason. frames: the newest keyframe of each camera, without its image.
+    calibration: the shared errors that the session corrects in its measurements, None if it corrects none. map_T_odom:
+    (4, 4) the pose of the odometry's frame in the map at the newest keyframe (REP 105), for uncorrected odometry. None if
+    the odometry does not cover this keyframe. in_map: the place in a prior map, None without such a map or before the first
+    search for it. Once the place is known, everything is in the frame of the prior map.
     """
 
     stamp: float

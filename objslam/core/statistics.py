@@ -12,22 +12,22 @@ from objslam.core.arrays import Floats, Ints
 
 SAME_POINT = 11.345
 """The squared Mahalanobis distance between two estimates of one point is below this value in 99 % of all cases (chi-squared,
-3 degrees of freedom). A larger value takes more pairs of estimates for one point."""
+3 degrees of freedom). A larger value treats more pairs of estimates as one point."""
 SAME_POINT_WIDE = 16.266
 """The squared Mahalanobis distance between two estimates of one point is below this value in 99.9 % of all cases
 (chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
-"""The squared deviation below which 99.73 % of the planar motions in x, y and yaw lie (chi-squared, 3 degrees of freedom).
-99.73 % of a Gaussian is within 3 standard deviations. A larger value tries less likely motions."""
+"""The squared deviation of 99.73 % of planar motions in x, y and yaw is below this value (chi-squared, 3 degrees of
+freedom). It is the share of a Gaussian within 3 standard deviations. A larger value tries less likely motions."""
 STRAY_RAY = 13.816
-"""The squared deviation below which 99.9 % of an object's own rays lie (chi-squared, 2 degrees of freedom). It is also the
-cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""
+"""The squared deviation of 99.9 % of an object's own rays is below this value (chi-squared, 2 degrees of freedom). It is
+also the cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""
 OUTLIER_RAY = 4.0
 """The deviation above which a ray is rejected. 3e-4 of an object's own rays exceed it (Rayleigh, exp(-4^2 / 2)). A larger
 deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
-"""The largest deviation that one ray adds to the measured noise of its object. A larger deviation lets a false box raise
-this noise more."""
+"""A ray with a larger deviation counts as one with this deviation in the measured noise of its object. A larger value lets a
+false box raise this noise more."""
 HALF_RAY = 6.0
 """The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
 squared). A larger deviation gives rays of other things more influence."""
@@ -45,21 +45,22 @@ NORMAL_MEDIAN = 0.6745
 """The median absolute value of a standard Gaussian. It scales a median absolute deviation to a standard deviation."""
 NOISE_FACTORS = (1.0, 3.0)
 """The limits on the factor by which association multiplies the nominal noise of an object's rays. The lower limit is 1,
-because box noise has heavy tails. A larger upper limit accepts rays that are farther from a noisy object."""
+because a median underestimates the heavy tails of box noise. A larger upper limit accepts rays farther from a noisy
+object."""
 MOST_NOISE_FACTOR = 5.0
 """The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the
 box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
-"""The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. The
-noise of a class and the nominal noise are weighted likewise. A larger number keeps objects near the noise of their class for
-longer."""
+"""The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. At the
+same number of rays of a class, the noise of the class and the nominal noise have equal weight. A larger number keeps objects
+near the noise of their class for longer."""
 POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
 
 
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:
-    """Return for each group (N,) the factor >= 1 on the nominal noise of its rays, from the median of their deviations (R,).
+    """Return for each group (N,) a factor >= 1 on the nominal noise of rays, from the median of their deviations (R,).
 
     index: (R,) the group of each ray. count: the number of groups, N. A group of fewer than `fewest` rays has the factor 1.
     """
@@ -88,7 +89,7 @@ def grouped_quantile(values: Floats, index: Ints, count: int, share: float) -> F
 
 
 def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[float, ...]) -> list[Floats]:
-    """Return one result of `grouped_quantile` for each share."""
+    """Return the result of `grouped_quantile` for each share."""
     ordered = values[np.lexsort((values, index))]
     number = np.bincount(index, minlength=count)
     some = number > 0
@@ -102,7 +103,7 @@ def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[flo
 def poisson_tail(least: Ints, mean: Floats) -> Floats:
     """Return the probability (N,) that a Poisson variable of this mean (N,) is at least `least` (N,).
 
-    It is the regularised incomplete gamma function (NIST DLMF 8.4.10). An import of scipy.stats would take 0.3 s.
+    It is the regularised incomplete gamma function (NIST DLMF 8.4.10). scipy.stats has it too, but its import takes 0.3 s.
     """
     from scipy.special import gammainc
 

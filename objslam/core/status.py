@@ -16,9 +16,9 @@ FEWEST_RAYS = 2
 def is_resolved(sigma: Any, reach: Any, rays: Any, parallax: Any, ranged: Any, limits: config.Triangulation) -> Any:
     """Return whether the position of each object (N,) is reliable. Arguments are arrays, tensors, or scalars for one object.
 
-    sigma: (N,) m, as `Estimate.seen_sigma`, but inf or NaN if the rays do not determine the position. reach: (N,) m, as the
-    function `reach` returns it. rays: (N,) number of inliers. parallax: (N,) rad, the widest angle between these rays.
-    ranged: (N,) whether measured ranges replace the parallax. limits: the settings of the triangulation.
+    sigma: (N,) m, `Estimate.seen_sigma`, or inf or NaN if the rays do not determine the position. reach: (N,) m, from the
+    function `reach`. rays: (N,) number of inlier rays. parallax: (N,) rad, the widest angle between them. ranged: (N,)
+    whether measured ranges replace the parallax. limits: the settings of the triangulation.
     """
     wide = ranged | (parallax >= math.radians(limits.min_parallax_deg))
     return wide & (rays >= FEWEST_RAYS) & (sigma <= limits.max_rel_sigma * reach)

@@ -31,9 +31,9 @@ class Iteration:
     """The state after one step of a solver.
 
     stage: `grow` adds keyframes to the graph, `solve` is one step of Levenberg-Marquardt. cost: the error of the graph. For
-    `grow`, it is the error of the newest part of the graph. path: (k, 3) m, the robot in map at the first k poses, which are
-    in the graph. Images of one stamp share a pose. positions: (N, 3) m, NaN for an object that is not in the graph.
-    parameters: the shared errors, None if this step does not change them.
+    `grow`, it is the error of the newest part of the graph. path: (k, 3) m, the positions of the robot in map at the k poses
+    that are in the graph so far. Images of one stamp share a pose. positions: (N, 3) m, NaN for an object that is not in the
+    graph. parameters: the shared errors, None if this step does not change them.
     """
 
     stage: Stage
@@ -48,7 +48,8 @@ class Round:
     """One association and the estimate from it.
 
     why: `fixed` for fixed poses, `labels` for one object per label, `association` for a new association at the current
-    poses, `merge` for merged copies of one object. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) of each ray.
+    poses, `merge` for merged copies of one object, `bodies` for bearings to bodies' centres. map_T_base: (K, 4, 4).
+    positions: (N, 3) m. weight: (R,) of each ray.
     """
 
     why: Why
@@ -63,8 +64,8 @@ class Round:
 class Trace:
     """A collector of the rounds of an estimation.
 
-    base_T_camera: (K, 4, 4) the camera on the robot at each keyframe. count: how many positions of an iteration are objects.
-    The positions behind them, such as further corners of fiducials, are left out. None means all.
+    base_T_camera: (K, 4, 4) the camera on the robot at each keyframe. count: the number of objects, which are the first
+    positions of an iteration. The positions behind them, such as further corners of fiducials, are left out. None keeps all.
     """
 
     base_T_camera: Floats
@@ -81,14 +82,14 @@ class Trace:
         self._iterations.append(step)
 
     def aside(self) -> Trace:
-        """Return an empty trace for an attempt that may be discarded."""
+        """Return an empty trace for an attempt that may fail."""
         return Trace(self.base_T_camera, self.count)
 
     def take(self, attempt: Trace) -> None:
-        """Add the iterations of a successful attempt."""
+        """Add the iterations of an attempt that succeeded."""
         self._iterations += attempt._iterations
 
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:
-        """End a round, which gets all iterations since the end of the last round."""
+        """End a round. It gets all iterations since the end of the round before."""
         iterations, self._iterations = tuple(self._iterations), []
         self.rounds.append(Round(why, association, iterations, estimate.map_T_base, estimate.positions, estimate.weight))

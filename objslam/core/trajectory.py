@@ -7,13 +7,13 @@ from objslam.core.geometry import interpolate, inverse, log_se3
 from objslam.core.types import Trajectory
 
 _SPAN = 0.4
-"""The time, s, over which a speed is taken. A longer time smooths more. Chosen to span several poses of slow odometry."""
+"""The time, s, over which a speed is averaged. It spans several poses of slow odometry. A longer time smooths more."""
 
 
 def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
     """Return the speed (K,), m/s, and the turn rate to the left (K,), rad/s, of a path at stamps (K,), s.
 
-    Both are means over 0.4 s. At an end of the path, the time is shorter. A path of one pose gives 0 for both.
+    Both are means over 0.4 s, or over less at an end of the path. A path of one pose gives 0 for both.
     """
     begin, end = (np.clip(stamps + half, path.stamps[0], path.stamps[-1]) for half in (-_SPAN / 2, _SPAN / 2))
     before, after = (interpolate(path.stamps, path.poses, at, np.inf)[0] for at in (begin, end))

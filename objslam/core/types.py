@@ -1,7 +1,7 @@
 """The data types of the pipeline: frozen dataclasses of arrays that check their shapes when they are made.
 
 Coordinate frames follow REP 103/105: `map`, `odom`, `base` (x forward, y left, z up), `camera` (optical: x right, y down, z
-forward). `a_T_b` is the pose of b in a. It turns coordinates in b into coordinates in a. Units are SI, angles in radians.
+forward). `a_T_b` is the pose of b in a. It transforms coordinates in b to coordinates in a. Units are SI, angles in radians.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from objslam.core.diagnostics import Ledger
 MAX_BOXES = 10_000
 """The most boxes of a frame. A frame with more is rejected: no detector finds so many, and association would be too slow."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
-"""An axis of a map's frame, with its direction, that points up in the world."""
+"""The axis of a map's frame that points up in the world, with its sign."""
 
 
 def _need(condition: Any, message: str) -> None:
@@ -56,10 +56,10 @@ class Detections:
 
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
-    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge.
-    Then box centres are valid up to the edge. This holds for fiducials, because a detector needs all their corners.
-    corners: (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if
-    no box has corners. ValueError if a shape, an index or the order is wrong.
+    the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge,
+    as with fiducials, of which a detector needs all corners. Then box centres are valid up to the edge. corners: (M, 4, 2)
+    px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if no box has corners.
+    ValueError if a shape, an index or the order is wrong.
     """
 
     frame_stamps: Floats
@@ -127,8 +127,8 @@ class CameraLog:
 
 @dataclass(frozen=True)
 class TruthObject:
-    """One object of the ground truth. position: (3,) m in map. size: (3,) m, length, width and height. yaw: rad, the
-    direction of its length. Both are None if unknown."""
+    """One object of the ground truth. position: (3,) m in map. size: (3,) m, length, width and height, None if unknown. yaw:
+    rad, the direction of its length, None if unknown."""
 
     id: int
     label: str
@@ -149,8 +149,8 @@ class Truth:
 class Log:
     """The log of a robot, with odometry, localisation or both.
 
-    odometry: odom_T_base. localization: map_T_base. path: the absolute path that was read, None for a log from memory.
-    reading: the data dropped while the log was read, None if they were not counted.
+    odometry: odom_T_base. localization: map_T_base. path: the file or folder that was read, absolute, None for a log from
+    memory. reading: the data dropped while the log was read, None if they were not counted.
     """
 
     name: str
@@ -163,7 +163,7 @@ class Log:
 
     @property
     def robot_path(self) -> Trajectory | None:
-        """The poses that place the frames: the localisation if it has poses, else the odometry, None without both."""
+        """The path that gives keyframes their poses: the localisation if it has poses, else the odometry, else None."""
         return next((path for path in (self.localization, self.odometry) if path is not None and len(path)), None)
 
 
@@ -171,15 +171,14 @@ class Log:
 class Keyframes:
     """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
-    stamps: (K,) s, non-decreasing. If different clock offsets of several cameras were corrected, this holds for each camera
-    alone. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera.
-    base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no
-    localisation. localized_every: how many keyframes (>= 1, on average) are interpolated from one measurement of the
-    absolute pose, or 0 if map_T_base is odometry. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose,
-    None without odometry. drift: (K, 6, 6) covariance, rotation first, that the odometry has accumulated since its start, in
-    the same coordinate frame. stretch: (K,) the number of the odometry stretch of each keyframe, where gaps split the
-    odometry into stretches. None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and
-    drift have no meaning.
+    stamps: (K,) s, non-decreasing. After a correction of the cameras' clocks, this holds for each camera alone. camera: (K,)
+    index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera. base_T_camera: (K, 4, 4).
+    map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation. localized_every: how many
+    keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. odom_T_base:
+    (K, 4, 4) in the coordinate frame of the first odometry pose, None without odometry. drift: (K, 6, 6) covariance,
+    rotation first, of the odometry's error since its start, in the frame of odom_T_base. stretch: (K,) the number of the
+    odometry stretch of each keyframe, where gaps split the odometry into stretches. None means one stretch for all. -1 marks
+    a keyframe without odometry, whose odom_T_base and drift have no meaning.
     """
 
     stamps: Floats

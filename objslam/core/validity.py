@@ -28,7 +28,7 @@ _RIGID = 1e-3
 """The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations. Rotations that
 are printed with four decimals are below it."""
 _ROUNDING = 1e-12
-"""The difference between R^T R and the identity up to which R stays as it is, bit by bit. A larger value leaves more
+"""R stays unchanged, bit by bit, if no entry of R^T R differs from the identity by more. A larger value leaves more
 rotations inexact. A product of a hundred rotations is below it."""
 _SHORTEST, _LONGEST = 1e-6, 1e3
 """The bounds of the length of a quaternion. Wider bounds accept more wrong quaternions. A valid quaternion has length 1, but
@@ -64,9 +64,9 @@ def valid_pose_rows(rows: Floats) -> Bools:
 def rigid_poses(poses: Floats) -> tuple[Floats, Bools]:
     """Return rigid poses (N, 4, 4) with exact rotations, and which of the poses (N, 4, 4) are rigid at all.
 
-    A pose is rigid if its position is valid, its last row is 0, 0, 0, 1, and its rotation is within 1e-3 of an exact one, in
-    every entry of R^T R. The nearest exact rotation (Kabsch 1976) replaces one that is off by more than rounding. The
-    identity replaces a pose that is not rigid.
+    A pose is rigid if its position is valid, its last row is 0, 0, 0, 1, and every entry of R^T R is within 1e-3 of the
+    identity. The nearest exact rotation (Kabsch 1976) replaces a rotation that is off by more than rounding. The identity
+    replaces a pose that is not rigid.
     """
     rotation = poses[:, :3, :3]
     sane = valid_positions(poses[:, :3, 3]) & np.asarray((np.abs(rotation) < 2).all(axis=(1, 2)))
@@ -91,8 +91,8 @@ def rigid_pose(pose: Floats) -> Floats | None:
 def covariance_fault(covariance: Floats) -> str | None:
     """Return what is wrong with covariances (..., P, P), in words that follow their name; None if all are valid.
 
-    A covariance is finite, symmetric and not negative in any direction. The last two are judged after a division by the
-    standard deviations, because the units differ.
+    A covariance is finite, symmetric and not negative in any direction. Symmetry and sign are judged on the correlations,
+    because the units of a covariance differ.
     """
     if not np.isfinite(covariance).all():
         return "has a number that is not finite"
@@ -149,7 +149,7 @@ def is_name(value: object) -> bool:
 
 
 def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools, str], ...]:
-    """Return the rules for boxes (M, 4), px: which boxes (M,) keep each rule, and the reason to drop a box that does not.
+    """Return the rules for boxes (M, 4), px. Each has a mask (M,) of the boxes that keep it, and the reason to drop others.
 
     scores: (M,). names: (M,) whether the label of each box `is_name`.
     """
@@ -164,7 +164,7 @@ def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools,
 
 
 def valid_corners(corners: Floats) -> Bools:
-    """Return which corners (M, 4, 2), px, are finite, not too large, and those of a convex quadrilateral in its order."""
+    """Return which corners (M, 4, 2), px, are finite, not too large, and go around a convex quadrilateral."""
     with np.errstate(invalid="ignore", over="ignore"):
         known = np.asarray((np.abs(corners) < MAX_PIXEL).all(axis=(1, 2)))
         ahead = np.roll(corners, -1, axis=1) - corners

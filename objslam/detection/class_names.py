@@ -15,7 +15,7 @@ from objslam.errors import ConfigError, DetectorError
 
 _GAPS = frozenset({0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83})  # The numbers among COCO's 91 that have no class.
 _BACKGROUND = frozenset({"background", "__background__", "n/a", "no object"})  # The class names that mean no object.
-_MOST = 100_000  # The class numbers in a dictionary of names must be below this number. It bounds memory.
+_MOST = 100_000  # The class numbers in a dictionary of names must be below this number. The limit bounds memory.
 
 
 def _coco91() -> tuple[str, ...]:
@@ -70,7 +70,7 @@ def names_from_metadata(text: str | None, model: Path) -> tuple[str, ...] | None
         return None
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Python warns of some texts that it cannot parse either.
+            warnings.simplefilter("ignore")  # Python also warns of some texts that it cannot parse.
             data = ast.literal_eval(text)
     except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError):
         try:

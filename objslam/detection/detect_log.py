@@ -47,7 +47,9 @@ def detect_log(
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:
-        raise LogError("no camera has rgb images for the detector", where=log.name, hint="rgb.txt lists them")
+        raise LogError(
+            "no camera has rgb images for the detector", where=log.name, hint="list them in rgb.txt, one a line: stamp path"
+        )
     for warning in detector.warnings:
         ledger.warn(warning)
     done, begin = count(1), time.perf_counter()
@@ -83,7 +85,7 @@ def detect_log(
 
 @dataclass(frozen=True)
 class Frame:
-    """One image file. image: its pixels, if the cache has no boxes of it. known: its boxes from the cache, if any.
+    """One image file. known: its boxes from the cache, if any. image: its pixels, if the cache has no boxes of it.
 
     problem: the reason why the image cannot be used, if any. where: the place of the problem. digest: SHA-256 of the file.
     """

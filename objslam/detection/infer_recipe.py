@@ -1,4 +1,4 @@
-"""Inference of a model's recipe. The settings override the model's own description. This description overrides the usual
+"""Inference of a model's recipe. The settings override the model's own description, and the description overrides the usual
 recipe of the layout."""
 
 import json
@@ -21,7 +21,7 @@ DESCRIPTION = "objslam.detector"
 
 _USER_ONLY = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
 _SIZE = 640  # The width and height of an input of free size, px, if the settings and the metadata have no size.
-_LARGEST = 8192  # The largest width or height, px, that is accepted from the metadata. It bounds memory.
+_LARGEST = 8192  # The largest width or height, px, that is accepted from the metadata. The limit bounds memory.
 _STRIDE = 32  # The stride of an input of free size, px, if the metadata has no stride.
 _PAD = 114  # The grey value of the padding if the settings have no value.
 _QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.
@@ -29,8 +29,8 @@ _UNNAMED = "the model names no classes: they are numbered (set detector.names)"
 
 
 def with_description(network: Network, settings: config.Detector) -> config.Detector:
-    """Return the settings, with unset values filled in from the model's own description. The description is optional. It is
-    in the model's metadata. Raises DetectorError if it is invalid."""
+    """Return the settings, with unset values filled in from the model's own description, if its metadata has one. Raises
+    DetectorError if the description is invalid."""
     text = network.metadata.get(DESCRIPTION)
     if text is None:
         return settings
@@ -117,7 +117,7 @@ def _habits(
     """Return the usual properties of models of the layout, changed for families of models with other properties."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
-        habits = replace(habits, resize="none")  # such models resize the image themselves
+        habits = replace(habits, resize="none")  # An ssd model of free size resizes the image itself.
     if _is_tensorflow(roles):
         habits = replace(habits, box_form="yxyx", box_units="fractions")
     if layout == "end_to_end" and facts.ultralytics_detr:

@@ -21,7 +21,7 @@ _ROLES: dict[Layout, tuple[frozenset[Role], ...]] = {
 _SINGLE: tuple[frozenset[Role], ...] = (frozenset({"predictions"}),)
 
 Roles = Mapping[Role, str]
-"""The name of the output that has each role."""
+"""The name of the model's output for each role, such as `boxes`."""
 
 
 @dataclass(frozen=True)

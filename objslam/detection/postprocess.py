@@ -11,7 +11,7 @@ from objslam.detection.output_layouts import STRIDES
 from objslam.detection.recipe import Recipe
 from objslam.errors import DetectorError
 
-_FRACTION = 1.5  # Boxes are in fractions if the absolute value of no coordinate is larger. Boxes of 1.5 px do not matter.
+_FRACTION = 1.5  # Boxes are in fractions if no coordinate has a larger absolute value. Boxes in px are far larger.
 _CANDIDATES = 1000  # The most boxes of an image. The time of non-maximum suppression grows with the square of this number.
 _Outputs = Mapping[Role, Array]
 
@@ -53,7 +53,7 @@ def suppress(boxes: Floats, scores: Floats, label: Ints, iou: float) -> Ints:
 
     if len(boxes) == 0:
         return np.zeros(0, dtype=np.int64)
-    # OpenCV separates labels by an offset of the largest coordinate, which fails for boxes with negative coordinates.
+    # OpenCV keeps labels apart by offsets of the largest coordinate, so no coordinate may be negative.
     boxes = boxes - np.tile(boxes.reshape(-1, 2).min(axis=0), 2)
     sized = np.concatenate([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxesBatched(sized, scores.astype(np.float32), label.astype(np.int32), -1.0, iou)  # type: ignore[arg-type]

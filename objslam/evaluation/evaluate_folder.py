@@ -8,7 +8,7 @@ from objslam.errors import LogError
 from objslam.evaluation.alignment import Alignment
 from objslam.evaluation.evaluate import Evaluation, check_radius, evaluate
 from objslam.io.atomic_files import write_file
-from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, TRAJECTORY, dump_json
+from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, SITE_FRAME, TRAJECTORY, dump_json
 from objslam.results.read import load_map, load_summary, load_trajectory, load_truth
 
 AlignmentChoice = Literal["auto", "none", "se2", "sim2", "se3", "sim3"]
@@ -29,7 +29,7 @@ def choose_alignment(out: Path) -> tuple[Alignment, str]:
         return "none", "a localisation fixed the frame of the map"
     if summary.get("map_frame") == "map":
         return "none", "the drive was found in an older map, whose frame it has"
-    if summary.get("map_frame") == "site":
+    if summary.get("map_frame") == SITE_FRAME:
         return "se2", "the map has the frame of its first session"
     if summary.get("map_frame") == "odometry":
         planar = summary.get("planar") is not False
@@ -47,7 +47,7 @@ def evaluate_folder(
     """
     check_radius(radius)
     map_, known = load_map(out), load_truth(truth or out)
-    path = None if load_summary(out).get("map_frame") == "site" else load_trajectory(out)  # A site has no path.
+    path = None if load_summary(out).get("map_frame") == SITE_FRAME else load_trajectory(out)  # A site has no path.
     if known is None:
         if truth is None:
             raise LogError("the log of this result has no ground truth", where=str(out), hint="give --truth FILE")

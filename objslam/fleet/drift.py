@@ -51,8 +51,8 @@ class Drift:
 def drifts(mapped: Sequence[Mapped]) -> list[Drift]:
     """Return at most `_MOST` curves, the largest change first.
 
-    A curve belongs to a robot that the layout names, and to an error that its logs determine on two days or more. The value
-    of a day is the mean of its sessions, weighted by the inverse variances.
+    There is a curve for each robot with a name and each error that its logs determine on two days or more. The value of a
+    day is the mean of its sessions, weighted by the inverse variances.
     """
     found: dict[tuple[str, str, str], dict[str, list[tuple[float, float]]]] = {}
     for one in mapped:

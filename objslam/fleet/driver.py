@@ -20,18 +20,19 @@ from objslam.fleet.tasks.site_task import Member, SiteResult, SiteTask
 from objslam.fleet.tree import MERGES, tree_of
 
 UNDATED = "undated"
-"""The day of a log whose layout says none and whose clock does not count from 1970."""
+"""The day of a log if its path names no day, and its stamps are not Unix time."""
 _CHUNK = 500
-"""The records that are read at once. A larger number asks a store less often, and takes more memory for a moment."""
+"""The number of records that are read at once. A larger number asks a store less often, and takes more memory."""
 
 Stage = Literal["mapping", "merging"]
-Tell = Callable[[Stage, int, int, int], None]
-"""A function that is called with the stage, and with the numbers of its tasks that succeeded, that failed, and of all."""
+Tell = Callable[[Stage, int, int, int, int], None]
+"""A function that is called with the stage, and with the numbers of its tasks that succeeded, failed, are running, and of
+all."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
-    """What the driver keeps of a log that was mapped.
+    """The driver's summary of a mapped log.
 
     key: of the result. begin: the first stamp of the path, s. warnings: their number. seconds: of the task, s. report:
     whether the result has a report.html. new: whether this run mapped the log.
@@ -65,7 +66,7 @@ class Failure:
 
 @dataclass
 class FleetResult:
-    """What became of the logs and the sites of a fleet. A run adds to it.
+    """The outcome of the logs and the sites of a fleet. A run adds to it.
 
     copies: the number of mapped logs that have the same content as another log of their site. A merge takes one of them.
     """
@@ -88,7 +89,7 @@ def run_fleet(
     *,
     price: float = float("nan"),
     again: bool = False,
-    tell: Tell = lambda stage, done, failed, total: None,
+    tell: Tell = lambda stage, done, failed, running, total: None,
     merge_engine: Engine | None = None,
 ) -> FleetResult:
     """Map the logs that have no result yet, merge each site, and write all tables.
@@ -113,7 +114,7 @@ def run_fleet(
 def _map_logs(
     job: Job, logs: Sequence[LogPlace], engine: Engine, store: Store, again: bool, found: FleetResult, tell: Tell
 ) -> None:
-    """Add what became of each log to `found`."""
+    """Map the logs that have no result yet, and add the outcome of each log to `found`."""
     seen = parse_seen(store.names(SEEN))
     places: dict[str, LogPlace] = {}
     known: list[tuple[LogPlace, str]] = []
@@ -130,7 +131,7 @@ def _map_logs(
             continue
         failed += _add(found, place, record, new=False)
         done += 1
-    tell("mapping", done - failed, failed, len(logs))
+    tell("mapping", done - failed, failed, 0, len(logs))
     tasks = (MapTask(job, place.path, task, again) for task, place in places.items())
     for answer in engine(map_task.WORK, tasks):
         place = places[answer.argument.task]
@@ -140,7 +141,7 @@ def _map_logs(
             found.failures.append(Failure(place.path, answer.kind, answer.message, place))
             failed += 1
         done += 1
-        tell("mapping", done - failed, failed, len(logs))
+        tell("mapping", done - failed, failed, answer.running, len(logs))
 
 
 def _read_records(store: Store, known: Sequence[tuple[LogPlace, str]]) -> Iterator[tuple[LogPlace, Record | None]]:
@@ -208,7 +209,7 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
             done += 1
             if answer.value is None:
                 wrong.setdefault(tasks[answer.argument], answer.message)
-            tell("merging", done - len(wrong), len(wrong), total)
+            tell("merging", done - len(wrong), len(wrong), answer.running, total)
             yield answer
 
     for depth in range(max(map(len, trees.values()), default=0)):
@@ -232,8 +233,8 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
 def _with_earlier(members: dict[str, Member], state: bytes | None, digest: str, paths: set[str]) -> dict[str, Member]:
     """Return the sessions of a site by key, in the order of time: `members`, and those of earlier runs with other logs.
 
-    state: the content of the site's `state_name`. digest: of the job. paths: of the logs that this run mapped or could not
-    map. An earlier session at one of these paths is left out, because this run replaces it.
+    state: the content of the file `state_name` of the site. digest: of the job. paths: of the logs that this run mapped or
+    could not map. An earlier session at one of these paths is left out, because this run replaces it.
     """
     before = {one.key: one for one in site_task.earlier_members(state, digest) if one.path not in paths}
     return dict(sorted((before | members).items(), key=lambda entry: (entry[1].begin, entry[1].path)))

@@ -1,4 +1,4 @@
-"""Make the job that all logs of a fleet share, from the settings of the user and the files that the settings name."""
+"""Make the job that all logs of a fleet share, from the settings of the user and the files that they name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from objslam.sources import SourceOptions
 
 _INPUTS = "inputs"
-"""The folder of the files that settings name, in a store that is no folder of this machine."""
+"""The folder, in a remote store, of the files that settings name."""
 
 
 def make_job(store: str, settings: Settings, options: SourceOptions, detector: Path | None, *, report: bool) -> Job:

@@ -36,7 +36,7 @@ def hash_log(path: Path) -> str:
 
 
 def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str, bytes]) -> str:
-    """Return the hash of what decides a result besides its log: settings, options of the source, the version, and `files`.
+    """Return the hash of all that decides a result besides its log: settings, options of the source, version and `files`.
 
     files: the content of each file that a setting names, by the dotted key of the setting, and of the detector, by the key
     "detector". The path of a file does not count.

@@ -12,7 +12,7 @@ from objslam.fleet.stores.open_store import open_source
 from objslam.fleet.stores.store import FileState
 
 DEFAULT_LAYOUT = "{site}/{log}"
-"""The default layout: the folder that holds a log is its site."""
+"""The default of --layout: the folder that holds a log is its site."""
 NO_SITE = "all"
 """The name of the only site with --by none. With --by folder, it is the site of a log that lies in no folder."""
 _LOG_MARKS = {
@@ -43,8 +43,7 @@ class Layout:
     """The folders above a log, as "{site}/{robot}/{day}/{log}". Each {name} is one part of a path."""
 
     def __init__(self, template: str, by: str) -> None:
-        """by: the field of the layout that names the site, `folder` for the folder that holds the log, or `none`
-        for one site of all logs.
+        """by: what names the site: a field of the layout, `folder` for the folder of the log, or `none` for one site of all.
 
         ConfigError for a wrong template or field.
         """
@@ -95,7 +94,7 @@ class Layout:
 def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
     """Return the logs that paths, glob patterns and URLs name, each once, in order.
 
-    A folder that is no log is searched. A path that is named and has no log counts as one: its run says what is wrong with
+    A folder that is no log is searched. A named path without a log counts as a log, so that its run says what is wrong with
     it. Of the files that a pattern names, only bags count. LogError if a source names nothing, ConfigError if a path does
     not fit the layout.
     """
@@ -116,7 +115,7 @@ def find_logs(sources: Sequence[str], layout: Layout) -> list[LogPlace]:
 
 
 def _split(files: Mapping[str, FileState]) -> Iterator[tuple[str, dict[str, FileState]]]:
-    """Yield the relative path of each log among files, with the files of the log. If there is no log, all files are one.
+    """Yield the relative path of each log among files, with the files of the log. If there is none, all files are one log.
 
     A log inside another log is a part of the outer one.
     """

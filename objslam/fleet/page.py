@@ -1,6 +1,6 @@
 """fleet.html: the sites, the failures, the drift of each robot's calibration, and links to the results.
 
-The page needs no network. What it shows of logs is escaped, because names come from strangers.
+The page needs no network. Texts from logs are escaped, because strangers chose the names in them.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def fleet_page(found: FleetResult, *, price: float) -> bytes:
         version=__version__,
         made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         found=found,
-        hours=hours,
+        spent=duration(hours),
+        robots=any(one.place.robot for one in found.mapped),
         cost=hours * price,
         sites=[(one, f"{SITES}/{quote(folder_of(one.site))}", _told(of_site[one.site])) for one in found.sites],
         failures=found.failures[:_FAILURES],
@@ -63,8 +64,15 @@ def fleet_page(found: FleetResult, *, price: float) -> bytes:
     return page.encode("utf-8", errors="replace")
 
 
+def duration(hours: float) -> str:
+    """Return a time in the unit that suits it, such as 15 s, 4.2 min or 31.50 h."""
+    if hours >= 1:
+        return f"{hours:.2f} h"
+    return f"{60 * hours:.1f} min" if hours >= 1 / 60 else f"{3600 * hours:.0f} s"
+
+
 def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
-    """Return what the table of sites says of the sessions of a site that this run has."""
+    """Return the columns of the table of sites that come from the sessions of a site in this run."""
     days = sorted({one.day for one in mapped})
     return {
         "robots": len({one.place.robot for one in mapped} - {""}),

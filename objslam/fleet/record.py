@@ -27,7 +27,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """What became of one log.
+    """The outcome of one log.
 
     key: of the content, the settings and the version. source: the path or URL of the log. log: the hash of its content.
     settings: the digest of the job. error: what is wrong with the log, empty if it was mapped. begin, end: the first and the
@@ -81,7 +81,7 @@ def result_name(key: str) -> str:
 
 
 def seen_name(task: str, key: str, good: bool) -> str:
-    """Return the name of the empty file that says which key a log has, and whether it was mapped (`good`).
+    """Return the name of an empty file. The name says which key a log has, and whether the log was mapped (`good`).
 
     task: the key of the log's fingerprint and the job, which is known before the log is read.
     """

@@ -55,8 +55,8 @@ def session_row(
 ) -> dict[str, Any]:
     """Return the row of a session.
 
-    island: its number from 1. pose: (4, 4) of the session in the frame of its island, m. odds, common: the `log_odds` and
-    `common` of `Placed`. price: of an hour of one core, NaN if unknown.
+    island: the number, from 1 on, of its group of sessions with objects in common. pose: (4, 4) of the session in the frame
+    of its island, m. odds, common: the `log_odds` and `common` of `Placed`. price: of an hour of one core, NaN if unknown.
     """
     counts = record.counts or {}
     return {

@@ -20,8 +20,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
 
     The ledger counts the other boxes. A box is not usable if its score is too low, if its centre is outside the image, or if
     the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
-    rays.border is negative or the detections are `whole`. In each frame, at most `MAX_OF_LABEL` boxes of one label are used.
-    The boxes with the highest scores are taken.
+    rays.border is negative or the detections are `whole`. In each frame, the `MAX_OF_LABEL` boxes of a label with the
+    highest scores are used.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}
@@ -78,7 +78,7 @@ def box_rays(
     """Return the indices (n,) of the usable boxes (M, 4) px of a camera, and the rays through their centres.
 
     A ray has a unit direction (n, 3) in the camera frame and a standard deviation (n,) rad. The ledger counts the other
-    boxes. stamps: (M,) s, or the one stamp of all. `whole` is explained in `types.Detections`.
+    boxes. stamps: (M,) s, or one stamp for all boxes. whole: as in `types.Detections`.
     """
     kept = _usable(boxes, scores, stamps, camera, settings, ledger, whole)
     boxes = boxes[kept]
@@ -113,8 +113,7 @@ def _corner_rays(boxes: Detections, camera: Camera, settings: Settings, ledger: 
 def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Ledger) -> Ints:
     """Return the increasing indices of the boxes that are used: for each label in each frame the `MAX_OF_LABEL` best.
 
-    frame, label, scores: (M,) of each box. A box is better if its score is higher. Among equal scores the first box is
-    better. The ledger counts the other boxes.
+    frame, label, scores: (M,) of each box. Of equal scores, the first box is better. The ledger counts the other boxes.
     """
     count = len(frame)
     if count <= MAX_OF_LABEL:

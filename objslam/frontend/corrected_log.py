@@ -52,13 +52,13 @@ class CorrectablePath:
         self._ways = np.ascontiguousarray(np.diff(places, axis=0).T)
 
     def poses(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
-        """Return the corrected poses (n, 4, 4) with the indices `which`, or all poses, as by `corrected_odometry`."""
+        """Return the corrected poses (n, 4, 4) with the indices `which`, or all poses, as `corrected_odometry` does."""
         scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
         poses = self.odometry.poses if which is None else self.odometry.poses[which]
         if scale == turn_scale == turn_bias == 0:
             return poses
         more = turn_scale * self._turned + turn_bias * self._seconds
-        middle = (more[1:] + more[:-1]) / 2  # A chord has the mean of the two headings of its arc.
+        middle = (more[1:] + more[:-1]) / 2  # The chord of an arc points along the mean of the two headings at its ends.
         cos, sin = np.cos(middle), np.sin(middle)
         x, y, z = self._ways
         places = np.empty((3, len(more)))
@@ -79,7 +79,7 @@ class CorrectablePath:
 class OdometryCorrection:
     """Corrects odometry pose by pose, as it arrives, like `corrected_odometry` does for a whole path. The first pose stays.
 
-    A session corrects every pose. For a single pose, this takes a fraction of the time of `corrected_odometry`.
+    A session corrects every pose, and this takes a fraction of the time of `corrected_odometry`.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class OdometryCorrection:
         turn = rotation_vector(pose[:3, :3] @ self._before[:3, :3].T)[2]
         more = float(self._turn_scale * turn + self._turn_bias * (stamp - self._stamp))
         way = (1 + self._scale) * (pose[:3, 3] - self._before[:3, 3])
-        self._place = self._place + _about_z(self._turned + more / 2) @ way  # A chord has the mean of its headings.
+        self._place = self._place + _about_z(self._turned + more / 2) @ way  # as in `CorrectablePath`
         self._turned += more
         self._stamp, self._before = stamp, pose
         return make_pose(_about_z(self._turned) @ pose[:3, :3], self._place)
@@ -158,7 +158,7 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 
 
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
-    """Return a camera and its data, corrected by the errors. path: on which its stamps stay (see `later`), or None."""
+    """Return a camera and its data, corrected by the errors. path: on this path its stamps stay (see `later`)."""
     camera, name = one.camera, one.camera.name
     clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
     longer = 1 + error.get("range_scale", 0.0)

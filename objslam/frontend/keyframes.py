@@ -85,7 +85,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
 def _on_path(
     path: Trajectory, stamps: Floats, wanted: Bools, boxes: Floats, max_gap: float, ledger: Ledger, what: str
 ) -> tuple[Floats, Bools]:
-    """Return the poses of a path at the stamps, and which stamps have one. The ledger counts `wanted` frames without one."""
+    """Return the poses of a path at stamps, and which stamps have one. The ledger counts `wanted` frames that have none."""
     poses, valid = interpolate(path.stamps, path.poses, stamps, max_gap)
     outside = (stamps < path.stamps[0]) | (stamps > path.stamps[-1])
     lost = wanted & ~valid

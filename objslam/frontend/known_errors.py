@@ -1,6 +1,6 @@
 """The shared errors that a log can have, and the errors in a calibration file.
 
-The errors in the file that a run does not estimate are corrected before it.
+Errors in the file that a run does not estimate are corrected before the run.
 """
 
 from pathlib import Path
@@ -42,8 +42,8 @@ def prior_sigma(name: str, settings: Settings) -> float:
 def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
     """Return whether the shared errors of a log are estimated.
 
-    odometry: whether it is used. localized: whether there is a localisation. In fixed mode, odometry without a localisation
-    reveals no error, because the poses must be known. In joint mode, calibration.use decides, and "auto" needs odometry.
+    odometry: whether it is used. localized: whether there is a localisation. In fixed mode, errors are estimated from known
+    poses, which only a localisation gives. In joint mode, calibration.use decides, and "auto" needs odometry.
     """
     use = settings.calibration.use
     if settings.mode == "fixed":

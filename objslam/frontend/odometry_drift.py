@@ -14,9 +14,9 @@ Length = TypeVar("Length", float, Floats)
 
 
 def scaled_noise(settings: Settings, error: Mapping[str, float]) -> Settings:
-    """Return the settings with the odometry noise for distances that are longer by the error "odometry.scale".
+    """Return the settings with the odometry noise for distances that are longer by the share "odometry.scale" in `error`.
 
-    error: by name. If the noise stayed the same, the noise relative to the distances would depend on the size of the map.
+    The noise of positions grows like the distances. Otherwise a map of another size would fit better or worse.
     """
     way = 1 + error.get("odometry.scale", 0.0)
     if way == 1:
@@ -32,8 +32,8 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
     """Return the covariance (Q, 6, 6) that the odometry has accumulated up to each of the stamps (Q,), s, rotation first.
 
     The covariance is in the frame of the first pose. The adjoint moves the noise of each step into this frame, where the
-    steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. This covariance,
-    moved into base at j, shows how an error of the heading shifts the later positions.
+    steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. The adjoint can
+    move it into base at j.
     """
     return DriftPath(odometry).gathered(stamps, settings)
 
@@ -60,7 +60,7 @@ class DriftPath:
         self._way = np.hypot(*np.diff(places[:, :2], axis=0).T) / np.sinc(self._turn / (2 * np.pi))
         px, py = places[1:, 0], places[1:, 1]
         one, none = np.ones_like(px), np.zeros_like(px)
-        # The factors of a step's variances of yaw, x and y, by the numbers in `_PLANAR`.
+        # How each variance of a step (of yaw, x, y) adds to the six distinct elements of the covariance, see `_PLANAR`.
         self._parts = (
             np.stack([one, py, -px, py * py, -px * py, px * px], axis=1),
             np.stack([none, none, none, c * c, c * s, s * s], axis=1),

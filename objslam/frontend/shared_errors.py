@@ -1,7 +1,4 @@
-"""The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations.
-
-The parameters change the measurements. They do not change the kinds of factors in the graph.
-"""
+"""The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -27,8 +24,9 @@ noisy and change abruptly. The clocks of the MRCLAM robots converge in half the 
 _STEP = 0.01
 """The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
-"""A parameter may be as large as its absolute prior mean plus this many standard deviations of its prior. MOST_SCALE bounds
-scales further. Clocks have a bound of their own. A larger value lets a parameter move farther from its prior."""
+"""The bound of a parameter is the absolute value of its prior mean, plus this many standard deviations of its prior.
+MOST_SCALE bounds scales further. Clocks have their own bound. A larger value lets a parameter move farther from its
+prior."""
 
 
 _KEPT = 9
@@ -56,7 +54,7 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: kinds that the settings leave open, if the log has such measurements.
+        """The kinds of noise that are estimated: those that the settings allow, if the log has their measurements.
 
         The set is empty in fixed mode, and if odometry is not used.
         """
@@ -74,9 +72,9 @@ class SharedErrors:
 
     @cached_property
     def unknown_scales(self) -> frozenset[str]:
-        """The names of the scales, if every measured length has an unknown scale. The set is empty if not.
+        """The names of the scales, if every measured length has an unknown scale, else an empty set.
 
-        If it is not empty, the log cannot tell a factor that all lengths have in common.
+        With unknown scales alone, the log does not determine the size of its map.
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return frozenset()
@@ -206,7 +204,7 @@ class SharedErrors:
         keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
         assert path is not None
         stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # The stamps of the poses, which are all on the path.
+        known = stamps.copy()  # The stamps at which the poses are taken, all within the time of the path.
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             clock = error.get(f"{one.camera.name}.clock", 0.0)
@@ -270,8 +268,8 @@ class SharedErrors:
 class _Poses:
     """The poses (K, 4, 4) of K keyframes, corrected for the errors of clocks and odometry.
 
-    stamps: (K,) s, of the images. known: (K,) s, of the poses, which are all on the path. base_T_camera: not yet corrected
-    for the errors of the camera's rotation and place.
+    stamps: (K,) s, of the images. known: (K,) s, at which the poses are taken, all within the time of the path.
+    base_T_camera: not yet corrected for the errors of the camera's rotation and place.
     """
 
     stamps: Floats

@@ -1,4 +1,4 @@
-"""Which axis of a map points up, by the cameras that saw it, and the view of the map from above."""
+"""Find the axis of a map that points up, from the poses of its cameras, and the axes of a view from above."""
 
 from typing import get_args
 
@@ -15,7 +15,7 @@ _TILT = np.radians(45)
 """The angle, rad, between the mean of the up vectors and the map's z axis, above which the map lies on its side. Cameras on
 robots look up or down by less. A larger angle takes z more often."""
 _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
-"""The axes that point right and up in a view from above, so that right, up and the upward axis are a right-handed frame."""
+"""The axes that point right and to the top of a view from above. With the axis to the viewer, they are right-handed."""
 
 
 def up_axis(keyframes: Keyframes) -> Up:
@@ -35,7 +35,7 @@ def up_axis(keyframes: Keyframes) -> Up:
 
 
 def from_above(up: Up) -> list[int]:
-    """Return the two axes that point right and up in a view from above."""
+    """Return the two axes that point to the right and to the top of a view from above."""
     return list(_FROM_ABOVE[up])
 
 

@@ -23,8 +23,8 @@ _UNSUPPORTED = (errno.EINVAL, errno.ENOTSUP, errno.ENOLCK, errno.ENOSYS)
 class FileSet:
     """The names of files that are replaced together."""
 
-    seal: str  # The file that is deleted first and written last.
-    others: tuple[str, ...]  # All other names, including optional files.
+    seal: str  # Deleted first and written last, so it exists only in a complete set.
+    others: tuple[str, ...]  # The other files of the set, including optional files.
     pattern: str  # A glob pattern for files whose names vary.
 
     def names(self, folder: Path) -> tuple[str, ...]:
@@ -81,7 +81,7 @@ def write_file(file: Path, data: bytes) -> None:
 
 
 def write_lines(file: Path, lines: Iterable[str]) -> None:
-    """Write a text file of lines as `write_file` does, line by line. Raises the errors of `write_file` and of `lines`."""
+    """Write a text file of lines as `write_file` does, line by line. Raises what `write_file` and `lines` raise."""
     with _replaced(file) as stream:
         for line in lines:
             stream.write(encode(f"{line}\n"))
@@ -116,7 +116,7 @@ def encode(text: str) -> bytes:
 
 @contextmanager
 def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
-    """Convert OSError to OutputError. The error names the failing file, or `path` if it is unknown or `only` is set."""
+    """Turn OSError into OutputError with the name of the failing file. With `only`, or if it is unknown, `path` is named."""
     try:
         yield
     except OSError as error:

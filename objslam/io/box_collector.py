@@ -14,8 +14,8 @@ from objslam.io.text import drop_rows, in_order
 @dataclass
 class BoxCollector:
     """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1. The corners of
-    fiducials are known by the index of their box.
-    Each frame and box has a place, such as file:line. The ledger shows the place if the frame or box is dropped."""
+    fiducials are stored by the index of their box. Each frame and box has a place, such as file:line. The ledger shows the
+    place if the frame or box is dropped."""
 
     stamps: list[float] = field(default_factory=list)
     frame_places: list[str] = field(default_factory=list)
@@ -55,8 +55,8 @@ class BoxCollector:
         self.box_places.append(place)
 
     def checked(self, ledger: Ledger) -> Detections:
-        """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted.
-        A depth that is not above zero, or too large, becomes unknown and is counted. So do corners that are no square's."""
+        """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted. A depth that is
+        not above zero or too large becomes unknown and is counted, and so do corners that are not those of a square."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
         drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)

@@ -1,6 +1,6 @@
 """Read and write camera.yaml, which has ROS camera_info keys and the pose of the camera on the robot.
 
-The reader uses YAML nodes, because they keep line numbers. It reads 1e-05 as a number, although YAML 1.1 reads it as text.
+The reader uses YAML nodes, because they keep line numbers. The reader takes 1e-05 as a number. In YAML 1.1 it is text.
 """
 
 import math
@@ -74,7 +74,7 @@ def read_mounts(path: Path) -> tuple[Mount, ...]:
 
 
 def _sections(path: Path) -> list[tuple[str | None, _Mapping]]:
-    """Return the name and the keys of each camera in a file. A single camera has no name here."""
+    """Return the name and the keys of each camera in a file. The name is None if the file is that of a single camera."""
     top = _load(path, read_bytes(path), "the file")
     if _CAMERAS not in top:
         return [(None, top)]
@@ -134,7 +134,7 @@ def dump_camera(camera: Camera) -> str:
 
 
 def camera_keys(camera: Camera) -> dict[str, Any]:
-    """Return the content of a camera file."""
+    """Return the keys and values of a camera file."""
     return {
         "camera_name": camera.name,
         "image_width": int(camera.width),
@@ -230,8 +230,8 @@ def _size(path: Path, top: _Mapping, key: str) -> int:
 
 
 def _numbers(path: Path, node: yaml.Node, what: str) -> tuple[Floats, yaml.Node]:
-    """Return the numbers of a node, and the node of the list that has them.
-    The given node is a mapping {rows, cols, data}, a flat list or a list of rows."""
+    """Return the numbers of a node, and the node of the list that has them. node: a mapping {rows, cols, data}, a flat list
+    or a list of rows."""
     if isinstance(node, yaml.MappingNode):
         fields = _mapping(path, node, what)
         values, data = _numbers(path, _get(path, fields, "data", f"{what}.", node), f"{what}.data")

@@ -42,7 +42,7 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
             hint = "remove this file, and run a detector on rgb.txt (--detector)"
             raise LogError("no detection frame in it", where=str(path), hint=hint)
         why = f": {reasons.most_common(1)[0][0]}" if reasons else ""
-        hint = "a list holds all of them: write one frame a line" if lines[0][1].startswith("[") else _EXAMPLE
+        hint = "the file is one JSON list: write one frame a line" if lines[0][1].startswith("[") else _EXAMPLE
         raise LogError(f"none of its {len(lines)} lines is a detection frame{why}", where=str(path), hint=hint)
     return replace(collector.checked(ledger), whole=whole)
 

@@ -10,12 +10,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 OLD = "old"
-"""The name, in a temporary folder, of the folder that is being replaced."""
+"""In a temporary folder, the name of the folder that is being replaced."""
 
 
 @contextmanager
 def no_empty_folders(path: Path) -> Iterator[None]:
-    """If the block raises an error, delete `path` and its parent folders, if the block created them and left them empty."""
+    """If the block raises an error, delete those of `path` and its parent folders that the block created and left empty."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield
@@ -29,7 +29,7 @@ def no_empty_folders(path: Path) -> Iterator[None]:
 
 def temporary_name(path: Path) -> str:
     """Return the name of a temporary file or folder beside `path`. It contains the machine and the process, so that
-    `remove_leftovers` knows whose it is. The process may also use this name with a dot and more letters after it."""
+    `remove_leftovers` knows whose it is. The process may also append a dot and more letters to this name."""
     return f".{path.name}.{_machine()}-{os.getpid()}"
 
 
@@ -63,6 +63,6 @@ def _is_alive(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # It belongs to another user.
+    except PermissionError:  # The process belongs to another user, so it is alive.
         return True
     return True

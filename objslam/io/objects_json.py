@@ -154,7 +154,7 @@ def _load(file: Path) -> dict[str, Any]:
         raise _Malformed(f"not UTF-8 text (byte {error.start})") from error
     except json.JSONDecodeError as error:
         raise _Malformed(f"not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from error
-    except (ValueError, RecursionError) as error:  # An integer has thousands of digits, or brackets are deeply nested.
+    except (ValueError, RecursionError) as error:  # Integers of thousands of digits and deeply nested brackets raise these.
         raise _Malformed(f"not JSON that can be read: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("objects"), list):
         raise _Malformed('not an objects file: a mapping with a list under "objects" is needed')
@@ -278,7 +278,7 @@ def _tag(value: Any) -> TagPose:
         raise _Malformed(f"tag.rotation_covariance {fault}")
     size, sigma = (_number(value.get(name), f"tag.{name}") for name in ("size", "size_sigma"))
     if not (0 < size < MAX_POSITION and 0 <= sigma < MAX_POSITION):
-        raise _Malformed("tag.size must be above 0 m, and tag.size_sigma not below")
+        raise _Malformed("tag.size must be above 0 m, and tag.size_sigma at least 0 m")
     rotation, other, probability = _quaternion(value.get("rotation_xyzw"), "tag.rotation_xyzw"), None, 0.0
     if value.get("other_rotation_xyzw") is not None:
         other = _quaternion(value["other_rotation_xyzw"], "tag.other_rotation_xyzw")

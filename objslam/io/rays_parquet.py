@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _NUMBERS = {"stamp": 1, "origin": 3, "direction": 3, "residual": 1, "weight": 1, "score": 1, "box": 4, "sigma": 1}
 _NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # How many numbers each column has in a row.
-_UNIT = 1e-3  # The most that the squared length of a direction differs from 1. A larger value accepts worse directions.
+_UNIT = 1e-3  # The most that the squared length of a direction may differ from 1. A larger value accepts worse directions.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -37,7 +37,7 @@ class RaysTable:
     box: Floats  # (R, 4) x1, y1, x2, y2, px of the raw image.
     label: Any  # (R,) label of the box.
     sigma: Floats  # (R,) standard deviation of the residual along one axis, from the settings, rad.
-    residual_before: Floats  # (R,) residual with the shared errors left in, rad, NaN if they were not estimated.
+    residual_before: Floats  # (R,) rad, residual before the correction of the shared errors, NaN without one.
     image: Floats  # (R, 2) centre of the box, as a share of the image's width and height.
     speed: Floats  # (R,) speed of the robot, m/s.
     turn_rate: Floats  # (R,) turn rate of the robot to the left, rad/s.

@@ -16,7 +16,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
-_PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason. The ledger keeps no more.
+_PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason.
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
 
@@ -116,7 +116,7 @@ def to_table(
 
 
 def _clean_table(numbered: Sequence[tuple[int, str]], columns: int) -> Table | None:
-    """Return the table of lines that all have `columns` numbers, None if some line has not. It is three times as fast."""
+    """Return the table if all lines have `columns` numbers, else None. It is three times as fast as line by line."""
     lines = [text for _, text in numbered]
     if not lines or any("_" in text or not text.isascii() for text in lines):
         return None
@@ -144,7 +144,7 @@ def count_drops(reason: str, count: int, places: Iterable[str], ledger: Ledger) 
 
 
 def drop_rows(reason: str, bad: Bools, places: Sequence[str], ledger: Ledger) -> None:
-    """Count as drops, under `reason`, the rows that `bad` (N,) marks. `places` has the place (file:line) of each row."""
+    """Count the rows that `bad` (N,) marks as drops under `reason`. places: (N,) the place (file:line) of each row."""
     rows = np.flatnonzero(bad).tolist()
     count_drops(reason, len(rows), (places[i] for i in rows), ledger)
 

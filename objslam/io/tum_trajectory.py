@@ -76,7 +76,7 @@ def to_trajectory(table: Table) -> Trajectory:
 def write_trajectory(trajectory: Trajectory, path: Path) -> None:
     """Write a trajectory file. Every number is read back as the same float."""
     import pyarrow as pa
-    from pyarrow import csv  # five times as fast as one repr for each number
+    from pyarrow import csv  # pyarrow is five times as fast as one repr for each number.
 
     poses = trajectory.poses
     values = np.column_stack([trajectory.stamps, poses[:, :3, 3], quaternion(poses)])

@@ -9,7 +9,7 @@ import numpy as np
 from objslam.association.observations import MIN_DEPTH, extents
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.bodies.body import SHAPES, Body, PlacedBody
+from objslam.core.bodies.body import SHAPES, UNKNOWN_YAW, Body, PlacedBody
 from objslam.core.camera import Camera, undistort
 from objslam.core.statistics import grouped_median
 from objslam.frontend.up import up_axis
@@ -26,8 +26,6 @@ _CLEAR = 1.0
 """The angle between the centre of a body and that of its box, in standard deviations of the error that boxes share, above
 which the position is the centre of the body. It is 4 for a cabinet from close by, and below 0.6 for things on a table that a
 noisy detector sees. With a larger value, more objects stay where their rays meet."""
-_ANY_YAW = np.pi / np.sqrt(12)
-"""The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
@@ -220,5 +218,5 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
     covariance = slope @ covariance @ slope.T
     covariance[:3, :3] += extra
     sigma = np.sqrt(np.diagonal(covariance))
-    body = Body(SHAPES[found.shape[at]], 2 * half, float(yaw), sigma[3:6], float(min(sigma[6], _ANY_YAW)))
+    body = Body(SHAPES[found.shape[at]], 2 * half, float(yaw), sigma[3:6], min(float(sigma[6]), UNKNOWN_YAW))
     return PlacedBody(body, centre if clear else None, (covariance + covariance.T) / 2)

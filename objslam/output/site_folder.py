@@ -70,7 +70,7 @@ def summarise_site(island: Island, names: Sequence[str]) -> dict[str, Any]:
         )
     ]
     counts = {"objects": len(objects), "unresolved": 0, "gone": len(objects.gone), "sessions": len(sessions)}
-    return {"map_frame": "site", "counts": counts, "sessions": sessions}
+    return {"map_frame": files.SITE_FRAME, "counts": counts, "sessions": sessions}
 
 
 def _write(data: bytes, file: Path) -> None:

@@ -25,6 +25,7 @@ EVALUATION = "evaluation.json"  # The evaluation that `objslam eval` writes.
 REPORT = "report.html"  # The page that `objslam report` writes.
 TRUTH_OBJECTS = "groundtruth_objects.json"  # The true objects of the log.
 TRUTH_TRAJECTORY = "groundtruth_trajectory.txt"  # The true path of the log.
+SITE_FRAME = "site"  # The entry `map_frame` in the summary of the map of a site.
 GROUNDTRUTH = "groundtruth"  # The folder in a log that has the ground truth, in the files OBJECTS and TRAJECTORY.
 
 PARTS = (

@@ -85,7 +85,7 @@ def load_motions(out: Path) -> Motions | None:
 
 def load_rays(out: Path) -> RaysTable:
     """Read the rays of the result folder `out`. OutputError if the file is missing, damaged or of an older version."""
-    return read_rays(out / files.RAYS)
+    return read_rays(_existing(out, files.RAYS))
 
 
 def load_views(out: Path) -> Views | None:
@@ -122,10 +122,19 @@ def load_truth(path: Path) -> Truth | None:
     return None
 
 
+def refuse_site(out: Path, name: str) -> None:
+    """Raise OutputError if the folder `out` is the map of a site, which never has the file `name` of a run."""
+    if (out / files.SUMMARY).is_file() and load_summary(out).get("map_frame") == files.SITE_FRAME:
+        hint = f"look at {files.PICTURE}, or give the result of one of its sessions"
+        raise OutputError(f"this is the map of a site, which has no {name}", where=str(out), hint=hint)
+
+
 def _existing(out: Path, name: str) -> Path:
     if not out.is_dir():
         raise OutputError("there is no such result folder", where=str(out))
     if not (out / name).is_file():
+        if name != files.SUMMARY:
+            refuse_site(out, name)
         hint = "its run did not finish: run it again" if has_staging(out) else files.hint_below(out)
         raise OutputError(f"no result here: {name} is missing", where=str(out), hint=hint)
     return out / name

@@ -28,8 +28,8 @@ class Choices:
 def parse_topics(texts: Sequence[str], *, live: bool = False) -> Choices:
     """Parse the values of --topic. Raises ConfigError for a wrong value.
 
-    A value is "role=/topic", or for a bag also "camera.role=/topic". With `live`, there are no cameras, tf and tf_static are
-    also roles, and a missing "/" at the start of a topic is added.
+    A value is "role=/topic", or for a bag also "camera.role=/topic". With `live`, a value names no camera, the roles also
+    include tf and tf_static, and a topic may lack its "/".
     """
     choices, roles = Choices(), (*ROLES, "tf", "tf_static") if live else ROLES
     for text in texts:

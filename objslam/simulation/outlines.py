@@ -27,8 +27,9 @@ def looking_at(place: Floats, target: Floats) -> Floats:
 def outline_box(camera: Camera, body: Floats, pose: Floats) -> Floats | None:
     """Return the box (4,), px, around the image of an ellipsoid (7,), None if a part of it is behind the camera.
 
-    The rays that touch the ellipsoid touch it in an ellipse. Its image is searched for its extreme pixels. So none of the
-    planes of `triangulation.bodies` are used, and the lens may bend the image. pose: (4, 4) map_T_camera.
+    The tangent rays of the camera touch the ellipsoid along an ellipse, whose extreme pixels are searched. So the box is
+    exact for distorted lenses, and independent of `triangulation.bodies`. body: centre and half axes, m, and yaw, rad. pose:
+    (4, 4) map_T_camera.
     """
     root = np.linalg.cholesky(matrices(body[None])[0])
     seen = np.linalg.solve(root, pose[:3, 3] - body[:3])

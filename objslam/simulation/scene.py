@@ -134,7 +134,7 @@ def _good(settings: DriveSettings, path: Path, frame_stamps: Floats, places: Flo
 
 def _spread(directions: Floats, seen: Bools) -> Floats:
     """Return a lower bound (P,), rad, of the widest angle between directions (V, P, 3). seen: (V, P) which of them count."""
-    # Each step finds the direction furthest from the last one. For directions in a plane, the result is the widest angle.
+    # Go twice to the direction furthest from the last one. For directions in a plane, this gives the widest angle.
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     pick = seen.argmax(axis=0)
     for _ in range(2):

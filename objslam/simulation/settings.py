@@ -71,8 +71,8 @@ class CourseSettings(Section):
     frame_rate: Positive = 5.0  # The number of images of each camera per second, Hz.
     laps: Positive | None = None  # The number of laps in the whole drive, which determines the speed.
     odometry: config.Odometry | PoseNoise | None = PoseNoise()
-    """The drift. config.Odometry: by distance and turn, without the floors. PoseNoise: by the time of one image. None: no
-    odometry."""
+    """The drift. config.Odometry: noise by distance and turn, without its floors. PoseNoise: noise in the time between two
+    images. None: no odometry."""
     localization: PoseNoise | None = PoseNoise()  # The error of each localised pose. None: no localisation.
 
 
@@ -94,7 +94,7 @@ class DriveSettings(CourseSettings):
     heights: tuple[float, float] = (0.1, 1.5)  # The range of the heights of the objects' centres, m.
     min_distance: NotNegative = 0.6  # The least distance between two random objects, m.
     min_view_share: Probability = 0.1
-    """The least number of images, of all cameras together, that show a random object, as a share of one camera's images."""
+    """How many images of all cameras must show each random object, as a share of the number of images of one camera."""
     min_parallax_deg: NotNegative = 30.0  # The least parallax over the views of a random object, degrees.
     moving: Annotated[int, Field(ge=0)] = 0
     """The number of moving objects. They have the classes of the other objects and are not in the ground truth."""

@@ -132,7 +132,7 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
             log_folder.write_log_folder(read(source, ledger, options), log, overwrite=overwrite)
         except NoCamera as found:
             written = log_folder.write_path(found, log, overwrite=overwrite)
-            ledger.warn(f"{found.where}: {found.message}; {', '.join(written)} need a camera.yaml and a detections.jsonl")
+            ledger.warn(f"{found.where}: {found.message}; add a camera.yaml and a detections.jsonl to {', '.join(written)}")
 
 
 def choose(path: Path, name: str | None = None) -> Source:

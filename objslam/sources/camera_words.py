@@ -5,9 +5,9 @@ import numpy as np
 from objslam.core.camera import Camera, spoken_name, undistort
 
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
-_STEEP = 60.0  # The elevation, degrees, from which a camera looks up or down in the text. With a larger value, fewer do.
-_LEVEL = 5.0  # The elevation and tilt, degrees, up to which the text omits them. A larger value omits more of them.
-_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx is above this. Real lenses stay below 1.1. More reports fewer.
+_STEEP = 60.0  # From this elevation, degrees, a camera "looks up" or "looks down". With a larger value, fewer do.
+_LEVEL = 5.0  # The text omits an elevation or a tilt of at most this, degrees. A larger value omits more of them.
+_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx is larger. Real lenses are below 1.1. Larger reports fewer.
 
 
 def view_of(camera: Camera) -> str:

@@ -24,7 +24,7 @@ from objslam.sources.no_camera import NoCamera
 
 CAMERA, CAMERAS, MOUNT = "camera.yaml", "cameras", "camera_poses.txt"
 ODOMETRY, LOCALIZATION = "odometry.txt", "localization.txt"
-MOUNTS = "mounts.yaml"  # The file of mounts from tf, of a recording whose cameras are unknown.
+MOUNTS = "mounts.yaml"  # The file of base_T_camera from tf, for a recording without cameras.
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 
@@ -135,7 +135,7 @@ def beside(path: Path) -> Iterator[Path]:
 def check_target(path: Path, overwrite: bool) -> None:
     """Raise OutputError if `path` is something that a log folder must not replace. An empty folder may be replaced.
 
-    The remains of killed processes beside it are removed first. If one of them was replacing a log, the log is put back.
+    The remains of killed processes beside `path` are removed first. A log that a killed process was replacing is put back.
     """
     with _writing(path):
         remove_leftovers(Path(os.path.realpath(path)))
@@ -171,6 +171,9 @@ def _read_cameras(path: Path, ledger: Ledger) -> tuple[CameraLog, ...]:
 
 
 def _read_camera_log(folder: Path, name: str | None, ledger: Ledger) -> CameraLog:
+    if not (folder / CAMERA).exists():
+        hint = "write one with the image's size, camera_matrix, the distortion and base_T_camera, as README.md shows"
+        raise LogError(f"there is no {CAMERA}", where=str(folder), hint=hint)
     mount = read_trajectory(folder / MOUNT, ledger) if (folder / MOUNT).exists() else None
     detections = folder / DETECTIONS
     return CameraLog(

@@ -1,4 +1,4 @@
-"""The error of a recording that tells where the robot drove, but has no camera. It carries what the recording tells."""
+"""The error for a recording that has a path of the robot, but no camera. It carries the path, and poses of cameras in tf."""
 
 from __future__ import annotations
 

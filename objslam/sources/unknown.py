@@ -14,7 +14,7 @@ _VIDEOS = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 _ARCHIVES = {".zip", ".tar", ".tgz", ".gz", ".bz2", ".xz", ".zst", ".7z", ".rar"}
 _IMAGES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm", ".pgm", ".webp"}
 _LOOKED_AT = 20  # The most subfolders that are searched for recordings and images. A larger number takes longer.
-_SHOWN = 3  # The most names in a message. A larger number makes it longer.
+_SHOWN = 3  # The most names in a message.
 _NEEDED = f"a log folder has {CAMERA}, {ODOMETRY} or {LOCALIZATION}, and detections.jsonl or {RGB}.txt"
 
 

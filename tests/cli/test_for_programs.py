@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +52,53 @@ def test_a_run_ends_with_its_verdict(log: Path, tmp_path: Path) -> None:
     lines = call("run", log, "-o", tmp_path / "out", *LEAN).stdout.splitlines()
     assert lines[-2].startswith("verdict: good. 4 objects")
     assert lines[-1] == f"wrote {tmp_path / 'out'}"
+
+
+def test_an_evaluation_in_json_is_its_file(log: Path, tmp_path: Path) -> None:
+    assert call("run", log, "-o", tmp_path / "out", "--quiet", *LEAN).returncode == 0
+    told = json.loads(call("eval", tmp_path / "out", "--json").stdout)
+    assert told == json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert told["matched"] == 4
+
+
+def test_a_quiet_session_prints_warnings_only(log: Path, tmp_path: Path) -> None:
+    done = call("live", log, "-o", tmp_path / "out", "--speed", "0", "--quiet", *LEAN, "--set", "rays.border=100")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert all(line.startswith("warning: ") for line in done.stderr.splitlines())
+    assert "warning: dropped" in done.stderr
+    assert (tmp_path / "out" / "summary.json").is_file()
+
+
+def test_help_is_a_word_too() -> None:
+    for words in ((), ("run",), ("config", "dump")):
+        assert call("help", *words).stdout == call(*words, "--help").stdout != ""
+
+
+def test_a_log_that_tells_no_shared_error_has_no_table_of_them(log: Path, tmp_path: Path) -> None:
+    told = call("run", log, "-o", tmp_path / "out", *LEAN).stdout
+    assert "prior sigma" in told
+    assert "its priors count" not in told
+    few = tmp_path / "few"
+    shutil.copytree(log, few)
+    frames = (log / "detections.jsonl").read_text().splitlines()
+    (few / "detections.jsonl").write_text("\n".join(frames[:4]) + "\n")
+    told = call("run", few, "-o", tmp_path / "out", *LEAN).stdout
+    assert "prior sigma" not in told
+    assert "this log tells none of them, so their priors count" in told
+
+
+def test_doctor_shows_an_unusual_calibration_if_there_are_too_few_boxes_to_judge_it(log: Path, tmp_path: Path) -> None:
+    few = tmp_path / "few"
+    shutil.copytree(log, few)
+    frames = (log / "detections.jsonl").read_text().splitlines()
+    (few / "detections.jsonl").write_text("\n".join(frames[:4]) + "\n")
+    assert call("doctor", few).stdout.splitlines()[-1] == "nothing wrong was found"
+    camera = (few / "camera.yaml").read_text()
+    camera = re.sub(r"rotation_xyzw: .*", "rotation_xyzw: [0, 0, 0, 1]", camera)
+    (few / "camera.yaml").write_text(camera)
+    last = call("doctor", few).stdout.splitlines()[-1]
+    assert last.startswith("check: ")
+    assert "base_T_camera has no rotation" in last
 
 
 def test_info_tells_in_words_and_in_json(log: Path) -> None:

@@ -70,6 +70,10 @@ def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeyp
     assert [len(site), len(site.gone)] == [14, 1]
     assert {o.life.state for o in site} == {"confirmed", "moved", "new"}
     assert (tmp_path / "site" / "map.png").is_file()
+    for command, missing in (("report", "rays.parquet"), ("view", "recording.rrd")):
+        code, _, error = call(monkeypatch, capsys, command, tmp_path / "site")
+        assert code == 1
+        assert f"this is the map of a site, which has no {missing} (look at map.png" in error
     again = objslam.merge([tmp_path / "site", out / "b"])
     assert len(again) == 1
     assert {o.id for o in again[0].objects} == {o.id for o in site}

@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from rich.console import Console
 
 from objslam.cli import console as terminal
 from objslam.cli.live_command.status import status_line
-from objslam.cli.run import objects_table
+from objslam.cli.run import advice_on_tags, objects_table
+from objslam.core.bodies.body import Body
 from objslam.core.diagnostics import Ledger
-from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.object_map import MapObject, ObjectMap, TagPose
 from objslam.core.snapshot import Snapshot
 from objslam.core.types import Trajectory
 
@@ -78,6 +80,41 @@ def test_the_status_line_is_one_line_and_gives_way_to_others(monkeypatch):
             lines[-1] += part
             assert len(lines[-1]) <= 60
     assert [line for line in lines if line] == ["warning: no publisher of boxes"]
+
+
+def test_a_cell_without_a_value_is_empty_and_a_body_has_its_size():
+    body = Body("cuboid", np.array([0.2, 0.1, 0.3]), 0.0, np.full(3, 0.01), 0.1)
+    seen_once = replace(thing(3, "cup", (np.nan, np.nan, np.nan)), rms_deg=np.nan, covariance=None, status="unresolved")
+    screen = Console(file=io.StringIO(), width=120)
+    screen.print(objects_table((replace(thing(1, "box", (1.0, 2.0, 3.0)), body=body), seen_once), screen))
+    assert "0.20 x 0.10 x 0.30" in screen.file.getvalue()
+    assert "nan" not in screen.file.getvalue()
+
+
+@pytest.mark.parametrize(("sigma", "told"), [(0.002, True), (0.0, False)])
+def test_tags_of_unknown_size_say_how_a_size_helps(sigma, told):
+    tag = TagPose(np.array([0.0, 0.0, 0.0, 1.0]), 1e-4 * np.eye(3), 0.16, sigma)
+    objects = (thing(0, "cup", (1.0, 2.0, 3.0)), replace(thing(1, "tag_1", (1.0, 2.0, 3.0)), tag=tag))
+    assert ("--set tags.size=METRES" in advice_on_tags(objects)) == told
+    assert advice_on_tags(objects[:1]) == ""
+
+
+def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before(monkeypatch):
+    screen = Tty()
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "xterm")
+    terminal.console.cache_clear()
+    try:
+        with terminal.progress_bar() as show:
+            show("detecting", 220, 220)
+            show("solving", 0, 0)
+            mark = len(screen.getvalue())
+    finally:
+        terminal.console.cache_clear()
+    after = screen.getvalue()[mark:]
+    assert "solving" in after
+    assert "220" not in after
 
 
 def test_the_status_line_says_why_most_was_dropped(monkeypatch):

@@ -75,3 +75,9 @@ def test_an_engine_takes_arguments_as_it_needs_them():
     next(answers)
     assert len(taken) < 10
     answers.close()
+
+
+def test_an_answer_tells_how_many_tasks_run():
+    counts = [one.running for one in local_engine(2, Limits())(WORK + "process", range(6))]
+    assert max(counts) == 2
+    assert counts[-1] == 0

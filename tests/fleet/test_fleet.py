@@ -19,6 +19,7 @@ from waiting import wait_for
 
 import objslam
 from objslam.cli import main
+from objslam.fleet.page import duration
 from objslam.fleet.record import Record, parse_seen
 from objslam.fleet.stores.open_store import open_store
 from objslam.fleet.stores.store import StoreError
@@ -220,3 +221,8 @@ def test_what_is_damaged_is_said(tmp_path):
     assert code == 1
     assert warned.startswith("objslam: s4://bucket/out: no file system for this URL")
     assert warned.count("\n") == 1
+
+
+@pytest.mark.parametrize(("hours", "told"), [(15 / 3600, "15 s"), (0.07, "4.2 min"), (31.5, "31.50 h")])
+def test_a_time_has_the_unit_that_suits_it(hours, told):
+    assert duration(hours) == told

@@ -254,6 +254,6 @@ def test_a_session_says_what_the_detector_fails_on():
     worker.close()
     dropped, warned = messages.ledger.lines()
     assert dropped.startswith(
-        "dropped 6: image that the detector failed on (first: /front/image at 0.100 s: RuntimeError: no device, "
+        "dropped 6: image that the detector failed on (first: /front/image at 0.100 s: RuntimeError: no device; "
     )
     assert warned.startswith("/front/image: the detector gave no boxes for 5 images in a row")

@@ -185,6 +185,6 @@ def test_a_name_that_is_a_list_is_told():
     assert not session.push_detections(1.0, "front", BOX, ["cup"], [1.0], whole=np.ones(2))
     assert session.counters.ledger.lines() == [
         "dropped 1: mount of an unknown camera (first: of type list)",
-        "dropped 3: frame that is malformed (first: camera of type list, stamp 1.000, camera front, stamp 1.000)",
+        "dropped 3: frame that is malformed (first: camera of type list, stamp 1.000; camera front, stamp 1.000)",
         "dropped 1: frame without a stamp (first: camera front)",
     ]

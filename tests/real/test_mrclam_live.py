@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from parts import part
+from log_parts import part
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger

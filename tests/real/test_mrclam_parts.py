@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from parts import part
+from log_parts import part
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger

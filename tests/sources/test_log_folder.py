@@ -233,7 +233,8 @@ def test_no_camera(written):
     (written / "camera.yaml").unlink()
     with pytest.raises(LogError) as caught:
         read_log_folder(written, Ledger())
-    assert caught.value.where == str(written / "camera.yaml")
+    assert caught.value.where == str(written)
+    assert "there is no camera.yaml (write one with" in str(caught.value)
     (written / "cameras").mkdir()
     (written / "cameras" / ".hidden").mkdir()
     (written / "cameras" / "notes.txt").touch()
@@ -242,7 +243,7 @@ def test_no_camera(written):
     (written / "cameras" / "left").mkdir()
     with pytest.raises(LogError) as caught:
         read_log_folder(written, Ledger())
-    assert caught.value.where == str(written / "cameras" / "left" / "camera.yaml")
+    assert caught.value.where == str(written / "cameras" / "left")
 
 
 def test_both_forms_of_cameras(written):

@@ -11,7 +11,7 @@ import typer
 
 from objslam.cli.console import progress_bar, say
 from objslam.cli.live_command.drive import LatestObjects, drive, finish
-from objslam.cli.options import CalibrationFile, Config, Out, PriorMapPath, Set, settings_of, with_options
+from objslam.cli.options import CalibrationFile, Config, Out, PriorMapPath, Quiet, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
 from objslam.sources import SourceOptions
 from objslam.sources.options import names, unused
@@ -59,6 +59,7 @@ def live(
     publish: Publish = False,
     publish_tf: PublishTf = False,
     view: View = None,
+    quiet: Quiet = False,
 ) -> None:
     """Map objects while the robot drives. Update objects.json, and write a complete result folder at the end (Ctrl-C).
 
@@ -115,8 +116,8 @@ def live(
             taken = session.counters.accepted()
             say(f"continued {out / NAME}: {', '.join(f'{n} {kind}' for kind, n in taken.items())}", stderr=True)
         latest = LatestObjects(out)
-        broken = drive(session, feed, latest, interval)
-        result = finish(session, feed, out, latest, truth, broken)
+        broken = drive(session, feed, latest, interval, quiet)
+        result = finish(session, feed, out, latest, truth, broken, quiet)
     if known is not None and not result.summary["localisation"]["localised"]:
         raise typer.Exit(NOT_LOCALISED)
 

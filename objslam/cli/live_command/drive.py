@@ -60,11 +60,13 @@ class LatestObjects:
             write_file(self._out / OBJECTS, dump_objects(snapshot.map).encode())
 
 
-def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) -> Exception | None:
-    """Run the adapter until it ends, the session fails, or the user presses Ctrl-C. Every `interval` s, update objects.json,
-    the views and the status line. Ten times a second, call the ticks of the feed and print new warnings. An error of a view
-    or a tick also ends the loop. It is returned instead of raised, so that `finish` can write the map first. An error of the
-    adapter is only a warning."""
+def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float, quiet: bool = False) -> Exception | None:
+    """Run the adapter until it ends, the session fails, or the user presses Ctrl-C.
+
+    Every `interval` s, update objects.json, the views and, unless `quiet`, the status line. Ten times a second, call the
+    ticks of the feed and print new warnings. An error of a view or a tick also ends the loop. It is returned instead of
+    raised, so that `finish` can write the map first. An error of the adapter is only a warning.
+    """
     from objslam.live.session import low_latency
 
     low_latency.configure()
@@ -78,7 +80,7 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
     ledgers, shown = (feed.adapter.ledger, session.counters.ledger), [0, 0]
-    with _ends_by_signal(stop), status_line() as show:
+    with _ends_by_signal(stop), status_line(quiet) as show:
         bringing.start()
         due = time.monotonic() + interval
         try:
@@ -111,9 +113,15 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float) 
 
 
 def finish(
-    session: Session, feed: Feed, out: Path, latest: LatestObjects, truth: Truth | None, broken: Exception | None
+    session: Session,
+    feed: Feed,
+    out: Path,
+    latest: LatestObjects,
+    truth: Truth | None,
+    broken: Exception | None,
+    quiet: bool = False,
 ) -> RunResult:
-    """End the session, write its result, print a summary, and return the result.
+    """End the session, write its result, print a summary unless `quiet`, and return the result.
 
     If the session ended early, raise its error afterwards, as an ObjslamError. Else raise `broken`, the error that `drive`
     returned, if any. If there is no result, the last snapshot is written to objects.json.
@@ -135,7 +143,8 @@ def finish(
     report(session.counters.ledger)
     thinned = last.counters.get("keyframes left out", 0)
     more = f" ({thinned} more left out: live.max_keyframes)" if thinned else ""
-    say_result(result, f"{more}; {times(last, ', ')}{last.rebuilds} rebuilds", out, removed)
+    if not quiet:
+        say_result(result, f"{more}; {times(last, ', ')}{last.rebuilds} rebuilds", out, removed)
     for view in feed.views if broken is None else ():
         view(last)
     if session.failure is not None:

@@ -18,11 +18,15 @@ _LINES = 10.0  # The time in s between two status lines if stderr is not a termi
 
 
 @contextmanager
-def status_line() -> Iterator[Callable[[Snapshot, Ledger], None]]:
+def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], None]]:
     """Yield a function that shows a snapshot, and the drops of the adapter, in the status line on stderr.
 
-    On a terminal, the line is cut to the width. Else the function prints at most one line in ten seconds.
+    On a terminal, the line is cut to the width. Else the function prints at most one line in ten seconds. With `quiet`, it
+    shows nothing.
     """
+    if quiet:
+        yield lambda snapshot, ledger: None
+        return
     from rich.live import Live as Line
     from rich.text import Text
 

@@ -12,15 +12,17 @@ from objslam.core.arrays import Floats
 Shape = Literal["point", "sphere", "ellipsoid", "cuboid"]
 SHAPES: tuple[Shape, ...] = ("point", "sphere", "ellipsoid", "cuboid")
 """The shapes of objects. A point has no size."""
+UNKNOWN_YAW = float(np.pi / np.sqrt(12))
+"""The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
 
 
 @dataclass(frozen=True)
 class Body:
     """An upright body around the position of its object.
 
-    shape: `cuboid`, `ellipsoid`, or `sphere` if its boxes do not tell an ellipsoid from a sphere. size: (3,) m, the full
+    shape: `cuboid`, `ellipsoid`, or `sphere` if the boxes fit a sphere as well as an ellipsoid. size: (3,) m, the full
     length, width and height. The length is the longer horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the
-    length in the plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most that of an unknown direction (0.91).
+    length in the plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most `UNKNOWN_YAW`, for an unknown yaw.
     """
 
     shape: Shape
@@ -38,7 +40,7 @@ def turned(body: Body, rotation: Floats) -> Body:
 
 @dataclass(frozen=True)
 class PlacedBody:
-    """A body in a map. centre: (3,) m, None if the rays through the centres of its boxes tell the place as well. covariance:
+    """A body in a map. centre: (3,) m, None if the position of the object from its rays is at least as good. covariance:
     (7, 7) of the centre, the size and the yaw."""
 
     body: Body
@@ -47,7 +49,7 @@ class PlacedBody:
 
 
 def surer_body(a: Body | None, b: Body | None) -> Body | None:
-    """Return the body whose size is known better, or the only one."""
+    """Return the body with the more certain size, or the only body, or None."""
     if a is None or b is None:
         return a or b
     return b if b.size_sigma.prod() < a.size_sigma.prod() else a

@@ -16,7 +16,7 @@ _SIDES = ("size_l", "size_w", "size_h")
 _SIGMAS = tuple(f"{name}_sigma" for name in (*_SIDES, "yaw"))
 BODY_COLUMNS = {"shape": "string", **dict.fromkeys((*_SIDES, "yaw", *_SIGMAS), "float64")}
 """The columns of a body in a table of objects, with their types: sizes in m, yaws in rad."""
-_TURN = 2 * math.pi  # The largest yaw, rad. A larger value accepts angles in degrees.
+_TURN = 2 * math.pi  # The largest yaw in a file, rad. A larger bound accepts angles in degrees.
 
 
 def body_entry(body: Body) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def body_of_entry(entry: Mapping[str, Any]) -> Body | None:
 
 
 def size_of(entry: Mapping[str, Any], name: str) -> Floats:
-    """Return three lengths (3,), m, of a JSON entry. ValueError if they are malformed."""
+    """Return the length, width and height (3,), m, under `name` in a JSON entry. ValueError if they are malformed."""
     size: Any = entry.get(name)
     if not isinstance(size, list) or len(size) != 3 or not all(_finite(x) and 0 <= x < MAX_POSITION for x in size):
         raise ValueError(f"{name} must be a length, a width and a height in metres")

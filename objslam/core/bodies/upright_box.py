@@ -13,7 +13,7 @@ UprightBox = tuple[Floats, Floats, float]
 def overlap(first: UprightBox, second: UprightBox) -> float:
     """Return the intersection over union, 0 to 1, of two upright boxes.
 
-    The horizontal rectangles are cut as polygons (Sutherland and Hodgman 1974).
+    The two rectangles seen from above are intersected as polygons (Sutherland and Hodgman 1974).
     """
     (centre, size, _), (from_, size_, _) = first, second
     height = min(centre[2] + size[2] / 2, from_[2] + size_[2] / 2) - max(centre[2] - size[2] / 2, from_[2] - size_[2] / 2)
@@ -38,7 +38,7 @@ def footprint(box: UprightBox) -> Floats:
 
 
 def _clipped(polygon: Floats, begin: Floats, along: Floats) -> Floats:
-    """Return the part of a polygon (n, 2) to the left of a line."""
+    """Return the part of a polygon (n, 2) to the left of the line through `begin` (2,) in the direction `along` (2,)."""
     side = along[0] * (polygon[:, 1] - begin[1]) - along[1] * (polygon[:, 0] - begin[0])
     kept = []
     for i in range(len(polygon)):

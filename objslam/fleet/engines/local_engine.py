@@ -1,7 +1,7 @@
 """The engines of a fleet: each runs a function on many arguments, and yields each answer as it comes.
 
-An engine is a function of the work, as "module:function", and of the arguments. It never holds more than a bounded number of
-arguments and answers, so that a fleet of any size needs the memory of a small one.
+An engine is called with the name of a function, "module:function", and its arguments. It never holds more than a bounded
+number of arguments and answers, so that a fleet of any size needs the memory of a small one.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -23,23 +23,24 @@ from objslam.fleet.stores.store import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What became of one argument. value: what the function returned, None after a failure. kind, message: of the failure.
+    """The outcome of one task. value: what the function returned, None after a failure. message: of the failure.
 
-    kind: `memory`, `time`, `lost`, `store` or `error`, empty after a success.
+    kind: of the failure, `memory`, `time`, `lost`, `store` or `error`, empty after a success.
     """
 
     argument: Any
     value: Any
     kind: str = ""
     message: str = ""
+    running: int = 0
 
 
 Engine = Callable[[str, Iterable[Any]], Iterator[Answer]]
 """A function that runs the work, named as "module:function", on each argument, and yields the answers in any order."""
 
 _QUEUED = 2
-"""The most tasks of each process that are submitted and not answered yet. A larger number hides a slow source of
-arguments."""
+"""The most tasks of each process that are submitted and not answered yet. A larger number keeps processes busy while
+arguments come slowly."""
 
 
 def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
@@ -68,7 +69,7 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
         own = threading.local()
         with ExitStack() as stack:
             pool = stack.enter_context(ThreadPoolExecutor(jobs, "objslam fleet"))
-            closing = stack.enter_context(ExitStack())  # It ends the processes before the pool waits for its threads.
+            closing = stack.enter_context(ExitStack())  # Closed before the pool, whose threads wait for the processes.
 
             def task(argument: Any) -> Answer:
                 if not hasattr(own, "worker"):
@@ -77,7 +78,7 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
                 return attempt(own.worker, work, argument, limits)
 
             try:
-                yield from _in_flight(lambda argument: pool.submit(task, argument), arguments, jobs * _QUEUED)
+                yield from _in_flight(lambda argument: pool.submit(task, argument), arguments, jobs)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -85,15 +86,15 @@ def local_engine(jobs: int, limits: Limits) -> Engine:
     return run
 
 
-def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], most: int) -> Iterator[Answer]:
-    """Yield the answer of each task. most: the most tasks that are submitted and not answered yet."""
+def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], jobs: int) -> Iterator[Answer]:
+    """Yield the answer of each task. jobs: the number of processes."""
     left = iter(arguments)
-    running = {submit(argument) for argument in islice(left, most)}
+    running = {submit(argument) for argument in islice(left, jobs * _QUEUED)}
     while running:
         done, running = wait(running, return_when=FIRST_COMPLETED)
         for one in done:
             running |= {submit(argument) for argument in islice(left, 1)}
-            yield one.result()
+            yield replace(one.result(), running=min(len(running), jobs))
 
 
 def cores() -> int:

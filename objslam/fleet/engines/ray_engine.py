@@ -9,7 +9,7 @@ import atexit
 import logging
 import socket
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -24,7 +24,7 @@ _PATIENT = 10.0
 _GB = 1e9
 
 _worker = Worker()
-"""The process that does the tasks of this process of Ray. It is kept, so that libraries are imported once."""
+"""The worker of this process of Ray. It is kept between tasks, so that libraries are imported once."""
 atexit.register(_worker.close)
 
 
@@ -97,7 +97,7 @@ def ray_engine(limits: Limits, *, most: int, memory: int, gpus: float) -> Engine
                 done, _ = ray.wait(list(running), num_returns=1)
                 argument = running.pop(done[0])
                 submit(1)
-                yield _answer(done[0], argument)
+                yield replace(_answer(done[0], argument), running=min(len(running), int(cpus)))
         finally:
             for reference in running:
                 ray.cancel(reference, force=True)

@@ -1,8 +1,8 @@
 """A process that does one task after another, with a limit of memory and of time for each.
 
 A task is a function, named as "module:function", and one argument. The limits are watched from outside, because native code
-neither returns to Python nor lets another thread of its process run. The memory is what the process has in RAM. RLIMIT_AS
-and RLIMIT_DATA do not limit it, because they count what libraries reserve: 2.0 and 1.35 GB for a process that uses 0.28 GB.
+neither returns to Python nor lets another thread of its process run. The memory is the RAM of the process. RLIMIT_AS and
+RLIMIT_DATA do not limit it: they count what libraries reserve, 2.0 and 1.35 GB for a process that uses 0.28 GB.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from objslam.errors import ObjslamError
 _WATCH = 0.05
 """The pause between two looks at memory and time, s. A larger value costs less, and ends a task later."""
 _TIRED = 0.5
-"""The share of the memory limit that a process may still have after a task. A process that has more is replaced, so that the
+"""The share of the memory limit that a process may still use after a task. A process that uses more is replaced, so that the
 next task has its memory. A larger share replaces processes less often."""
 _THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """The environment variables that give numerical libraries one thread, because each core has a process of its own."""

@@ -18,10 +18,10 @@ _TRIES = 5
 _PAUSE = 0.1
 """The pause after the first failure, s; it doubles after each further one. A larger value gives a busy store more rest."""
 _STAMPS = ("ETag", "etag", "md5Hash", "crc32c", "generation", "content_settings", "mtime", "LastModified", "created")
-"""The keys under which file systems of fsspec say what changes with the content of a file, the best first."""
+"""The keys in fsspec's information on a file whose values change with its content, the most reliable first."""
 _MAGIC = re.compile(r"[*?\[]")  # The marks of a pattern.
 _SAFE = re.compile(r"(?!(.*/)?\.\.?(/|$))[^\0]*")
-"""The names of files that stay below their folder: none of their parts is . or .. ."""
+"""The names of files that stay below their folder: no part of the name is "." or ".."."""
 
 _T = TypeVar("_T")
 
@@ -183,7 +183,7 @@ class RemoteSource:
         return isinstance(self._fs, AsyncFileSystem) and type(self._fs)._find is not AsyncFileSystem._find
 
     def _walk(self, root: str) -> dict[str, Any]:
-        """Return every file below a path, folder by folder, so that a call that fails is tried again alone."""
+        """Return every file below a path. Folders are listed one by one, and only a listing that fails is repeated."""
         found, left = {}, [root]
         while left:
             for name, info in self._inside(left.pop()).items():

@@ -16,7 +16,7 @@ class StoreError(ObjslamError):
 
 @dataclass(frozen=True, slots=True)
 class FileState:
-    """What a listing says of a file. size: bytes. stamp: changes with the content: an ETag, a checksum or the time of the
+    """A file in a listing. size: bytes. stamp: a text that changes with the content: an ETag, a checksum or the time of the
     last change."""
 
     size: int

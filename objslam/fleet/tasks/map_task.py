@@ -36,7 +36,7 @@ WORK = "objslam.fleet.tasks.map_task:map_one"
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What all logs of a fleet have in common.
+    """The part that the tasks of all logs of a fleet share.
 
     store: the path or URL of the output. options: of the sources. digest: the hash of all that decides a result besides its
     log. files: the dotted key of each setting that names a file, or `detector`, with the path of the file, or with its name
@@ -98,7 +98,7 @@ def map_one(given: MapTask) -> Record:
 
 
 def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
-    """Map a log into the folder `out`, and return its record with what the summary says."""
+    """Map a log into the folder `out`, and return its record, completed from the summary."""
     from objslam.api.mapping import map_log
     from objslam.api.result import Result
     from objslam.core.diagnostics import Ledger

@@ -1,4 +1,7 @@
-"""The task of one node of the tree of a site: merge the sessions, or the two parts, below the node."""
+"""The task of one node of the tree of a site: merge the sessions, or the two parts, below the node.
+
+An island is a group of sessions that have objects in common, and so one map. A node may have several islands.
+"""
 
 from __future__ import annotations
 
@@ -44,9 +47,9 @@ class MergeTask:
 class Placed:
     """A session in the frame of its island.
 
-    key: of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence that tied the session, or the
-    part of the site that begins with it, to those before, NaN for the first. common: how many of its objects other sessions
-    had in the first merge that found any.
+    key: of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence for its place among the
+    earlier sessions, NaN for the first. If it is the first of a part of the site, the evidence is that of the whole part.
+    common: how many of its objects other sessions share, from the first merge with any.
     """
 
     key: str
@@ -123,7 +126,7 @@ def _result_folder(store: Store, folder: Path, key: str) -> Iterator[Path]:
 
 
 def _session(part: SiteMap, load: Any) -> Session:
-    """Return an island as a session of the next merge. Its visits are loaded when an object may have been missed."""
+    """Return an island as a session of the next merge. Its sessions are loaded only if an object may have been missed."""
     from objslam.core.geometry import inverse
     from objslam.mapping.sites.session import Session, Visit
 

@@ -31,7 +31,7 @@ _STATE = "fleet.json"
 """The file of a site that says what its folder and its tables were made of."""
 _OBJECTS, _SESSIONS = "objects.parquet", "sessions.parquet"
 """The folders of the tables, with one file for each site and day."""
-_FILE = "part-0.parquet"  # The name of this file.
+_FILE = "part-0.parquet"  # The name of each of these files.
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def _parse_state(data: bytes | None) -> dict[str, Any]:
 
 
 def _write_folder(store: Store, given: SiteTask, islands: Sequence[SiteMap], at: str, before: int) -> None:
-    """Write the site as `objslam merge` does, and the map as a table. before: the islands of the earlier run."""
+    """Write the site as `objslam merge` does, and the map as a table. before: the number of islands in the earlier run."""
     from objslam.fleet.tables import dump_objects, object_rows
     from objslam.output.site_folder import write_site
 
@@ -183,7 +183,7 @@ def _island(found: SiteMap, order: Mapping[str, int]) -> Island:
 def _write_tables(store: Store, given: SiteTask, islands: Sequence[SiteMap], before: Mapping[str, str]) -> dict[str, str]:
     """Write the tables of the days that changed, and remove those of days that are gone.
 
-    Return for each day the hash of what its files are made of. before: the same of the earlier run.
+    Return for each day a hash of the data in its files. before: these hashes from the earlier run.
     """
     placed = {one.key: (number + 1, one) for number, island in enumerate(islands) for one in island.sessions}
     days: dict[str, list[Member]] = {}

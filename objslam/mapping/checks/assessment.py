@@ -96,6 +96,11 @@ def assess(e: Evidence) -> Assessment:
 def _bad(e: Evidence) -> list[str]:
     if e.spoilt:
         return ["The input is wrong, and the warnings say how."]
+    if not e.resolved and e.unexplained > _UNEXPLAINED * e.rays:
+        return [
+            f"No object has a place, because {100 * e.unexplained / e.rays:.0f} % of the used boxes agree on none: check "
+            "the input, and drive around things."
+        ]
     if not e.resolved:
         return ["No object has a place. Drive around things, so that they are seen from more than one side."]
     return []

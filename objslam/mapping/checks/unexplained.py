@@ -19,7 +19,7 @@ def warn_of_unexplained(rays: Rays, association: Association, ledger: Ledger) ->
     if association.count and left.mean() <= _USUAL:
         return
     number = np.bincount(rays.label[left], minlength=len(rays.label_names))
-    worst = ", ".join(f"{rays.label_names[i]} {number[i]}" for i in np.argsort(-number, kind="stable")[:3] if number[i])
+    worst = ", ".join(f"{rays.label_names[i]}: {number[i]}" for i in np.argsort(-number, kind="stable")[:3] if number[i])
     why = "" if association.count else "; an object needs at least three boxes from three places that agree"
     if left.mean() > _IMPLAUSIBLE:
         why += f"; unless most things move, the input may be wrong: check {_INPUT}"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -12,107 +12,108 @@ from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import printable
 from objslam.mapping.sites.compare import Comparison
-from objslam.output.plot.label_layout import place_labels
-from objslam.output.plot.style import frame_objects
+from objslam.output.plot.figure import Colour, Figure, Label, Line, Marks, Shape
+from objslam.output.plot.labels import make_labels, shortened
+from objslam.output.plot.page import render
+from objslam.output.plot.style import body_outline, frame_objects
 
-_COLOURS = {"confirmed": "#4b5563", "unseen": "#767676", "new": "#1a7f37", "moved": "#0b63c5", "gone": "#c22f2f"}
-"""The colour of each outcome."""
-_MARKERS = {"confirmed": "o", "unseen": "o", "new": "P", "moved": "D", "gone": "X"}
-"""The marker of each outcome, so that the picture is readable without colours."""
-_LONG_SIDE, _SHORT_SIDE = 8.0, 4.0
-"""The length of the map's longer side, and the least length of the other side, inches. Larger values make a larger
-picture."""
-_FONT = 8.0
-"""The font size of labels and legend, points. A larger size has room for fewer labels."""
-_LETTERS = 24
-"""The most letters of a label. A larger number cuts fewer labels."""
+_LONG_SIDE, _SHORT_SIDE = 1200.0, 600.0
+"""The length of the map's longer side, and the least length of the other side, px. Larger values make a larger picture."""
+_MARGIN = 0.08
+"""The margin around the objects, as a share of the longer side. A larger share leaves more room for labels at the edge."""
+_MARK, _ARROW = 15.0, 18.0
+"""The size of the mark of an object, and of the head of an arrow, px."""
+_LINE = 2.0
+"""The width, px, of the arrow of an object that moved, and of the outline of a body."""
+_WHITE: Colour = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class _Look:
+    """The mark of an outcome. Its kind differs too, so that the picture is readable without colours."""
+
+    colour: Colour
+    kind: Literal["dot", "plus", "x", "diamond"]
+    hollow: bool = False
+
+
+_LOOKS = {
+    "confirmed": _Look((0.294, 0.333, 0.388), "dot"),
+    "unseen": _Look((0.463, 0.463, 0.463), "dot", hollow=True),
+    "new": _Look((0.102, 0.498, 0.216), "plus"),
+    "moved": _Look((0.043, 0.388, 0.773), "diamond"),
+    "gone": _Look((0.761, 0.184, 0.184), "x"),
+}
+"""The mark of each outcome."""
 
 
 def draw_site(objects: ObjectMap) -> bytes:
     """Return a PNG of the map of a site, with what became of each object."""
     items = [(_outcome(o), o) for o in (*objects.objects, *objects.gone)]
-    return _draw(items, f"{len(objects)} objects")
+    return render(changes_figure(items, f"{len(objects)} objects"))
 
 
 def draw_comparison(found: Comparison) -> bytes:
     """Return a PNG of the comparison of two maps, in the frame of the first."""
-    return _draw([(one.outcome, one.item) for one in found.changes], "changes since the first map")
+    return render(changes_figure([(one.outcome, one.item) for one in found.changes], "changes since the first map"))
+
+
+def changes_figure(items: Sequence[tuple[str, MapObject]], title: str) -> Figure:
+    """Return what the picture of objects with their outcomes shows."""
+    everything = np.array([o.position[:2] for _, o in items]).reshape(-1, 2)
+    inside, low, high = frame_objects(everything, np.zeros((0, 2)))
+    items = [item for item, there in zip(items, inside, strict=True) if there]
+    points, before = everything[inside], np.array([_before(o)[:2] for _, o in items]).reshape(-1, 2)
+    title += f", {int((~inside).sum())} far away not shown" if not inside.all() else ""
+    low, high = np.minimum(low, before.min(axis=0, initial=np.inf)), np.maximum(high, before.max(axis=0, initial=-np.inf))
+    margin = _MARGIN * max(float((high - low).max()), 1.0)
+    low, high = low - margin, high + margin
+    scale = _LONG_SIDE / float((high - low).max())
+    wider = np.maximum(_SHORT_SIDE / scale - (high - low), 0.0) / 2
+    shapes: list[Shape] = []
+    marks: list[Shape] = []
+    for outcome, look in _LOOKS.items():
+        mine = np.array([one == outcome for one, _ in items], dtype=bool)
+        if not mine.any():
+            continue
+        shapes += _outlines([o for one, o in items if one == outcome], look.colour, 2 * _MARK / scale)
+        if outcome == "moved":
+            shapes += _arrows(before[mine], points[mine], look.colour)
+        face, rim = (_WHITE, look.colour) if look.hollow else (look.colour, _WHITE)
+        marks.append(Marks(points[mine], look.kind, face, rim, _MARK, f"{outcome} ({int(mine.sum())})"))
+    figure = Figure(title, ("x", "y"), low - wider, high + wider, scale, (*shapes, *marks))
+    return replace(figure, labels=_labels(figure, items, points))
 
 
 def _outcome(o: MapObject) -> str:
     return "confirmed" if o.life is None else o.life.state
 
 
-def _draw(items: Sequence[tuple[str, MapObject]], title: str) -> bytes:
-    import matplotlib
-
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()  # The user's own style may use TeX or white text.
-        return _draw_figure(items, title)
-
-
-def _draw_figure(items: Sequence[tuple[str, MapObject]], title: str) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    everything = np.array([o.position[:2] for _, o in items]).reshape(-1, 2)
-    inside, low, high = frame_objects(everything, np.zeros((0, 2)))
-    items = [item for item, there in zip(items, inside, strict=True) if there]
-    points, before = everything[inside], np.array([_before(o)[:2] for _, o in items]).reshape(-1, 2)
-    title += f", {int((~inside).sum())} far away not shown" if not inside.all() else ""
-    margin = 0.08 * max(float((high - low).max()), 1.0)
-    low, high = np.minimum(low, before.min(axis=0, initial=np.inf)), np.maximum(high, before.max(axis=0, initial=-np.inf))
-    low, high = low - margin, high + margin
-    width, height = (high - low) / (high - low).max() * _LONG_SIDE
-    size = max(width, _SHORT_SIDE) + 0.6, max(height, _SHORT_SIDE) + 1.2  # The added inches are for title and legend.
-    figure = Figure(figsize=size, dpi=150, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.set_aspect("equal", adjustable="box")
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="x (m)", ylabel="y (m)")
-    axes.grid(True, color="#ececec", linewidth=0.6)
-    axes.set_axisbelow(True)
-    for outcome, colour in _COLOURS.items():
-        mine = np.array([one == outcome for one, _ in items], dtype=bool)
-        if not mine.any():
-            continue
-        if outcome == "moved":
-            for start, end in zip(before[mine], points[mine], strict=True):
-                axes.annotate("", end, start, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.2})
-        name = f"{outcome} ({int(mine.sum())})"
-        face = "white" if outcome == "unseen" else colour
-        marks: dict[str, Any] = {"markersize": 6, "markerfacecolor": face, "linestyle": "", "zorder": 3}
-        axes.plot(*points[mine].T, _MARKERS[outcome], color=colour, label=name, **marks)
-    axes.set_title(title, fontsize=10, loc="left")
-    if items:
-        figure.legend(loc="outside lower left", ncols=5, fontsize=_FONT, frameon=False)
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # Labels are placed by pixels, so the layout is frozen.
-    _draw_labels(axes, canvas.get_renderer(), items, points)
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()
-
-
 def _before(o: MapObject) -> Floats:
     return o.position if o.life is None or o.life.moved_from is None else o.life.moved_from
 
 
-def _draw_labels(axes: Any, renderer: Any, items: Sequence[tuple[str, MapObject]], points: Floats) -> None:
-    """Write the label of each object beside it, where there is room. Objects that changed come first."""
+def _outlines(objects: Sequence[MapObject], colour: Colour, least: float) -> list[Shape]:
+    """Return the outlines of the bodies of objects. A body shorter than `least`, m, has none, because its mark covers it."""
+    rims = (body_outline(o) for o in objects)
+    return [Line(rim, colour, _LINE) for rim in rims if rim is not None and np.ptp(rim, axis=0).max() >= least]
+
+
+def _arrows(starts: Floats, ends: Floats, colour: Colour) -> list[Shape]:
+    """Return a line from each start (n, 2), m, to its end, with a head in the middle that points to the end."""
+    found: list[Shape] = []
+    for start, end in zip(starts, ends, strict=True):
+        turn = float(np.arctan2(*(end - start)[::-1]))
+        found.append(Line(np.stack([start, end]), colour, _LINE))
+        found.append(Marks(((start + end) / 2)[None], "triangle", colour, colour, _ARROW, turn=turn))
+    return found
+
+
+def _labels(figure: Figure, items: Sequence[tuple[str, MapObject]], points: Floats) -> tuple[Label, ...]:
+    """Return the label of each object that has room for one. Objects that changed come first."""
     order = sorted(range(len(items)), key=lambda k: items[k][0] in ("confirmed", "unseen"))
-    texts = []
-    for k in order:
-        outcome, o = items[k]
-        name = printable(f"{o.label} #{o.id}")
-        short = name if len(name) <= _LETTERS else name[: _LETTERS - 1] + "\u2026"
-        texts.append(axes.text(0, 0, short, fontsize=_FONT, color=_COLOURS[outcome], va="bottom", ha="left", zorder=4))
-    boxes = [text.get_window_extent(renderer) for text in texts]
-    sizes = np.array([(box.width, box.height) for box in boxes]).reshape(-1, 2)
-    anchors = axes.transData.transform(points[order]).reshape(-1, 2)
-    frame = axes.get_window_extent(renderer)
-    area = np.array([[frame.x0, frame.y0], [frame.x1, frame.y1]])
-    corners, placed = place_labels(anchors, sizes, area, np.zeros((0, 2)))
-    back = axes.transData.inverted().transform(corners).reshape(-1, 2)
-    for text, corner, there in zip(texts, back, placed, strict=True):
-        text.set_position(corner) if there else text.remove()
+    items, points = [items[k] for k in order], points[order]
+    names = [shortened(printable(f"{o.label} #{o.id}")) for _, o in items]
+    rims = [rim for _, o in items if (rim := body_outline(o)) is not None]
+    avoid = figure.pixels(np.concatenate(rims)) if rims else np.zeros((0, 2))
+    return make_labels(figure, names, [_LOOKS[outcome].colour for outcome, _ in items], points, avoid)

@@ -37,11 +37,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Marks:
-    """Marks of one size (px) at points (n, 2), m. rim: the colour of the rim of a dot. name: in the legend, "" for no entry.
-    turn: rad, the direction in which a triangle points, counterclockwise from the right."""
+    """Marks of one size (px) at points (n, 2), m. A cross is thin, a plus has thick arms, and an x is a plus that is turned.
+    rim: the colour of the rim of a dot. name: in the legend, "" for no entry. turn: of a triangle, rad counterclockwise from
+    the right."""
 
     points: Floats
-    kind: Literal["dot", "cross", "triangle"]
+    kind: Literal["dot", "cross", "plus", "x", "diamond", "triangle"]
     colour: Colour
     rim: Colour
     size: float

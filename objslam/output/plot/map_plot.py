@@ -7,22 +7,18 @@ from typing import Any
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.bodies.body import Body
-from objslam.core.bodies.upright_box import footprint
 from objslam.core.object_map import MapObject
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
 from objslam.frontend.up import from_above, up_axis
-from objslam.output.plot.canvas import text_width
 from objslam.output.plot.figure import Area, Figure, Label, Line, Marks, Segments, Shape
-from objslam.output.plot.label_layout import needs_leader, place_labels
-from objslam.output.plot.page import FONT, LINE, render
-from objslam.output.plot.style import captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
+from objslam.output.plot.labels import make_labels, shortened
+from objslam.output.plot.page import render
+from objslam.output.plot.style import body_outline, captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
 
 _MAX_RAYS = 2000  # The picture shows at most this many used rays. More rays would merge into one blue area.
 _MAX_REJECTED = 400  # The picture shows at most this many rejected rays, because they cross the whole map.
 _MAX_LABELS = 150  # The picture has at most this many labels. The objects with the most rays come first.
-_MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
 _PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
 _WEIGHT = 5  # A label avoids each point of a cross or of an ellipse as much as this many points of the path.
 _CROSS = 17.0  # The cross of a true object has this width and height, px.
@@ -72,10 +68,11 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
         shapes=(*shapes, *dots),
         legend=_legend(result),
     )
-    names = np.array([_shortened(" ".join(name.split())) for name in captions(result.map)], dtype=object)
+    names = np.array([shortened(name) for name in captions(result.map)], dtype=object)
     names[far] = [f"{name}, {away:.1f} m out" for name, away in zip(names[far], beyond, strict=True)]
     points[far] = at
-    rims = [_ellipse(o, plane) for o, seen in zip(result.map, shown.tolist(), strict=True) if seen]
+    seen = [o for o, is_shown in zip(result.map, shown.tolist(), strict=True) if is_shown]
+    rims = [*(_ellipse(o, plane) for o in seen), *(body_outline(o) for o in seen if plane == [0, 1])]
     outlines = np.concatenate([np.zeros((0, 2)), *(rim for rim in rims if rim is not None)])
     path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS)][:, plane, 3]
     labels = _labels(figure, result, points, shown | far, names, (path, crosses, outlines))
@@ -142,8 +139,9 @@ def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[
         rim = _ellipse(o, plane)
         if rim is not None:
             below.append(Area(rim, colour, 0.18))
-        if o.body is not None and plane == [0, 1]:  # A body stands along z.
-            below.append(Line(_footprint(o, o.body), colour, _PATH))
+        outline = body_outline(o) if plane == [0, 1] else None  # A body stands along z.
+        if outline is not None:
+            below.append(Line(outline, colour, _PATH))
     return below, dots
 
 
@@ -168,17 +166,6 @@ def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
     turn = np.linspace(0, 2 * np.pi, _ELLIPSE_POINTS, endpoint=False)
     values, vectors = np.linalg.eigh(o.covariance[np.ix_(plane, plane)])
     return o.position[plane] + 2 * ((vectors * np.sqrt(np.maximum(values, 0))) @ np.stack([np.cos(turn), np.sin(turn)])).T
-
-
-def _footprint(o: MapObject, body: Body) -> Floats:
-    """Return the closed outline (n, 2), m, of a body seen from above."""
-    if body.shape == "cuboid":
-        corners = footprint((o.position, body.size, body.yaw))
-        return np.concatenate([corners, corners[:1]])
-    turn = np.linspace(0, 2 * np.pi, _ELLIPSE_POINTS)
-    cos, sin = np.cos(body.yaw), np.sin(body.yaw)
-    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * body.size[:2] / 2
-    return np.asarray(o.position[:2] + rim @ np.array([[cos, sin], [-sin, cos]]))
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
@@ -209,33 +196,19 @@ def _title(result: RunResult) -> str:
     return text + (f"\n{lost} of them without a position" if lost else "")
 
 
-def _shortened(name: str) -> str:
-    return name if len(name) <= _MAX_LETTERS else name[: _MAX_LETTERS - 1] + "…"
-
-
 def _labels(
     figure: Figure, result: RunResult, points: Floats, shown: Bools, names: Any, avoid: tuple[Floats, Floats, Floats]
 ) -> tuple[Label, ...]:
     """Place at most `_MAX_LABELS` labels. An object whose label has no room has none.
 
     points: (N, 2) m. shown: (N,) which objects may have a label. names: (N,) the texts. avoid: points (P, 2), m, of the
-    path, of the crosses, and of the ellipses.
+    path, of the crosses, and of the ellipses and the outlines of bodies.
     """
     path, crosses, outlines = (figure.pixels(part) for part in avoid)
     colours = label_colours(result.map)
     order = np.argsort([-o.rays for o in result.map.objects], kind="stable")
     chosen = [int(j) for j in order if shown[j]][:_MAX_LABELS]
-    sizes = np.array([(text_width(text, FONT), LINE * FONT) for text in names[chosen]]).reshape(-1, 2)
-    anchors = figure.pixels(points[chosen]) if chosen else np.zeros((0, 2))
     arms = crosses[:, None] + _CROSS / 2 * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
     heavy = np.repeat(np.concatenate([arms.reshape(-1, 2), outlines]), _WEIGHT, axis=0)
-    frame = np.array([[0, 0], figure.size], dtype=np.float64)
-    corners, found = place_labels(anchors, sizes, frame, np.concatenate([path, heavy]))
-    led = needs_leader(anchors, corners, sizes)
-    labels = []
-    for i in np.flatnonzero(found).tolist():
-        near = np.clip(anchors[i], corners[i], corners[i] + sizes[i])
-        leader = np.stack([anchors[i], near]) if led[i] else None
-        box = np.concatenate([corners[i], corners[i] + sizes[i]])
-        labels.append(Label(names[chosen[i]], colours[result.map.objects[chosen[i]].label], box, leader))
-    return tuple(labels)
+    painted = [colours[result.map.objects[j].label] for j in chosen]
+    return make_labels(figure, names[chosen].tolist(), painted, points[chosen], np.concatenate([path, heavy]))

@@ -96,16 +96,31 @@ def _draw_shape(area: Image, figure: Figure, shape: Shape) -> None:
         _draw_marks(area, figure.pixels(shape.points), shape)
 
 
+def _turned(angle: float) -> Floats:
+    """Return the matrix (2, 2) by which points, as rows, turn counterclockwise."""
+    return np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+
+
+_ARM = 0.3  # Half the width of an arm of a plus, as a share of half its size.
+_PLUS = np.array([(1, _ARM), (_ARM, _ARM), (_ARM, 1), (-_ARM, 1), (-_ARM, _ARM), (-1, _ARM)])
+_RIMS = {
+    "plus": np.concatenate([_PLUS, -_PLUS]),
+    "x": np.concatenate([_PLUS, -_PLUS]) @ _turned(np.pi / 4),
+    "diamond": np.array([(1, 0), (0, 1), (-1, 0), (0, -1)]),
+    "triangle": np.column_stack([np.cos(np.radians([0, 130, 230])), np.sin(np.radians([0, 130, 230]))]),
+}
+"""The corners of the marks that are areas, x to the right and y up, with half a mark's size as the unit."""
+
+
 def _draw_marks(image: Image, points: Floats, marks: Marks) -> None:
     """Draw marks at points (n, 2), px."""
     for point in points:
         if marks.kind == "cross":
             for arm in np.eye(2) * marks.size / 2:
                 draw_line(image, np.stack([point - arm, point + arm]), marks.colour, 1)
-        elif marks.kind == "triangle":
-            corners = marks.turn + np.radians([0, 130, 230])
-            rim = point + marks.size / 2 * np.column_stack([np.cos(corners), -np.sin(corners)])
-            draw_area(image, rim, marks.colour, 1.0, 1)
+        elif marks.kind in _RIMS:
+            rim = marks.size / 2 * _RIMS[marks.kind] @ _turned(marks.turn)
+            draw_area(image, point + rim * [1, -1], marks.colour, 1.0, 1)
         else:
             draw_dot(image, point, marks.size, marks.colour, marks.rim, 1.0 if marks.rim == (1.0, 1.0, 1.0) else 2.0)
 

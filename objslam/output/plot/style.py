@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.bodies.upright_box import footprint
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.errors import printable
@@ -21,6 +22,10 @@ _SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
 """Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
 either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
+_CORE, _AROUND = 0.1, 1.5
+"""Without a path, the box of the objects leaves out this share of them on each side, and a picture shows objects up to this
+multiple of the box's diagonal from it. A larger share hides more far objects, and a larger multiple fewer."""
+_OUTLINE_POINTS = 96  # A round body is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _FENCE = (3.0, 0.5, 1.0)
 """A picture shows an object if its distance from the path is at most the largest of three distances: this multiple of the
 median distance of the objects, this share of the diagonal of the path's bounding box, and this length, m. Larger values show
@@ -106,6 +111,20 @@ def ellipsoid(o: MapObject) -> tuple[Floats, Floats] | None:
     return 2.0 * np.sqrt(np.maximum(values, 0.0)), axes
 
 
+def body_outline(o: MapObject) -> Floats | None:
+    """Return the closed outline (n, 2), m, of an object's body seen from above, along z. None for a point."""
+    body = o.body
+    if body is None or o.status != "ok":
+        return None
+    if body.shape == "cuboid":
+        corners = footprint((o.position, body.size, body.yaw))
+        return np.concatenate([corners, corners[:1]])
+    turn = np.linspace(0, 2 * np.pi, _OUTLINE_POINTS)
+    cos, sin = np.cos(body.yaw), np.sin(body.yaw)
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * body.size[:2] / 2
+    return np.asarray(o.position[:2] + rim @ np.array([[cos, sin], [-sin, cos]]))
+
+
 def sample(mask: Bools, count: int) -> Ints:
     """Return at most `count` of the indices that a mask (N,) selects, in order.
 
@@ -126,7 +145,8 @@ def frame_objects(objects: Floats, path: Floats) -> tuple[Bools, Floats, Floats]
     """Choose the objects and the area that a picture shows.
 
     A far object is left out, because it would shrink the rest of the map. `_FENCE` limits the distance of an object from the
-    bounding box of the path. The box leaves out 1 % of the path on each side.
+    bounding box of the path. The box leaves out 1 % of the path on each side. Without a path, it is the box of the objects,
+    and leaves out `_CORE` of them on each side.
 
     Args:
         objects, path: positions (N, D) and (K, D), m in map.
@@ -135,12 +155,14 @@ def frame_objects(objects: Floats, path: Floats) -> tuple[Bools, Floats, Floats]
     """
     if len(path):
         low, high = np.quantile(path, 0.01, axis=0), np.quantile(path, 0.99, axis=0)
+    elif len(known := objects[np.isfinite(objects).all(axis=1)]):
+        low, high = np.quantile(known, _CORE, axis=0), np.quantile(known, 1 - _CORE, axis=0)
     else:
-        low = high = np.median(objects, axis=0) if len(objects) else np.zeros(path.shape[1])
+        low = high = np.zeros(path.shape[1])
     diagonal = float(np.linalg.norm(high - low))
     off = np.linalg.norm(np.maximum(np.maximum(low - objects, objects - high), 0.0), axis=1)
     usual = float(np.sort(off)[(len(off) - 1) // 2]) if len(off) else 0.0
-    fence = max(_FENCE[0] * usual, _FENCE[1] * diagonal, _FENCE[2])
+    fence = max(_FENCE[0] * usual, (_FENCE[1] if len(path) else _AROUND) * diagonal, _FENCE[2])
     inside = np.isfinite(off) & (off <= fence)
     near = path[((path >= low - fence) & (path <= high + fence)).all(axis=1)]
     shown = np.concatenate([near, objects[inside], np.stack([low, high])])

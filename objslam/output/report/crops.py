@@ -50,7 +50,7 @@ def images_of(path: object, count: int | None) -> tuple[dict[str, Images], str |
         count: the number of images that the log had at the time of the run; None if this is unknown.
     """
     if count == 0:
-        return {}, "The log has no images."
+        return {}, "The log of the run had no images."
     if not isinstance(path, str | Path):
         return {}, "The result does not name its log: name it with objslam report --log LOG."
     log = Path(path)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
+from objslam.core.bodies.body import UNKNOWN_YAW
 from objslam.core.types import Images
 from objslam.errors import ConfigError, OutputError, printable
 from objslam.evaluation.alignment import lay_truth
@@ -30,6 +31,7 @@ from objslam.results.read import load_evaluation, load_map, load_path, load_rays
 
 _BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
 _LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
+_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # A yaw with a smaller standard deviation (rad) is shown. Nothing is known of others.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",
@@ -114,6 +116,8 @@ def write_report(
         picture=picture.read_bytes() if picture.is_file() else None,
         cards=cards,
         with_errors=any(card.error is not None for card in cards),
+        with_size=any(o.body is not None or o.tag is not None for o in objects),
+        unknown_yaw=_KNOWN_YAW,
         with_existence=any(card.object.existence is not None for card in cards),
         histogram=histogram(np.degrees(rays.residual), rays.weight, _BINS),
         trends=trends(rays),
@@ -128,7 +132,7 @@ def write_report(
             label: (int(((rays.object < 0) & (rays.label == label)).sum()), [pictures[i] for i in index if i in pictures])
             for label, index in unexplained.items()
         },
-        dropped=[(why, n, ", ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
+        dropped=[(why, n, "; ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
         **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},
         changed=_changed(settings),

@@ -97,10 +97,10 @@
       return `rgb(${parts.map(x => Math.round(theme.dark ? x + 0.45 * (255 - x) : x)).join(" ")})`;
     };
     // The outline of an ellipsoid, by the derivative of the projection at its centre.
-    const outline = (o, p) => {
+    const outline = (o, axes, p, fill, width) => {
       const scale = frame.focal / p[2], {right, up, back} = frame;
       const dx = (p[0] - frame.w / 2) / frame.focal, dy = (p[1] - frame.h / 2) / frame.focal;
-      const flat = o.axes.map(a => {
+      const flat = axes.map(a => {
         const on = v => a[0] * v[0] + a[1] * v[1] + a[2] * v[2];
         return [scale * (on(right) + dx * on(back)), scale * (-on(up) + dy * on(back))];
       });
@@ -109,12 +109,21 @@
       const mean = (xx + yy) / 2, off = Math.hypot((xx - yy) / 2, xy);
       pen.beginPath();
       pen.ellipse(p[0], p[1], Math.sqrt(mean + off), Math.sqrt(Math.max(mean - off, 0)), Math.atan2(2 * xy, xx - yy) / 2, 0, 7);
-      pen.globalAlpha = 0.18; pen.fillStyle = shade(o.colour); pen.fill();
-      pen.globalAlpha = 0.8; pen.strokeStyle = shade(o.colour); pen.lineWidth = 1; pen.stroke(); pen.globalAlpha = 1;
+      pen.globalAlpha = fill; pen.fillStyle = shade(o.colour); pen.fill();
+      pen.globalAlpha = 0.8; pen.strokeStyle = shade(o.colour); pen.lineWidth = width; pen.stroke(); pen.globalAlpha = 1;
+    };
+    // A cuboid by its twelve edges, another body by its outline.
+    const drawBody = (o, p) => {
+      if (!o.cuboid) return outline(o, o.body, p, 0, 2);
+      const corner = bits => project(...o.at.map((x, i) => o.body.reduce((sum, a, k) => sum + (bits >> k & 1 ? a[i] : -a[i]), x)));
+      pen.beginPath(); pen.strokeStyle = shade(o.colour); pen.lineWidth = 2;
+      for (let bits = 0; bits < 8; bits++) for (const bit of [1, 2, 4]) if (!(bits & bit)) segment(corner(bits), corner(bits | bit));
+      pen.stroke();
     };
     const drawObjects = () => {
       const seen = objects.map(o => ({o, p: project(...o.at)})).filter(({p}) => p[2] > near()).sort((a, b) => b.p[2] - a.p[2]);
-      if (shows("ellipsoids")) for (const {o, p} of seen) if (o.ok && o.axes.length) outline(o, p);
+      if (shows("ellipsoids")) for (const {o, p} of seen) if (o.ok && o.axes.length) outline(o, o.axes, p, 0.18, 1);
+      if (shows("bodies")) for (const {o, p} of seen) if (o.body.length) drawBody(o, p);
       for (const {o, p} of seen) {
         const big = o.id === chosen || o.id === hovered;
         // A stem down to the floor shows the height and the position.
@@ -263,7 +272,7 @@
       view = {...view, azimuth, height}; fitted = true; redraw();
     });
     for (const button of document.querySelectorAll("[data-zoom]")) button.addEventListener("click", () => zoom(+button.dataset.zoom));
-    for (const name of ["rays", "labels", "ellipsoids"]) document.getElementById("scene-" + name).addEventListener("change", redraw);
+    for (const name of ["rays", "labels", "ellipsoids", "bodies"]) document.getElementById("scene-" + name).addEventListener("change", redraw);
     for (const link of document.querySelectorAll("[data-show]")) link.addEventListener("click", () => {
       view = {...view, ...start}; fitted = true; choose(+link.dataset.show);
     });

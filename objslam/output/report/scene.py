@@ -46,6 +46,8 @@ def scene_data(objects: ObjectMap, rays: RaysTable, path: Trajectory, truth: Tru
                 "ok": objects[i].status == "ok",
                 "at": positions[i].round(3).tolist(),
                 "axes": _half_axes(objects, i, turn),
+                "body": _body(objects, i, turn),
+                "cuboid": getattr(objects[i].body, "shape", "point") == "cuboid",
             }
             for i in shown
         ],
@@ -68,6 +70,19 @@ def _half_axes(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
     """
     found = ellipsoid(objects[i])
     return [] if found is None else (turn @ (found[1] * found[0])).T.round(4).tolist()
+
+
+def _body(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
+    """Return half the length, the width and the height of the body of object i, as vectors like those of `_half_axes`.
+
+    There are none if the object is a point.
+    """
+    body = objects[i].body
+    if body is None:
+        return []
+    cos, sin = np.cos(body.yaw), np.sin(body.yaw)
+    directions = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    return (directions * body.size[:, None] / 2 @ turn.T).round(4).tolist()
 
 
 def _thinned(truth: Truth | None, turn: Floats) -> Floats:

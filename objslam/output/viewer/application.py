@@ -20,6 +20,7 @@ from objslam.io.atomic_files import disk_errors
 from objslam.io.folders import remove_leftovers, temporary_name
 from objslam.output.viewer.times import STAMP
 from objslam.results.files import OBJECTS, RECORDING, hint_below
+from objslam.results.read import refuse_site
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
@@ -58,6 +59,7 @@ def find_rrd(out: Path) -> Path:
     if not file.is_file() and not (out / OBJECTS).is_file():
         raise OutputError(f"no result here: {OBJECTS} is missing", where=str(out), hint=hint_below(out))
     if not file.is_file():
+        refuse_site(out, RECORDING)
         hint = hint_below(out) or "run with output.recording=true, and name the new result"
         raise OutputError("no recording here", where=str(out), hint=hint)
     try:

@@ -85,11 +85,13 @@ def write_field(out: Path, number: int, file: Path) -> ProximityField:
 
 def heat(cost: Floats, low: float, high: float) -> NDArray[np.uint8]:
     """Return RGB colours (..., 3) for costs (...), m: bright at the lowest cost `low`, dark at the highest cost `high`."""
-    from matplotlib import colormaps
+    import cv2
 
     # The cost rises from the minimum like a cone, so the square root gives more colours to the part near the minimum.
     share = np.sqrt(np.clip((cost - low) / max(high - low, 1e-12), 0.0, 1.0))
-    return (255 * colormaps["inferno"](0.97 * (1 - share))[..., :3]).round().astype(np.uint8)
+    level = (255 * 0.97 * (1 - share)).round().astype(np.uint8)
+    coloured = np.asarray(cv2.applyColorMap(level.reshape(-1, 1), cv2.COLORMAP_INFERNO), dtype=np.uint8)
+    return coloured[:, 0, ::-1].reshape(*level.shape, 3)
 
 
 def _log_field(recording: Any, f: ProximityField) -> None:

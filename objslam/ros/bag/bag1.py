@@ -1,7 +1,7 @@
 """Read ROS 1 bags (format 2.0) record by record from the front, so that damage affects only the records that it hits.
 
-The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes give only the connections, and how many
-messages the bag should have.
+The format is documented at https://wiki.ros.org/Bags/Format/2.0. The indexes are used only for the connections and the
+expected number of messages.
 """
 
 import io

@@ -1,4 +1,4 @@
-"""Decompression with a size limit, which also recovers the readable part of data that are cut off."""
+"""Decompression with a size limit. It also recovers the readable part of cut-off data."""
 
 import io
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ from typing import Any, BinaryIO
 from objslam.ros.bag.records import MAX_RECORD
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # The first bytes of zstd data.
-_PIECE = 1 << 22  # The largest piece that is unpacked at once, bytes. With a larger one, data over the limit take more.
+_PIECE = 1 << 22  # The largest piece that is unpacked at once, bytes. A larger piece takes more memory.
 
 
 class CorruptDataError(ValueError):
@@ -44,7 +44,7 @@ def unpack(data: bytes, method: str, *, cut: bool = False) -> bytes:
 def unpack_file(source: Path, target: Path, limit: int) -> str | None:
     """Unpack a zstd file to `target`. Return the reason for an early stop, None if the whole file is unpacked.
 
-    limit: the largest unpacked size, bytes. What was unpacked before the stop stays in `target`.
+    limit: the largest unpacked size, bytes. The part that was unpacked before the stop stays in `target`.
     """
     size = 0
     with source.open("rb") as packed, target.open("wb") as out:

@@ -26,7 +26,7 @@ _FORMATS = {
 _METADATA = "metadata.yaml"
 _MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. The limit bounds memory.
 _MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. The limit bounds disk use.
-_MAX_RATIO = 1000  # How many times larger an unpacked file may be. 1 GiB is always allowed. No recording compresses further.
+_MAX_RATIO = 1000  # The largest ratio of unpacked to packed size. 1 GiB is always allowed. No recording compresses further.
 _SPLIT = re.compile(r"(.*?)[-_]?(\d+)?((?:\.bag|\.mcap|\.db3|\.active|\.zstd)+)")
 
 
@@ -62,9 +62,9 @@ def find_recording(paths: Path | Sequence[Path], ledger: Ledger) -> Recording:
     """Find the recording in one or several files, or in one folder.
 
     Several files are read in the given order. The metadata.yaml of a folder lists its files. Listed files that are missing
-    or outside the folder are counted as drops. Files that it does not list are left out with a warning. A killed recorder
-    writes no metadata.yaml. Without it, the file names may differ only in the number before the suffix. Raises LogError if
-    there is no recording, or if a folder has more than one.
+    or outside the folder are counted as drops. Files that metadata.yaml does not list are left out with a warning. A killed
+    recorder writes no metadata.yaml. Without it, the file names may differ only in the number before the suffix. Raises
+    LogError if there is no recording, or if a folder has more than one.
     """
     paths = [paths] if isinstance(paths, Path) else list(paths)
     if not paths:

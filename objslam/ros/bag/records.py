@@ -46,7 +46,7 @@ class FileReport:
             self.lost += lost
 
     def close(self) -> None:
-        """Use the message count that the file states, if any.
+        """Compare the messages read with the count that the file states, if any.
 
         Then `lost` is at least the stated count minus the messages read, and `complete` is True.
         """

@@ -1,4 +1,4 @@
-"""Message definitions that bags before ROS 2 Iron do not contain and that the type library does not know.
+"""Message definitions that are neither in the type library nor in bags before ROS 2 Iron.
 
 They are from the documentation of the packages. Messages of vision_msgs 3.x and 4.x have equal bytes, 2.x (Foxy) differs.
 """

@@ -30,7 +30,7 @@ _DEPTH_HEADER = 12  # The size of the header before the PNG in a compressed dept
 def colour_image(message: Any) -> NDArray[Any]:
     """Return the pixels (H, W, 3), uint8, BGR, of an image message.
 
-    Raises DecodeError if the data are malformed, or if they are depth as float or compressed.
+    Raises DecodeError if the data are malformed, or if they are float depth or compressed depth.
     """
     if (packing := _packing(message)) is not None:
         if "compresseddepth" in packing:

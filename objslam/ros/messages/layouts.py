@@ -47,7 +47,7 @@ _FIELDS: dict[str, dict[str, str]] = {
 def missing_field(store: Typestore, type_: str) -> str | None:
     """Return the first field of a type that objslam reads but the definition in a store lacks. None if no field is missing.
 
-    A field counts as missing if it has another type. Types that objslam does not read, and boxes, have no missing field.
+    A field counts as missing if it has another type. Types that objslam does not read, and boxes, give None.
     """
     return next((path for path, kind in _FIELDS.get(type_, {}).items() if not _has(store, type_, path, kind)), None)
 

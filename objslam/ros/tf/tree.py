@@ -138,7 +138,8 @@ class TfTree:
         if ways is None:
             raise LogError(
                 f"tf does not connect {a!r} and {b!r}: {self._part(a)}; {self._part(b)}",
-                hint="record /tf_static, or give the pose of the camera in --camera-info FILE",
+                hint="record /tf_static, or give the pose of the camera in --camera-info FILE: base_T_camera with "
+                "translation and rotation_xyzw",
             )
         return ways
 

@@ -54,7 +54,7 @@ def put_back(aside: Path, file: Path) -> bool:
 def restore_after_kill(file: Path) -> Path | None:
     """Put back the newest journal that was set aside, if `file` is the empty journal of a session that was killed.
 
-    A session sets the earlier journal aside before its own first message. If it is killed between the two, it leaves an
+    A session sets the earlier journal aside before its own first message. If it is killed before that message, it leaves an
     empty journal, and a resumed session would start from nothing. Returns the path from which the journal came, None if
     nothing was renamed. If another session has the empty journal open, nothing is renamed. Raises OutputError if the journal
     cannot be renamed.

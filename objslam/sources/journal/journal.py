@@ -1,7 +1,7 @@
 """Write the journal: the files with all messages that a live session accepted.
 
 A message is accepted only when its record is in the kernel's cache, so a killed process loses no accepted message. The
-record is on the disk about `_SYNC_EVERY` later, so a power failure loses about the messages of that time. If the disk is
+record is on the disk about 1 s later (`_SYNC_EVERY`), so a power failure loses the messages of about 1 s. If the disk is
 nearly full or fails, or the file is deleted, the journal warns and stops. The session goes on without it.
 """
 
@@ -31,7 +31,7 @@ from objslam.sources.journal.segments import compress, identity_of, new_file, se
 
 _SYNC_EVERY = 1.0  # The time between two syncs to the disk, s. With a larger value, a power failure loses more messages.
 _EARLY = 2.0  # A warning comes at this many times the free space at which the journal stops. A larger value warns earlier.
-_SMALL = 0.02  # The largest share of the disk that the journal leaves free. A larger share ends it earlier on a small disk.
+_SMALL = 0.02  # The largest share of the disk that the journal leaves free. A larger share stops it earlier on a small disk.
 _MB = 1_000_000
 
 
@@ -222,7 +222,7 @@ def _locked(file: Path) -> int:
         except OSError:
             os.close(stream)
             raise
-        os.close(stream)  # The next segment replaced the file before it was locked.
+        os.close(stream)  # The next segment replaced this file before the lock.
 
 
 def _existing(file: Path) -> tuple[Header | None, int, int]:

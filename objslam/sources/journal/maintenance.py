@@ -25,7 +25,7 @@ from objslam.sources.journal.segments import Segment, compress, identity_of, jou
 
 @dataclass(frozen=True)
 class Check:
-    """What is in a segment. format: 1 or 2, 0 without a readable header. size: of the file, bytes, 0 if it is missing.
+    """The content of a segment. format: 1 or 2, 0 without a readable header. size: of the file, bytes, 0 if it is missing.
 
     records: the number of undamaged records. unknown: how many of them this version of objslam cannot read. damaged: the
     bytes that belong to no undamaged record. start, end: the least and the greatest stamp, s, None without stamps.
@@ -65,14 +65,14 @@ def repair(path: Path) -> list[Path]:
         last = found[-1].header
         assert last is not None
         made += [compress(full) for full in uncompressed_segments(file, identity_of(file, last), last.number)]
-    return [one for one in made if one.exists()]  # A segment that was rewritten and then compressed has another name.
+    return [one for one in made if one.exists()]  # If a rewritten segment was then compressed, it has another name.
 
 
 def json_lines(path: Path, ledger: Ledger, left_out: Counter[str]) -> Iterator[str]:
     """Yield the messages of a journal as lines for `objslam live stdin`, with the stamps of the session.
 
-    left_out: counts the other messages, which only a journal has. Its keys are "note" (an offset) and "calibration".
-    Raises LogError if the path is not a journal.
+    left_out: counts the messages that have no such line, by kind: "note" (`NoteMessage`) or "calibration". Raises LogError
+    if the path is not a journal.
     """
     for message in messages(path, ledger):
         row = _row(message)

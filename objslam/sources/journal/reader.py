@@ -31,7 +31,7 @@ def calibrations(file: Path) -> Iterator[CalibrationMessage]:
     it takes effect."""
     for _, content in contents(file, Ledger()):
         if content.startswith(CALIBRATION_KIND):
-            with suppress(LogError):  # `messages` counts it.
+            with suppress(LogError):  # `messages` counts unreadable records.
                 message = decode(content)
                 assert isinstance(message, CalibrationMessage)
                 yield message

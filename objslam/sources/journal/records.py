@@ -103,7 +103,7 @@ class FrameMessage:
 
 @dataclass(frozen=True)
 class NoteMessage:
-    """The offsets that a session adds to the stamps and the odometry of all later messages.
+    """The offsets that a session adds to later stamps and odometry, after the robot's clock or odometry jumped.
 
     clock: s, added to stamps. odometry: start_T_odom (4, 4), the present odom frame in the first odom frame of the session.
     """
@@ -127,7 +127,7 @@ Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessag
 
 
 def encode_stop(reason: str) -> bytes:
-    """Encode the record that a session had to stop the journal, with the reason."""
+    """Encode the record that says why a session had to stop the journal."""
     return _STOP_KIND + json.dumps([reason]).encode()
 
 

@@ -195,7 +195,7 @@ def _uncompressed(path: Path, packed: bool = False) -> Iterator[BinaryIO]:
 
 
 class _Unpacked(io.RawIOBase):
-    """The uncompressed bytes of a zstd stream. Where the stream is damaged, they end."""
+    """The uncompressed bytes of a zstd stream, up to its first damage."""
 
     def __init__(self, stream: BinaryIO) -> None:
         reader = zstandard.ZstdDecompressor(max_window_size=_WINDOW)

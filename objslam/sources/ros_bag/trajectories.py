@@ -53,8 +53,8 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     The odometry comes from a nav_msgs/Odometry topic. Without such a topic, it is tf from odom to base. The localisation is
     tf from map to odom, composed with the odometry at the odometry's stamps. If the odometry's frame is not in tf, the
     localisation is tf from map to base. Without map in tf, it comes from a topic of poses in map. If map never moves against
-    odom, the odometry is converted to map and there is no localisation. The user may choose other topics, or tf.
-    Raises LogError if both are missing, if a topic has no usable pose, or if tf does not connect a necessary frame.
+    odom, the odometry is converted to map and there is no localisation. The user may choose other topics, or tf. Raises
+    LogError if both paths are missing, if a topic has no usable pose, or if tf does not connect a necessary frame.
     """
     ledger = pool.ledger
     topics = [topic for topic in candidates(pool.survey, "odometry") if not is_world(_main_pair(topic)[0])]

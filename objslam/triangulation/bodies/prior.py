@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.bodies.body import UNKNOWN_YAW
 from objslam.triangulation.bodies.fit import Prior
 from objslam.triangulation.bodies.shapes import PARAMETERS
 
@@ -18,8 +19,6 @@ value, an object that is seen from one side may become very deep or flat."""
 _ASPECT = 0.35
 """The standard deviation of the two aspect parameters q and s. The median ratio of the horizontal half axes is then 2.3. A
 larger value allows longer objects."""
-_YAW = np.pi / np.sqrt(12)
-"""The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
 _DOT = 1e-4
 """The half axes (m) of an ellipsoid that stands for a point."""
 _LIKE = 2.0
@@ -110,7 +109,7 @@ def cuboid_prior(prior: Prior, start: Floats) -> Prior:
     towards = np.stack([np.cos(2 * start[:, 5]), np.sin(2 * start[:, 5])], axis=1)
     mean[:, 4], mean[:, 5] = (prior.mean[:, 4:6] * towards).sum(axis=1), start[:, 5]
     aspect = np.einsum("ni,nij,nj->n", towards, prior.information[:, 4:6, 4:6], towards)
-    information[:, 4:6, 4:6] = aspect[:, None, None] * np.diag([1.0, 0.0]) + np.diag([0.0, _YAW**-2])
+    information[:, 4:6, 4:6] = aspect[:, None, None] * np.diag([1.0, 0.0]) + np.diag([0.0, UNKNOWN_YAW**-2])
     return Prior(mean, information)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -294,17 +292,3 @@ def test_of_a_great_many_objects_those_with_most_rays_are_named() -> None:
     assert figure.note == f"{400 - len(named)} labels have no room"
     assert 70 < sum(int(name[1:]) % 4 == 0 for name in named) <= 100
     assert len(named) <= 150
-
-
-def test_drawing_imports_no_library_for_plots(tmp_path: Path) -> None:
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
-        "from pathlib import Path; from synthetic_result import *\n"
-        "from objslam.output.plot.map_plot import draw_map\n"
-        "draw_map(synthetic_result(*clusters(), keyframes=3)[0], Path(sys.argv[2]))\n"
-        "assert 'matplotlib' not in sys.modules\n"
-    )
-    command = [sys.executable, "-W", "error", "-c", code, str(Path(__file__).parents[2]), str(tmp_path / "a.png")]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert picture(tmp_path / "a.png").shape[2] == 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 from synthetic_result import clusters, synthetic_result
 
 from objslam.core.arrays import Floats
+from objslam.core.bodies.body import Body
+from objslam.core.object_map import ObjectMap
 from objslam.core.types import Truth, Up
 from objslam.io.rays_parquet import RaysTable
 from objslam.output.report.cards import make_cards
@@ -53,6 +56,21 @@ def test_the_view_has_the_map_and_its_rays_with_z_up(up: Up) -> None:
         np.testing.assert_allclose(end, begin + reach * rays.direction[row], atol=1e-3)
     used = (rays.object >= 0) & (rays.weight >= 0.5)
     assert data["used"] == used.sum()
+
+
+@pytest.mark.parametrize("up", ["z", "-y"])
+def test_the_view_has_the_bodies_with_their_headings(up: Up) -> None:
+    result, rays, truth = a_map()
+    body = Body("cuboid", np.array([0.6, 0.4, 0.9]), np.pi / 3, np.full(3, 0.01), 0.1)
+    first, second, *others = result.map.objects
+    objects = ObjectMap((replace(first, body=body), replace(second, body=replace(body, shape="ellipsoid")), *others))
+    cuboid, ellipsoid, point = scene_data(objects, rays, result.path_after, truth, up)["objects"][:3]
+    assert (cuboid["cuboid"], ellipsoid["cuboid"], point["cuboid"]) == (True, False, False)
+    assert point["body"] == []
+    half = np.array(cuboid["body"]) @ upright(up)  # back to the frame of the map
+    np.testing.assert_allclose(half[0], 0.3 * np.array([0.5, np.sqrt(3) / 2, 0.0]), atol=1e-3)
+    np.testing.assert_allclose(half[1], 0.2 * np.array([-np.sqrt(3) / 2, 0.5, 0.0]), atol=1e-3)
+    np.testing.assert_allclose(half[2], [0, 0, 0.45], atol=1e-3)
 
 
 def test_a_timeline_stands_where_the_rays_are() -> None:

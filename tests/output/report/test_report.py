@@ -7,6 +7,7 @@ import dataclasses
 import json
 import re
 from collections import Counter
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from synthetic_result import clusters, synthetic_result
 from objslam import config
 from objslam.cli import main
 from objslam.config import Settings
+from objslam.core.bodies.body import UNKNOWN_YAW, Body
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.errors import OutputError
@@ -139,6 +141,20 @@ def test_the_table_is_the_map(tmp_path: Path) -> None:
     assert "the clock of the camera runs 0.04 s late" in page.all_text
     assert '"joint"' in page.text["td"]  # a setting that was changed
     assert any(text.startswith("mode: joint") for text in page.text["pre"])
+
+
+def test_bodies_have_a_size_and_an_unknown_heading_is_no_number(tmp_path: Path) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=40)
+    body = Body("ellipsoid", np.array([0.6, 0.4, 0.9]), np.pi / 6, np.full(3, 0.012), np.radians(5))
+    first, second, *others = result.map.objects
+    bodies = (replace(first, body=body), replace(second, body=replace(body, yaw_sigma=UNKNOWN_YAW)), *others)
+    write_result(replace(result, map=ObjectMap(bodies)), tmp_path)
+    page = Page(write_report(tmp_path))
+    rows = [row for row in page.rows if row]
+    assert [row[6] for row in rows[:3]] == ["0.60 × 0.40 × 0.90", "0.60 × 0.40 × 0.90", ""]
+    assert page.all_text.count("0.60 × 0.40 × 0.90 m (length, width, height)") == 2
+    assert page.all_text.count("30°, sigma 5°") == 1
+    assert page.all_text.count("unknown") == 1
 
 
 @pytest.mark.parametrize("evaluated", [True, False])

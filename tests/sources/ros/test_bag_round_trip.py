@@ -91,7 +91,7 @@ def test_a_bag_without_a_camera_gives_its_path_and_the_mounts_and_with_boxes_bes
     convert(write_bag(tmp_path / "drive", "mcap-none", maker, rows), tmp_path / "log", ledger, SourceOptions())
     assert sorted(file.name for file in (tmp_path / "log").iterdir()) == ["localization.txt", "mounts.yaml", "odometry.txt"]
     (warning,) = ledger.warnings
-    assert warning.endswith("odometry.txt, localization.txt, mounts.yaml need a camera.yaml and a detections.jsonl")
+    assert warning.endswith("add a camera.yaml and a detections.jsonl to odometry.txt, localization.txt, mounts.yaml")
     (mount,) = read_mounts(tmp_path / "log" / "mounts.yaml")
     assert mount.name == "front_optical_frame"
     _close(mount.base_T_camera, log.cameras[0].camera.base_T_camera)

@@ -1,0 +1,40 @@
+"""Texts beside the points of a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.output.plot.canvas import text_width
+from objslam.output.plot.figure import Colour, Figure, Label
+from objslam.output.plot.label_layout import needs_leader, place_labels
+from objslam.output.plot.page import FONT, LINE
+
+_MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
+
+
+def make_labels(
+    figure: Figure, names: Sequence[str], colours: Sequence[Colour], points: Floats, avoid: Floats
+) -> tuple[Label, ...]:
+    """Return a label beside each point (N, 2), m. A name that has no room has no label.
+
+    avoid: (P, 2) px of the shown area, points that labels should not cover.
+    """
+    sizes = np.array([(text_width(text, FONT), LINE * FONT) for text in names]).reshape(-1, 2)
+    anchors = figure.pixels(points) if len(points) else np.zeros((0, 2))
+    corners, found = place_labels(anchors, sizes, np.array([[0, 0], figure.size], dtype=np.float64), avoid)
+    led = needs_leader(anchors, corners, sizes)
+    labels = []
+    for i in np.flatnonzero(found).tolist():
+        near = np.clip(anchors[i], corners[i], corners[i] + sizes[i])
+        leader = np.stack([anchors[i], near]) if led[i] else None
+        labels.append(Label(names[i], colours[i], np.concatenate([corners[i], corners[i] + sizes[i]]), leader))
+    return tuple(labels)
+
+
+def shortened(name: str) -> str:
+    """Return a name as one line of at most `_MAX_LETTERS` letters."""
+    name = " ".join(name.split())
+    return name if len(name) <= _MAX_LETTERS else name[: _MAX_LETTERS - 1] + "…"
