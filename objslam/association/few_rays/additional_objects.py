@@ -22,7 +22,7 @@ from objslam.core.camera import Camera
 from objslam.core.types import Association, Keyframes, Rays
 
 _MOVING = 6
-"""The number of coordinates of a moving point: those of its position and of its velocity. A velocity explains any three rays."""
+"""The number of coordinates of a moving point: those of its position and of its velocity. So it explains any three rays."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
 _POWER = 0.4
