@@ -1,5 +1,10 @@
 """Points against bodies on simulated boxes of ellipsoids: errors of centres, sizes and yaws, honesty, and time.
 
+    python tools/bench_bodies.py [--objects 200] [--boxes 30] [--noise 2] [--seeds 3]
+    python tools/bench_bodies.py --drives 10
+
+The second line runs whole drives in joint mode instead, with bodies and without.
+
 The nearest peer, gtsam-quadrics, has wheels for Python 3.10 and numpy below 1.24 only. The benchmark says whether it can be
 imported here, and compares nothing with it otherwise.
 """
@@ -8,9 +13,14 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from mapping.body_drives import drive, scores
 
 from objslam.config import load_settings
 from objslam.core.arrays import Floats, Ints
@@ -27,13 +37,17 @@ LARGE = 0.2  # The ratio of size and distance above which an object counts as la
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", type=int, default=200)
     parser.add_argument("--boxes", type=int, default=30, help="boxes of each object")
     parser.add_argument("--noise", type=float, default=2.0, help="standard deviation of each edge, px")
     parser.add_argument("--arc", type=float, nargs=2, default=(60.0, 180.0), help="range of azimuths of the views, degrees")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--drives", type=int, default=0, help="drives between large objects, in place of single bodies")
     options = parser.parse_args()
+    if options.drives:
+        drives(options.drives)
+        return
     for seed in range(options.seeds):
         rng = np.random.default_rng(seed)
         true, boxes, poses, distance = scene(options.objects, options.boxes, options.arc, rng)
@@ -46,6 +60,23 @@ def main() -> None:
     print(
         "gtsam-quadrics:", "absent (it needs Python 3.10 and numpy < 1.24)" if peer is None else "present, but not compared"
     )
+
+
+def drives(number: int) -> None:
+    """Run drives with bodies and without, and print the medians of their scores and the CPU time of one drive."""
+    logs = [drive(seed) for seed in range(number)]
+    for name, change in (("points", "bodies.use=false"), ("bodies", "bodies.use=true")):
+        begin = time.process_time()
+        found = [scores(log, change)[1] for log in logs]
+        seconds = (time.process_time() - begin) / number
+        middle = {key: float(np.median([one[key] for one in found])) for key in ("position_rmse", "ate")}
+        print(
+            f"{name}: objects {sum(one['matched'] for one in found)} of {sum(len(log.truth.objects) for log in logs)}, "
+            f"RMSE {middle['position_rmse']:.3f} m, ATE {middle['ate']:.3f} m (medians of {number} drives), "
+            f"inside 95 %: {np.mean([one['inside_95_3d'] for one in found]):.1%}, {seconds:.2f} s of CPU for a drive"
+        )
+    sizes, overlaps = ([one[key] for one in found] for key in ("size_error_median", "iou_median"))
+    print(f"  sizes off by {np.median(sizes):.1%}, 3D overlap {np.median(overlaps):.2f} (medians)")
 
 
 def scene(count: int, per: int, arc: tuple[float, float], rng: np.random.Generator) -> tuple[Floats, Floats, Floats, Floats]:

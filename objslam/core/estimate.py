@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from objslam.core.arrays import Bools, Floats
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.calibration import Calibration
 from objslam.core.noise import NoiseFactors
-from objslam.core.object_map import TagPose
 
 
 @dataclass(frozen=True)

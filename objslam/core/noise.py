@@ -64,6 +64,10 @@ class NoiseFactors:
         return {name: value if digits is None else round(value, digits) for name, value in asdict(self).items()}
 
 
+MOST_NOISE = 20.0
+"""The largest estimated factor on a noise. With a larger factor, measurements with wrong units or axes fit as noise. Real
+robots have up to 6.3, for odometry that is only the commanded speed."""
+
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from objslam.core.arrays import Bools, Floats
 from objslam.core.bodies.body import Body, surer_body
 from objslam.core.bodies.body_entry import BODY_COLUMNS, body_row
-from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion
+from objslam.core.bodies.tag_pose import TAG_COLUMNS, TagPose, tag_row
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
@@ -30,9 +30,11 @@ COLUMNS: dict[str, str] = {
     **{"rays": "int64", "frames": "int64"},
     **dict.fromkeys(("parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"), "float64"),
     **BODY_COLUMNS,
+    **TAG_COLUMNS,
 }
 """The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s,
-yaws in rad. size_l, size_w and size_h are length, width and height of the body. width and height are those of the boxes."""
+yaws in rad. size_l, size_w and size_h are length, width and height of the body. width and height are those of the boxes.
+tag_qx to tag_qw are the unit quaternion of map_R_tag of a fiducial."""
 
 
 @dataclass(frozen=True)
@@ -67,50 +69,6 @@ class Life:
     detections: int
     updated: float
     moved_from: Floats | None = None
-
-
-@dataclass(frozen=True)
-class TagPose:
-    """The rotation and the size of one fiducial. Its position is that of its object.
-
-    xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
-    covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a size
-    from the settings. other_xyzw: (4,) a second rotation at which a flat square looks nearly the same, None if the views
-    rule it out. other_probability: of this second rotation, 0 without one.
-    """
-
-    xyzw: Floats
-    covariance: Floats
-    size: float
-    size_sigma: float
-    other_xyzw: Floats | None = None
-    other_probability: float = 0.0
-
-    @property
-    def rotation(self) -> Floats:
-        """(3, 3) map_R_tag."""
-        return rotation_from_quaternion(self.xyzw[None])[0]
-
-    @property
-    def other(self) -> Floats | None:
-        """(3, 3) the second rotation, None without one."""
-        return None if self.other_xyzw is None else rotation_from_quaternion(self.other_xyzw[None])[0]
-
-    @property
-    def sigma_deg(self) -> float:
-        """The standard deviation of the rotation about its least certain axis, degrees."""
-        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1])))
-
-    def turned(self, rotation: Floats, yaw_sigma: float = 0.0) -> Self:
-        """Return the fiducial after `rotation` (3, 3) turned its map. yaw_sigma: rad, the standard deviation of this
-        rotation's yaw."""
-        up = (rotation @ self.rotation)[2]
-        return replace(
-            self,
-            xyzw=_quaternion(rotation @ self.rotation),
-            covariance=self.covariance + yaw_sigma**2 * np.outer(up, up),
-            other_xyzw=None if self.other is None else _quaternion(rotation @ self.other),
-        )
 
 
 @dataclass(frozen=True)
@@ -168,6 +126,7 @@ class MapObject:
                 self.existence,
             ),
             *body_row(self.body),
+            *tag_row(self.tag),
         )
         known = (None if isinstance(value, float) and not np.isfinite(value) else value for value in values)
         return dict(zip(COLUMNS, known, strict=True))
@@ -277,10 +236,6 @@ class ObjectMap:
         objects, positions = self._placed(label)
         distance = np.linalg.norm(positions[:, : len(at)] - at, axis=1)
         return [(float(distance[i]), objects[i]) for i in np.argsort(distance, kind="stable")]
-
-
-def _quaternion(rotation: Floats) -> Floats:
-    return quaternion_from_rotation(rotation[None])[0]
 
 
 def _point(values: ArrayLike) -> Floats:

@@ -128,13 +128,15 @@ class CameraLog:
 @dataclass(frozen=True)
 class TruthObject:
     """One object of the ground truth. position: (3,) m in map. size: (3,) m, length, width and height, None if unknown. yaw:
-    rad, the direction of its length, None if unknown."""
+    rad, the direction of its length, None if unknown. tag_xyzw: (4,) the unit quaternion of map_R_tag of a fiducial, None if
+    unknown."""
 
     id: int
     label: str
     position: Floats
     size: Floats | None = None
     yaw: float | None = None
+    tag_xyzw: Floats | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from objslam.core.types import Trajectory, Truth, TruthObject
 from objslam.errors import ConfigError, LogError
 from objslam.evaluation.alignment import IDENTITY, Alignment, Transform, align_objects, correspondences, match_points
 from objslam.evaluation.bodies import BodyMatch, body_scores, match_bodies
+from objslam.evaluation.tags import TagMatch, match_tags, tag_scores
 
 MAX_TRUTH_GAP = 1.0
 """The true path is interpolated in gaps of at most this length, s. A pose in a longer gap has no true pose."""
@@ -29,7 +30,8 @@ class Match:
 
     squared: squared Mahalanobis distance of the offset in x and y, by the object's covariance, rotated and scaled like the
     map. squared_3d: the squared distance in x, y and z. Both are None without a covariance.
-    body: how the two bodies fit, None if one of the two has no size.
+    body: how the two bodies fit, None if one of the two has no size. tag: how the rotations of two fiducials fit, None if
+    one of the two has none.
     """
 
     object: MapObject
@@ -38,6 +40,7 @@ class Match:
     squared: float | None
     squared_3d: float | None
     body: BodyMatch | None = None
+    tag: TagMatch | None = None
 
     @property
     def error(self) -> float:
@@ -182,12 +185,12 @@ def _score_objects(
 
 def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform) -> Match:
     """Return a match. offset: (3,) m, after the alignment. The covariance of the object gives its Mahalanobis distance."""
-    body = match_bodies(found, true, transform)
+    shape = match_bodies(found, true, transform), match_tags(found, true, transform)
     if found.covariance is None:
-        return Match(found, true, offset, None, None, body)
+        return Match(found, true, offset, None, None, *shape)
     turn = transform.scale * transform.pose[:3, :3]
     covariance = turn @ found.covariance @ turn.T
-    return Match(found, true, offset, _squared(offset[:2], covariance[:2, :2]), _squared(offset, covariance), body)
+    return Match(found, true, offset, _squared(offset[:2], covariance[:2, :2]), _squared(offset, covariance), *shape)
 
 
 def _squared(offset: Floats, covariance: Floats) -> float:
@@ -214,7 +217,7 @@ def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
     counts = ("matched", "missed", "false", "unresolved", "precision", "recall")
     honest = ("mahalanobis_median", "inside_95", "inside_95_3d")
     if scores is None:
-        none = dict.fromkeys((*counts, *honest, *body_scores([])))
+        none = dict.fromkeys((*counts, *honest, *body_scores([]), *tag_scores([])))
         return {**none, **_summary("position_", None), "transform": None}
     found = (len(scores.matches), len(scores.missed), len(scores.false), scores.unresolved, scores.precision, scores.recall)
     numbers = dict(zip(counts, found, strict=True))
@@ -225,7 +228,14 @@ def _object_dict(scores: ObjectScores | None) -> dict[str, Any]:
     else:
         numbers |= dict.fromkeys(honest)
     bodies = body_scores([m.body for m in scores.matches if m.body is not None])
-    return {**numbers, **_summary("position_", scores.errors), **bodies, "transform": _transform_dict(scores.transform)}
+    tags = tag_scores([m.tag for m in scores.matches if m.tag is not None])
+    return {
+        **numbers,
+        **_summary("position_", scores.errors),
+        **bodies,
+        **tags,
+        "transform": _transform_dict(scores.transform),
+    }
 
 
 def _path_dict(path: PathScores | None) -> dict[str, Any]:
@@ -254,6 +264,7 @@ def _listing(scores: ObjectScores | None) -> dict[str, Any]:
             "mahalanobis": m.squared,
             "mahalanobis_3d": m.squared_3d,
             **({} if m.body is None else m.body.to_dict()),
+            **({} if m.tag is None else {"rotation_error_deg": float(np.degrees(m.tag.error))}),
         }
         for m in scores.matches
     ]

@@ -29,9 +29,14 @@ _BODY_ROWS = (
     ("yaw_error_deg_median", "error of the yaw, median", " deg"),
     ("iou_median", "3D overlap (IoU) of the bodies, median", ""),
 )
-"""The rows about bodies, if there are any: key in evaluation.json, name in the table, and unit."""
-
-"""The rows about objects: key in evaluation.json, name in the table, and unit."""
+_TAG_ROWS = (
+    ("tags", "rotations of fiducials compared", ""),
+    ("rotation_error_deg_median", "error of the rotation, median", " deg"),
+    ("rotation_error_deg_max", "error of the rotation, max", " deg"),
+    ("rotation_inside_95", "share of true rotations inside the 95 % region", ""),
+)
+"""The rows about objects, and about bodies and fiducials, if there are any: key in evaluation.json, name in the table, and
+unit."""
 
 _PATH_ROWS = (
     ("ate", "ATE (RMSE)", " m"),
@@ -58,7 +63,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     scores.add_column("against the ground truth" if evaluation.truth is None else f"against {evaluation.truth}")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
-    for key, name, unit in (*rows, *(_BODY_ROWS if data["bodies"] else ())):
+    for key, name, unit in (*rows, *(_BODY_ROWS if data["bodies"] else ()), *(_TAG_ROWS if data["tags"] else ())):
         scores.add_row(name, _cell(data[key], unit))
     parts: list[RenderableType] = [scores]
     if evaluation.objects is not None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
-from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
+from objslam.graph.marginals import joint_covariances, largest_sigma, marginal_covariances, seen_covariances
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
@@ -214,7 +215,8 @@ def solve_joint(
     if tags is None:
         return estimate
     told = None if calibrated is None else calibrated.sensitivity
-    return with_objects(estimate, tags, rays, map_T_camera, (gaussian, optimum.values), wider, told, ledger)
+    covariances = partial(joint_covariances, gaussian, optimum.values)
+    return with_objects(estimate, tags, rays, map_T_camera, optimum.values, covariances, wider, told, ledger)
 
 
 def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:

@@ -47,6 +47,11 @@ starts farther from its optimum, so it needs more. Larger numbers are slower."""
 _STRAIN = 200.0
 """A loop closure may raise the cost (a sum of squared deviations) by this amount for each joined landmark. A larger amount
 closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for each landmark, wrong ones by 240 or more."""
+_PAIRS = 150
+"""The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
+next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.
+A larger number finds loops sooner in logs with many landmarks of one label, and takes longer. The unnamed posts of MRCLAM
+need 45, and up to 330 with mirrored images."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ def initialize_unknown(
     owner = np.full(len(rays), -1, dtype=np.int64)
     known = Landmarks.none()
     refused: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
-    none = np.zeros(0, dtype=np.int64)
+    none, pairs_left = np.zeros(0, dtype=np.int64), 0
     graph = build_graph(measured.factors(owner, none, none, known.position, end=1))
     for begin in range(1, len(keyframes), settings.joint.explore_step):
         end = min(begin + settings.joint.explore_step, len(keyframes))
@@ -96,8 +101,12 @@ def initialize_unknown(
             map_T_camera[:end] = read_poses(values)
             known.position = read_points(values)
             known.covariance = _covariances(rays, owner, known.position, map_T_camera)
+        pairs_left += _PAIRS * (end - begin)
+        if len(known) and pairs_left > 0:
             active, now = _active(known, heading, end - 1), end - 1
-            found = find_closure(known, active, rays, owner, graph, values, map_T_camera, now, settings.association)
+            of = settings.association
+            found, compared = find_closure(known, active, rays, owner, graph, values, map_T_camera, now, of)
+            pairs_left -= compared
             if found is not None and (pairs := (tuple(found.now), tuple(found.before))) not in refused:
                 closed = _close(found, known, measured, owner, map_T_camera[:end], heading)
                 if closed is None:

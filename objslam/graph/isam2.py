@@ -18,7 +18,7 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.graph.factors.priors import point_prior, pose_prior
 from objslam.graph.growing_graph import GrowingGraph
 from objslam.graph.isam2_rebuild import IncrementalRebuild, new_isam
-from objslam.graph.marginals import HELD, in_camera
+from objslam.graph.marginals import HELD, in_camera, in_order
 from objslam.graph.optimizers import build_graph, indeterminate, levenberg_marquardt
 from objslam.graph.variables import L0, X0, Variables
 
@@ -108,7 +108,7 @@ class IncrementalGraph(GrowingGraph):
         joint = self.joint_covariance(X0 + k, L0 + j)
         if joint is None:
             return np.full((3, 3), np.nan)
-        return in_camera(joint, k, j, self.pose(k), self.points(np.array([j]))[0])
+        return in_camera(in_order(joint, (X0 + k, L0 + j)), self.pose(k), self.points(np.array([j]))[0])
 
     def joint_covariance(self, *keys: int) -> gtsam.JointMarginal | None:
         """Return the joint marginal covariance of variables by their keys. None if iSAM2 cannot give it."""

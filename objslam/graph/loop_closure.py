@@ -69,11 +69,13 @@ def find_closure(
     map_T_camera: Floats,
     now: int,
     settings: AssociationSettings,
-) -> Closure | None:
-    """Return the loop with the most evidence, or None if no loop is certain.
+) -> tuple[Closure | None, int]:
+    """Return the loop with the most evidence, None if no loop is certain, and the number of compared pairs.
 
     The search has two cases. After a long drift, recently observed landmarks (`active`, (N,)) are matched with the others.
     After a slip or a push, new landmarks (first seen in the last `_EPOCH` keyframes) are matched with all others.
+
+    A pair is a recent and an old landmark of one label. It counts once for each tried drift.
 
     owner: (R,) the landmark of each ray, or -1. graph, values: solved. map_T_camera: (K, 4, 4) the solved poses. now: the
     newest keyframe.
@@ -83,6 +85,7 @@ def find_closure(
     pivot = map_T_camera[now, :2, 3]
     born = active & (landmarks.first >= now - _EPOCH)
     best: Closure | None = None
+    compared = 0
     marginals: gtsam.Marginals | None = None
     for here, there in ((active, ~active), (born, ~born)):
         possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~together
@@ -92,7 +95,7 @@ def find_closure(
         try:
             marginals = marginals or gtsam.Marginals(graph, values)
         except RuntimeError:  # The system is indeterminate, so no loop can be tested.
-            return None
+            return None, compared
         before = np.minimum(landmarks.last[two], landmarks.first[one].min())
         epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
         anchors = [int(before[before // _EPOCH == e].max()) for e in epochs]
@@ -101,10 +104,11 @@ def find_closure(
             for which in (one, two)
         )
         for prior in relative_covariances(marginals, map_T_camera, anchors, now):
+            compared += int(possible.sum())
             found = recognise_place(a, b, pivot, prior, density[one], possible[np.ix_(one, two)])
             if found is not None and found.is_sure(settings) and (best is None or found.evidence > best.evidence):
                 best = Closure(found.correction, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.evidence)
-    return best
+    return best, compared
 
 
 def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:

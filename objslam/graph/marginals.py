@@ -1,12 +1,17 @@
 """Compute marginal covariances of landmarks, even if the graph does not determine all of them."""
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
+from scipy import sparse
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.rotation import skew
+from objslam.errors import SolveError
 from objslam.graph.factors.priors import point_prior
+from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 from objslam.graph.optimizers import indeterminate
 from objslam.graph.variables import L0, X0
 
@@ -14,6 +19,10 @@ HELD = 1.0
 """The standard deviation (m) of the prior that each landmark gets if the linear system is indeterminate. If the standard
 deviation of a landmark is still above half of this value, no measurement determines the landmark. A larger value constrains
 the landmarks less. With too large a value, the system stays indeterminate."""
+
+_LEAST_PIVOT = 1e-11
+"""The least pivot of the information matrix, scaled to 1 on its diagonal, of a system with one solution. Rounding leaves
+about 1e-15 if a system has none. A larger value refuses more systems of variables that are tied tightly and placed badly."""
 
 
 def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:
@@ -56,26 +65,25 @@ def seen_covariances(
     if len(landmarks) == 0:
         return covariance
     try:
-        marginals = gtsam.Marginals(graph, values)
-        for i, (j, k) in enumerate(zip(landmarks.tolist(), witnesses.tolist(), strict=True)):
-            joint = marginals.jointMarginalCovariance([X0 + k, L0 + j])
-            covariance[i] = in_camera(joint, k, j, values.atPose3(X0 + k).matrix(), values.atPoint3(L0 + j))
+        pairs = list(zip(landmarks.tolist(), witnesses.tolist(), strict=True))
+        joint = joint_covariances(graph, values, [(X0 + k, L0 + j) for j, k in pairs])
+        for i, (j, k) in enumerate(pairs):
+            covariance[i] = in_camera(joint[i], values.atPose3(X0 + k).matrix(), values.atPoint3(L0 + j))
     except RuntimeError as error:
         ledger.warn(f"covariances: {indeterminate(error).message}; objects far from the start are left unresolved")
     return covariance
 
 
-def in_camera(joint: gtsam.JointMarginal, k: int, j: int, map_T_camera: Floats, point: Floats) -> Floats:
-    """Return the covariance (3, 3), m^2, of L(j) in the frame of X(k), from their joint marginal.
+def in_camera(joint: Floats, map_T_camera: Floats, point: Floats) -> Floats:
+    """Return the covariance (3, 3), m^2, of a landmark in the frame of a camera, from the covariance (9, 9) of both.
 
-    map_T_camera: (4, 4) the pose of X(k). point: (3,) the position of L(j) in map.
+    The camera comes first in `joint`. map_T_camera: (4, 4) its pose. point: (3,) the position of the landmark in map.
     """
-    x, landmark = X0 + k, L0 + j
     to_point = map_T_camera[:3, :3].T
     seen = to_point @ (point - map_T_camera[:3, 3])
     to_pose = np.hstack([skew(seen), -np.eye(3)])
-    cross = to_pose @ joint.at(x, landmark) @ to_point.T
-    spread = to_pose @ joint.at(x, x) @ to_pose.T + to_point @ joint.at(landmark, landmark) @ to_point.T
+    cross = to_pose @ joint[:6, 6:] @ to_point.T
+    spread = to_pose @ joint[:6, :6] @ to_pose.T + to_point @ joint[6:, 6:] @ to_point.T
     return np.asarray(spread + cross + cross.T)
 
 
@@ -88,8 +96,68 @@ def largest_sigma(covariances: Floats) -> Floats:
 
 
 def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints) -> Floats:
-    marginals = gtsam.Marginals(graph, values)
-    covariance = np.array([marginals.marginalCovariance(L0 + j) for j in landmarks.tolist()]).reshape(-1, 3, 3)
+    covariance = np.array(joint_covariances(graph, values, [(L0 + j,) for j in landmarks.tolist()])).reshape(-1, 3, 3)
     if not np.isfinite(covariance).all():
         raise RuntimeError("a marginal covariance is not finite")
     return covariance
+
+
+def joint_covariances(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, groups: Sequence[Sequence[int]]
+) -> list[Floats]:
+    """Return the covariance (d, d) of each group of variables, given by their keys, at `values`, in the order of the keys.
+
+    GTSAM eliminates the linear system. It also refuses systems that have a solution, if a tight tie between variables that
+    are placed badly costs about seven digits. The ties of fiducials of unknown size do. Then the normal equations are
+    factored here. RuntimeError if the system is indeterminate.
+    """
+    try:
+        marginals = gtsam.Marginals(graph, values)
+        return [_of_marginals(marginals, group) for group in groups]
+    except RuntimeError:
+        found = of_normal_equations(graph.linearize(values), values, groups)
+        if found is None:
+            raise
+        return found
+
+
+def _of_marginals(marginals: gtsam.Marginals, keys: Sequence[int]) -> Floats:
+    if len(keys) == 1:
+        return np.asarray(marginals.marginalCovariance(keys[0]))
+    return in_order(marginals.jointMarginalCovariance(list(keys)), keys)
+
+
+def in_order(joint: gtsam.JointMarginal, keys: Sequence[int]) -> Floats:
+    """Return the joint covariance (d, d) of variables in the order of the keys."""
+    return np.block([[joint.at(a, b) for b in keys] for a in keys])
+
+
+def of_normal_equations(
+    system: gtsam.GaussianFactorGraph, values: gtsam.Values, groups: Sequence[Sequence[int]]
+) -> list[Floats] | None:
+    """Return the covariances of the groups from the sparse normal equations, None if the system is indeterminate."""
+    keys, zero = sorted(values.keys()), values.zeroVectors()
+    size = np.array([len(zero.at(key)) for key in keys])
+    begin, end = np.cumsum(size) - size, np.cumsum(size)
+    row, column, value = system.sparseJacobian_()
+    entries = (value, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))
+    jacobian = sparse.csr_matrix(entries, shape=(int(row.max()), int(end[-1]) + 1))[:, :-1]  # The last column is the error.
+    scale = np.sqrt(np.asarray(jacobian.power(2).sum(axis=0)).ravel())
+    if not (np.isfinite(scale) & (scale > 0)).all():
+        return None
+    scaled = sparse.csr_matrix(jacobian @ sparse.diags_array(1 / scale))
+    try:
+        normal = NormalEquations.of(scaled, elimination_order(scaled, np.repeat(np.arange(len(keys)), size)))
+    except SolveError:
+        return None
+    if not normal.least_pivot > _LEAST_PIVOT:
+        return None
+    place = {key: i for i, key in enumerate(keys)}
+    found = []
+    for group in groups:
+        at = np.concatenate([np.arange(begin[place[key]], end[place[key]]) for key in group])
+        right = np.zeros((len(scale), len(at)))
+        right[at, np.arange(len(at))] = 1 / scale[at]
+        part = normal.solve(right)[at] / scale[at, None]
+        found.append((part + part.T) / 2)
+    return found

@@ -11,7 +11,8 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.bodies.body_entry import body_entry, body_of_entry, size_of
-from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom, TagPose
+from objslam.core.bodies.tag_pose import TagPose, tag_entry
+from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
@@ -43,6 +44,8 @@ def _truth_entry(o: TruthObject) -> dict[str, Any]:
         entry["size"] = o.size.tolist()
     if o.yaw is not None:
         entry["yaw"] = o.yaw
+    if o.tag_xyzw is not None:
+        entry["tag"] = {"rotation_xyzw": o.tag_xyzw.tolist()}
     return entry
 
 
@@ -122,22 +125,9 @@ def _entry(o: MapObject) -> dict[str, Any]:
     if o.ray_point is not None:
         entry["ray_point"] = o.ray_point.tolist()
     if o.tag is not None:
-        entry["tag"] = _tag_entry(o.tag)
+        entry["tag"] = tag_entry(o.tag)
     if o.ray is not None:
         entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
-    return entry
-
-
-def _tag_entry(tag: TagPose) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "rotation_xyzw": tag.xyzw.tolist(),
-        "rotation_covariance": tag.covariance.tolist(),
-        "size": tag.size,
-        "size_sigma": tag.size_sigma,
-    }
-    if tag.other_xyzw is not None:
-        entry["other_rotation_xyzw"] = tag.other_xyzw.tolist()
-        entry["other_probability"] = tag.other_probability
     return entry
 
 
@@ -191,7 +181,11 @@ def _truth_object(entry: dict[str, Any]) -> TruthObject | None:
     size = None if entry.get("size") is None else _of_body(lambda: size_of(entry, "size"))
     yaw = None if entry.get("yaw") is None else _number(entry["yaw"], "yaw")
     place = _vector(entry.get("position"), "position")
-    return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), place, size, yaw)
+    tag: Any = entry.get("tag")
+    if tag is not None and not isinstance(tag, dict):
+        raise _Malformed("tag must be a mapping")
+    xyzw = None if tag is None else _quaternion(tag.get("rotation_xyzw"), "tag.rotation_xyzw")
+    return TruthObject(_integer(entry, "id"), _text(entry.get("label"), "label"), place, size, yaw, xyzw)
 
 
 def _map_object(entry: dict[str, Any]) -> MapObject:
@@ -200,11 +194,7 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         raise _Malformed(f'status must be "ok" or "unresolved", got {status!r}')
     covariance, extent, ray, labels = (entry.get(name) for name in ("covariance", "extent", "ray", "labels"))
     if covariance is not None:
-        if not isinstance(covariance, list) or len(covariance) != 3:
-            raise _Malformed("covariance must be 3 rows of 3 numbers, or null")
-        covariance = np.stack([_vector(row, "a row of covariance") for row in covariance])
-        if (fault := covariance_fault(covariance)) is not None:
-            raise _Malformed(f"covariance {fault}")
+        covariance = _covariance(covariance, "covariance")
         if not (np.diagonal(covariance) < MAX_POSITION**2).all():
             raise _Malformed(f"covariance has a standard deviation beyond {MAX_POSITION:g} m")
     if extent is not None:
@@ -270,12 +260,7 @@ def _seen_from(value: Any) -> SeenFrom:
 def _tag(value: Any) -> TagPose:
     if not isinstance(value, dict):
         raise _Malformed("tag must be a mapping")
-    rows = value.get("rotation_covariance")
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise _Malformed("tag.rotation_covariance must be 3 rows of 3 numbers")
-    covariance = np.stack([_vector(row, "a row of tag.rotation_covariance") for row in rows])
-    if (fault := covariance_fault(covariance)) is not None:
-        raise _Malformed(f"tag.rotation_covariance {fault}")
+    covariance = _covariance(value.get("rotation_covariance"), "tag.rotation_covariance")
     size, sigma = (_number(value.get(name), f"tag.{name}") for name in ("size", "size_sigma"))
     if not (0 < size < MAX_POSITION and 0 <= sigma < MAX_POSITION):
         raise _Malformed("tag.size must be above 0 m, and tag.size_sigma at least 0 m")
@@ -286,6 +271,15 @@ def _tag(value: Any) -> TagPose:
         if not 0 <= probability <= 1:
             raise _Malformed("tag.other_probability must be from 0 to 1")
     return TagPose(rotation, covariance, size, sigma, other, probability)
+
+
+def _covariance(value: Any, name: str) -> Floats:
+    if not isinstance(value, list) or len(value) != 3:
+        raise _Malformed(f"{name} must be 3 rows of 3 numbers")
+    covariance = np.stack([_vector(row, f"a row of {name}") for row in value])
+    if (fault := covariance_fault(covariance)) is not None:
+        raise _Malformed(f"{name} {fault}")
+    return covariance
 
 
 def _quaternion(value: Any, name: str) -> Floats:

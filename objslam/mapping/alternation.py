@@ -48,9 +48,6 @@ def solve(
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
-        if not frames.localized_every:
-            cause = " and allow no calibration" if settings.calibration.use is True else ""
-            ledger.warn(f"the poses are plain odometry{cause}, so the map drifts with them (--mode joint corrects both)")
         if errors is None:
             progress("association", 0, 0)
             association, rounds = at.associate(), tuple[dict[str, int], ...]()

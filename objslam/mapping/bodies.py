@@ -163,6 +163,7 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     number = np.bincount(association.object[ray], minlength=association.count)
     objects = np.flatnonzero(fit & (number >= _FEWEST))
     ray = ray[np.isin(association.object[ray], objects)]
+    ray = ray[np.argsort(association.object[ray], kind="stable")]  # Sums over the boxes of a body are then fast.
     return _Views(
         solution,
         cameras,

@@ -25,7 +25,7 @@ from objslam.mapping.bodies import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals
-from objslam.mapping.checks.shared_errors import uncorrected
+from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
@@ -69,7 +69,13 @@ def run(
             diagnosis = diagnose(expected, settings)
             if not diagnosis.refutable:
                 say(diagnosis, ledger)
+        if diagnosis.certain and settings.mode == "joint":
+            ledger.warn("the poses stay as they are, because no solve corrects wrong input")
+            settings = settings.model_copy(update={"mode": "fixed"})
         frames = build_keyframes(log, settings, ledger)
+        if settings.mode == "fixed" and not frames.localized_every and not diagnosis.certain:
+            cause = " and allow no calibration" if settings.calibration.use is True else ""
+            ledger.warn(f"the poses are plain odometry{cause}, so the map drifts with them (--mode joint corrects both)")
         if sideways := lies_on_its_side(frames):
             ledger.warn(sideways)
         rays = build_rays(log, frames, settings, ledger)
@@ -93,8 +99,8 @@ def run(
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(c.camera for c in log.cameras)
-        if settings.checks.use and solution.estimate.calibration is not None:
-            diagnosis = diagnosis.with_findings(uncorrected(solution.estimate.calibration, errors.bounds))
+        if settings.checks.use:
+            diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
     solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)

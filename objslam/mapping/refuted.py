@@ -33,6 +33,10 @@ _NOISE = 2.0
 noise, everything fits. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
 """A finding stands only if its corrected log explains more rays by this share. A larger share refutes more findings."""
+_QUIETER = 0.5
+"""If a solve explains the boxes, but only with noisy odometry, a finding stands if its corrected log needs at most this
+share of the noise. A larger share refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with
+mirrored images, because with these the path must turn the other way."""
 _IN_BOTH = 0.4
 """The halves of a log agree if at least this share of a half's explained rays belongs to objects in both halves
 (`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs with such a finding have 0.63 and more. Logs of
@@ -44,8 +48,9 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
 
     solution: of the unchanged log. It explains boxes only if its noise is near the settings. The test depends on the basis
     of a finding. "boxes": the finding is wrong if the solution explains the boxes, or if a solution of the log without the
-    fault explains them no better. "halves": the finding is wrong if the solution explains the boxes of both halves, or if
-    both halves agree on the objects. "frames": the finding is wrong if the rays of the solution do not fit by whole frames.
+    fault explains them no better. If the solution needs noisy odometry, the log without the fault must need it too.
+    "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree on the objects.
+    "frames": the finding is wrong if the rays of the solution do not fit by whole frames.
     """
     kept = tuple(
         one
@@ -65,15 +70,19 @@ def _refuted(
     if finding.basis == "halves":
         # Without rounds, each label is one object. With rounds, two copies of an object could explain both halves.
         return (explained and not solution.rounds) or (quiet and _halves_agree(solution))
-    if explained:
+    loud = _noise(solution) > _NOISE
+    if explained and not loud:
         return True
     named = [t.hypothesis for t in diagnosis.trials if t.hypothesis is not None and t.hypothesis.name == finding.name]
     if not named:
-        return False
+        return explained
     try:
         other = _solved(named[0].put_right(log), settings, progress)
     except ObjslamError:
         return True
+    if explained:  # A path that is free to bend explains boxes of a mirrored image too.
+        fits = _least_explained(other) >= _EXPLAINED and _noise(other, rays_only=True) <= _NOISE
+        return not fits or _noise(other) > _QUIETER * _noise(solution)
     explains = _least_explained(other) >= _EXPLAINED and _noise(other) <= _NOISE
     return not explains or _explained(other).mean() < _explained(solution).mean() + _MORE
 

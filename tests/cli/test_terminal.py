@@ -13,8 +13,9 @@ from objslam.cli import console as terminal
 from objslam.cli.live_command.status import status_line
 from objslam.cli.run import advice_on_tags, objects_table
 from objslam.core.bodies.body import Body
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.diagnostics import Ledger
-from objslam.core.object_map import MapObject, ObjectMap, TagPose
+from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import Snapshot
 from objslam.core.types import Trajectory
 

@@ -7,10 +7,14 @@ from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.evaluation.evaluate import evaluate
-from objslam.graph.init_unknown_correspondences import _planar_sigmas
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
+from objslam.graph import init_unknown_correspondences
+from objslam.graph.init_unknown_correspondences import _planar_sigmas, initialize_unknown
 from objslam.graph.loop_closure import distribute_correction
 from objslam.mapping import pipeline
 from objslam.mapping.joint_alternation import rays_moved
+from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
 
 STEP = {"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0}
@@ -28,6 +32,24 @@ def test_two_laps_from_odometry_alone(seed):
     assert 2 * len(objects.matches) >= 0.95 * (2 * len(objects.matches) + len(objects.false) + len(objects.missed))
     assert np.mean(found.path.errors**2) <= np.mean(dead.path.errors**2) / 9
     assert result.summary["rounds"][-1]["rays_changed"] <= 0.02 * len(result.rays)
+
+
+def test_a_large_search_for_loops_waits_for_keyframes(monkeypatch):
+    """Wrong input gives new landmarks all the time. The comparisons of landmarks must not grow with them."""
+    log = simulate(preset("drift", frames=120), 0)
+    settings = Settings.model_validate({"mode": "joint", "odometry": STEP})
+    frames = build_keyframes(log, settings, Ledger())
+    keyframes, rays = seen_something(frames, build_rays(log, frames, settings, Ledger()))
+    searches = []
+
+    def large(*given):
+        searches.append(1000)
+        return None, 1000
+
+    monkeypatch.setattr(init_unknown_correspondences, "find_closure", large)
+    monkeypatch.setattr(init_unknown_correspondences, "_PAIRS", 40)
+    initialize_unknown(keyframes, rays, (log.cameras[0].camera,), settings, lambda done, total: None)
+    assert 40 * len(keyframes) - 1000 <= sum(searches) <= 40 * len(keyframes) + 1000
 
 
 def test_a_bent_path_begins_where_it_was_and_ends_where_it_should():

@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.graph.factors.bearing import bearings
-from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
+from objslam.graph.marginals import (
+    joint_covariances,
+    largest_sigma,
+    marginal_covariances,
+    of_normal_equations,
+    seen_covariances,
+)
 from objslam.graph.optimizers import build_graph
 from objslam.graph.variables import L0, X0, make_values
 
@@ -52,6 +58,19 @@ def test_covariances_are_blocks_of_the_inverse_information():
     np.testing.assert_allclose(covariance[0], dense(graph, values, 2), rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(covariance[1], dense(graph, values, 0), rtol=1e-6, atol=1e-12)
     assert not ledger.lines()
+
+
+def test_where_gtsam_gives_up_the_normal_equations_give_the_same():
+    graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]), anchors(range(3)))
+    values = make_values(CAMERAS, POINTS, np.arange(3))
+    groups = [(L0 + 1,), (X0 + 2, L0 + 0)]
+    expected = joint_covariances(graph, values, groups)
+    found = of_normal_equations(graph.linearize(values), values, groups)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found[0], dense(graph, values, 1), rtol=1e-6, atol=1e-12)
+    floating = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]))  # Nothing holds the frame.
+    assert of_normal_equations(floating.linearize(values), values, groups) is None
 
 
 def test_a_landmark_that_one_ray_holds_is_left_out_and_the_others_are_not():

@@ -9,7 +9,8 @@ import jsonschema
 import numpy as np
 import pytest
 
-from objslam.core.object_map import Life, MapObject, ObjectMap, SeenFrom, TagPose
+from objslam.core.bodies.tag_pose import TagPose
+from objslam.core.object_map import Life, MapObject, ObjectMap, SeenFrom
 from objslam.errors import OutputError
 from objslam.io.objects_json import dump_objects, parse_objects
 

@@ -212,6 +212,20 @@ def test_a_map_of_wrong_input_has_no_object_that_is_ok(name):
     assert first["message"] in result.summary["warnings"]
 
 
+def test_a_log_that_shows_its_mistake_is_not_explored():
+    """A joint solve would take many rounds of association, and no round corrects such poses."""
+    stages = set()
+    log = MISTAKES["poses' quaternion wxyz"](drive("joint"))
+    settings = load_settings(None, ("mode=joint", "output.recording=false"))
+    ledger = Ledger()
+    result = pipeline.run(log, settings, ledger, lambda stage, done, total: stages.add(stage))
+    assert not any(stage == "explore" or "round" in stage for stage in stages)
+    assert result.summary["mode"] == "fixed"
+    assert result.summary["wrong_input"][0]["name"] == "poses wxyz"
+    assert result.map.resolved() == ()
+    assert not any("plain odometry" in warning for warning in ledger.warnings)
+
+
 def test_the_checks_can_be_switched_off():
     result, _ = run(MISTAKES["y of poses negated"](drive("fixed")), "fixed", "checks.use=false")
     assert result.map.resolved()

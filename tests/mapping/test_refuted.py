@@ -7,6 +7,7 @@ import pytest
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.noise import NoiseFactors
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import pipeline
@@ -56,6 +57,24 @@ def test_a_finding_stays_only_if_the_log_put_right_is_explained_better(clean, wr
     found = Diagnosis((Finding("mirrored", "it is mirrored", basis="boxes"), others), (trial,))
     left = without_refuted(found, solution, log, SETTINGS, nothing)
     assert [one.name for one in left.findings] == (["mirrored"] if kept else []) + ["depth in mm"]
+
+
+@pytest.mark.parametrize(
+    ("put_right", "kept"),
+    [
+        (lambda log: log, True),  # the corrected log needs no noise
+        (no_boxes, False),  # it leaves nothing to solve
+    ],
+)
+def test_boxes_that_fit_only_a_path_that_bends_refute_nothing(clean, put_right, kept):
+    frames = build_keyframes(clean, SETTINGS, Ledger())
+    rays = build_rays(clean, frames, SETTINGS, Ledger())
+    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
+    bent = replace(solution, estimate=replace(solution.estimate, noise=NoiseFactors(turning=10.0)))
+    trial = Trial(Hypothesis("odd", "it put right", "it is odd", put_right), 1.0, 1.0, None)
+    found = Diagnosis((Finding("odd", "it is odd", basis="boxes"),), (trial,))
+    assert bool(without_refuted(found, bent, clean, SETTINGS, nothing).findings) == kept
+    assert not without_refuted(found, solution, clean, SETTINGS, nothing).findings
 
 
 def names(log):

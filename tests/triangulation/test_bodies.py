@@ -10,7 +10,7 @@ from objslam.triangulation.bodies.edges import BoxEdges, contacts
 from objslam.triangulation.bodies.ellipsoid import from_axes
 from objslam.triangulation.bodies.fit import Prior, Weights, fit
 from objslam.triangulation.bodies.prior import weak_prior
-from objslam.triangulation.bodies.residuals import edge_gaps, residuals
+from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals
 from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
 from objslam.triangulation.bodies.shared import covariance_of, sides_of
 from objslam.triangulation.bodies.solve import solve_bodies
@@ -90,8 +90,8 @@ def test_the_covariance_is_that_of_repeated_boxes():
     noisy = np.tile(boxes, (many, 1)) + rng.normal(0, 2, (30 * many, 4))
     edges = edges_of(camera, noisy, np.tile(poses, (many, 1, 1)), body, sigma=2.0)
     prior = weak_prior(np.zeros((many, 3)), np.tile([[0.35, 0.35]], (many, 1)))
-    now = residuals(edges, prior.mean, ELLIPSOID)
-    found = fit(edges, prior.mean, prior, Weights(now.sigma**2, now.sigma), ELLIPSOID)
+    sigma = nominal_noise(edges)
+    found = fit(edges, prior.mean, prior, Weights(sigma**2, sigma), ELLIPSOID)
     told = covariance_of(edges, found, sides_of(edges, prior.mean[:, :3]), np.ones(2), np.zeros(2)).mean(axis=0)
     root = np.linalg.cholesky(told)
     spread = np.linalg.solve(root, np.linalg.solve(root, np.cov(found.values.T)).T)
@@ -111,6 +111,23 @@ def solved(camera, boxes, poses, points, half):
         share=0.05,
         bent=False,
     )
+
+
+def test_the_error_that_boxes_of_one_side_share_is_found():
+    """Shifts of 8 % of half the size for each side, and none of the sizes. Half of the bodies have few sides."""
+    rng, camera, share, each = np.random.default_rng(7), CAMERAS["pinhole"], 0.08, 30
+    true = random_bodies(24, rng)
+    views = [views_of(camera, body, each, rng, arc=1.0 if i % 2 else 2 * np.pi) for i, body in enumerate(true)]
+    boxes, poses = (np.concatenate(part) for part in zip(*views, strict=True))
+    body = np.repeat(np.arange(24), each)
+    edges = edges_of(camera, boxes, poses, body)
+    sides = sides_of(edges, true[:, :3])
+    error = [rng.multivariate_normal(np.zeros(len(a)), a, 2).T for a in sides.alike]
+    shift = share * edges.size[:, None] / 2 * np.concatenate(error)[sides.cell]
+    noisy = boxes + np.tile(shift, 2) + rng.normal(0, 2, boxes.shape)
+    found = solved(camera, noisy, poses, true[:, :3], np.full((24, 2), 0.3))
+    assert found.share[0] == pytest.approx(share, rel=0.25)
+    assert found.share[1] < 0.3 * share
 
 
 def test_the_shape_is_chosen_by_what_the_boxes_show():

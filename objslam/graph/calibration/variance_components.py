@@ -12,7 +12,7 @@ from scipy import sparse
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
-from objslam.core.noise import NoiseFactors
+from objslam.core.noise import MOST_NOISE, NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
 from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, from_neighbours
@@ -28,7 +28,7 @@ _ITERATIONS = 20
 """The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 12 to 17."""
 _CONVERGED = 0.02
 """The iteration ends if all factors change by less than this share. A larger share ends it sooner."""
-_LIMITS = (0.05, 20.0)
+_LIMITS = (0.05, MOST_NOISE)
 """The smallest and largest factors on a nominal noise. Outside them, the settings do not describe the sensor at all."""
 TOGETHER = 3.0
 """The time (s) over which errors may be correlated: wheels lag behind a command, and a detector's box is off for a while. A

@@ -23,6 +23,11 @@ class NormalEquations:
         """Factor the normal equations. SolveError if they are singular."""
         return cls(order, _factored(_reordered(jacobian, order), "NATURAL"))
 
+    @property
+    def least_pivot(self) -> float:
+        """The least pivot. The larger the entries of J^T J are beside it, the more digits the elimination has lost."""
+        return float(self.factored.U.diagonal().min())
+
     def solve(self, right: Floats) -> Floats:
         """Return the solution (D,) or (D, n) for a right-hand side (D,) or (D, n)."""
         found = np.empty_like(right)

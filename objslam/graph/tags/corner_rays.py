@@ -10,7 +10,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.types import Association, Rays
 from objslam.graph.tags.placement import placed
 from objslam.graph.tags.shapes import CLOCKWISE, COUNTER_CLOCKWISE, goes_clockwise
-from objslam.graph.tags.square_fit import Corners
+from objslam.graph.tags.square_fit import Corners, independent
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,9 @@ class TagCorners:
         """Return the corners in all views of fiducials, with the camera poses (K, 4, 4). rays: (n,) the new rays."""
         views = (self.first[:, None] + np.arange(4)).ravel()
         origin, direction = rays.take(views).in_map(map_T_camera)
-        return Corners(self.tag, origin[::4], direction.reshape(-1, 4, 3), rays.sigma[self.first])
+        return Corners(
+            self.tag, origin[::4], direction.reshape(-1, 4, 3), rays.sigma[self.first], independent(len(self.first))
+        )
 
     def placed(self, rays: Rays, map_T_camera: Floats, positions: Floats) -> Floats:
         """Return the positions (M, 3) m of landmarks with each fiducial at its best pose, as `placement.placed` does."""

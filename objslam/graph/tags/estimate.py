@@ -1,14 +1,15 @@
 """Turn the four corners of each fiducial back into one object: position, rotation and size, each with its covariance."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
-from objslam.core.object_map import TagPose
 from objslam.core.rotation import quaternion_from_rotation, rotation_vector
 from objslam.core.types import Rays
 from objslam.graph.optimizers import indeterminate
@@ -17,6 +18,8 @@ from objslam.graph.tags.placement import place
 from objslam.graph.tags.shapes import squares_of, turned_by_squares
 from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
+Covariances = Callable[[Sequence[Sequence[int]]], list[Floats]]
+"""A function of groups of keys that returns the covariance of each group, as `marginals.joint_covariances` does."""
 LEAST_PROBABILITY = 0.01
 """The least probability at which the second rotation of a flat square is reported. With more, fewer are reported."""
 
@@ -26,7 +29,8 @@ def with_objects(
     tags: TagCorners,
     rays: Rays,
     map_T_camera: Floats,
-    marginals: tuple[gtsam.NonlinearFactorGraph, gtsam.Values],
+    values: gtsam.Values,
+    covariances: Covariances,
     wider: Floats,
     sensitivity: Floats | None,
     ledger: Ledger,
@@ -38,7 +42,7 @@ def with_objects(
 
     Args:
         rays: (n,) the new rays. map_T_camera: (P, 4, 4) the solved camera poses.
-        marginals: the graph and its solved values.
+        values: the solved values of the graph. covariances: those of its variables.
         wider: (M,) the factor on the covariance of each landmark.
         sensitivity: (M, 3, P) of the landmarks by the shared errors of `estimate.calibration`, None without such errors.
         ledger: for a warning if the graph has no covariances.
@@ -50,7 +54,7 @@ def with_objects(
     solved = estimate.solved[: tags.count].copy()
     positions[object_], covariance[object_], solved[object_] = corners.mean(axis=1), np.nan, False
     found: dict[int, TagPose] = {}
-    spread = _marginals(marginals, tags, which, ledger)
+    spread = _marginals(values, covariances, tags, which, ledger)
     if len(which) and spread is not None:
         rotation, centre, side = squares_of(corners[which], tags.shape[which])
         spread = spread * wider[object_[which], None, None]
@@ -91,24 +95,24 @@ def with_objects(
 
 
 def _marginals(
-    graph_values: tuple[gtsam.NonlinearFactorGraph, gtsam.Values], tags: TagCorners, which: Ints, ledger: Ledger
+    values: gtsam.Values, covariances: Covariances, tags: TagCorners, which: Ints, ledger: Ledger
 ) -> Floats | None:
     """Return the covariances (t, 7, 7) of the rotation (rad) and position (m) of fiducials in their own frames, and of the
     logarithm of their side. If the linear system is indeterminate, return None, and warn in the ledger."""
-    graph, values = graph_values
     covariance = np.zeros((len(which), 7, 7))
+    free = np.flatnonzero(~np.isfinite(tags.side[which]))
+    keys = [(TAG0 + t,) for t in which.tolist()] + [(TAG_SIZE0 + t,) for t in which[free].tolist()]
     try:
-        marginals = gtsam.Marginals(graph, values)
-        for i, t in enumerate(which.tolist()):
-            covariance[i, :6, :6] = marginals.marginalCovariance(TAG0 + t)
-            if not np.isfinite(tags.side[t]):
-                reach = np.linalg.norm(
-                    values.atPose3(TAG0 + t).translation() - values.atPoint3(L0 + int(tags.landmarks[t, 0]))
-                )
-                covariance[i, 6, 6] = marginals.marginalCovariance(TAG_SIZE0 + t)[0, 0] / reach**2
+        found = covariances(keys)
     except RuntimeError as error:
         ledger.warn(f"rotations of fiducials: {indeterminate(error).message}")
         return None
+    for i in range(len(which)):
+        covariance[i, :6, :6] = found[i]
+    for i, of_size in zip(free.tolist(), found[len(which) :], strict=True):
+        t = int(which[i])
+        reach = np.linalg.norm(values.atPose3(TAG0 + t).translation() - values.atPoint3(L0 + int(tags.landmarks[t, 0])))
+        covariance[i, 6, 6] = of_size[0, 0] / reach**2
     return covariance
 
 

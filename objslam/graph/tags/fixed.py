@@ -3,18 +3,20 @@
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.object_map import TagPose
+from objslam.core.arrays import Floats
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.rotation import quaternion_from_rotation
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.tags.corner_rays import TagCorners
 from objslam.graph.tags.estimate import LEAST_PROBABILITY
 from objslam.graph.tags.placement import place
-from objslam.graph.tags.square_fit import Corners, fit, scatter
+from objslam.graph.tags.square_fit import fit, scatter, with_pose_noise
 
-_NOMINAL = 4.0
-"""The number of views at which the scatter of the views and the nominal noise have equal weight in the covariance. From this
-number on, a fit to all views leaves a known size free. A larger number leaves more to the nominal noise."""
+_NOMINAL = 30.0
+"""The number of views at which half of the scatter beyond the nominal noise counts. The scatter of n views tells a variance
+of seven parameters within a share of about sqrt(7 / n), which is a half at 30. A larger number leaves more to the nominal
+noise."""
 _STEPS = 5
 """The iterations of a fit to all views. It starts at a pose that fits some of the views. More iterations are slower."""
 
@@ -22,8 +24,8 @@ _STEPS = 5
 def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> dict[int, TagPose]:
     """Return the rotation and size of each fiducial by the index of its object, from all its views at fixed poses.
 
-    The error of a pose is common to the four corners of a view, so the covariance comes from the scatter of whole views, and
-    for few views also from the nominal noise. A fiducial whose views do not tell its size has no entry.
+    The error of a pose is common to the four corners of a view (`square_fit.with_pose_noise`). The covariance is that of the
+    nominal noise, and larger where the views scatter more. A fiducial whose views do not tell its size has no entry.
     """
     tags = TagCorners.of(rays, association, settings)
     if tags is None:
@@ -32,20 +34,19 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
     found = place(seen, tags.shape, tags.side)
     angle, shift = pose_noise(rays, keyframes, settings)
     source = tags.source[tags.first]
-    away = np.linalg.norm(found.best.pose[seen.square, :3, 3] - seen.origin, axis=1)
-    of_pose = np.maximum(angle[source] ** 2 - rays.sigma[source] ** 2, 0.0) + (shift / away) ** 2
-    seen = Corners(seen.square, seen.origin, seen.direction, np.sqrt(seen.sigma**2 + of_pose))
-    # If the poses of views err, a fixed size would turn the tag to explain distances that do not agree.
+    turn = np.sqrt(np.maximum(angle[source] ** 2 - rays.sigma[source] ** 2, 0.0))
+    seen = with_pose_noise(seen, found.best, turn, np.broadcast_to(shift, rays.sigma.shape)[source])
+    found = place(seen, tags.shape, tags.side)
     number = np.bincount(seen.square, minlength=len(tags.side))
     known = np.isfinite(tags.side)
-    free = ~known | (number >= _NOMINAL)
-    best, cost, information = fit(seen, found.best, free, _STEPS)
-    other, other_cost, _ = fit(seen, found.other, free, _STEPS)
+    best, cost, information = fit(seen, found.best, ~known, _STEPS)
+    other, other_cost, _ = fit(seen, found.other, ~known, _STEPS)
     told = np.flatnonzero(np.isfinite(found.cost))
-    nominal = np.linalg.inv(information[told])
-    between = nominal @ scatter(seen, best, free)[told] @ nominal
-    share = (_NOMINAL / (_NOMINAL + number[told]))[:, None, None]
-    covariance = share * nominal + (1 - share) * between
+    nominal = np.zeros_like(information)
+    nominal[told] = np.linalg.inv(information[told])
+    between = nominal @ scatter(seen, best, ~known, nominal) @ nominal
+    share = (number / (_NOMINAL + number))[told, None, None]
+    covariance = nominal[told] + share * _excess(between[told], nominal[told])
     gain = np.where(np.isfinite(found.other_cost), other_cost - cost, np.inf)
     probability = 1 / (1 + np.exp(np.clip(gain / 2, -50.0, 50.0)))
     xyzw, other_xyzw = (quaternion_from_rotation(one.pose[:, :3, :3]) for one in (best, other))
@@ -60,3 +61,12 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
         )
         for i, t in enumerate(told.tolist())
     }
+
+
+def _excess(covariance: Floats, nominal: Floats) -> Floats:
+    """Return by how much covariances (n, d, d) exceed the nominal ones, in the directions in which they do."""
+    root = np.linalg.cholesky(nominal)
+    inverse = np.linalg.inv(root)
+    ratio, axes = np.linalg.eigh(inverse @ covariance @ np.swapaxes(inverse, 1, 2))
+    axes = root @ axes
+    return np.asarray((axes * np.maximum(ratio - 1, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))

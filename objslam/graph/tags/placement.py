@@ -133,7 +133,7 @@ def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
     candidate = np.repeat(np.arange(len(owner)), number[owner])
     offset = np.arange(len(candidate)) - np.repeat(np.cumsum(number[owner]) - number[owner], number[owner])
     view = begin[owner[candidate]] + offset
-    return Corners(candidate, judges.origin[view], judges.direction[view], judges.sigma[view])
+    return Corners(candidate, judges.origin[view], judges.direction[view], judges.sigma[view], judges.whitening[view])
 
 
 def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Floats:

@@ -19,19 +19,25 @@ _BEHIND_COST = 1e6
 _DAMPING = 1e-3
 """The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
 
+_MOST_LEVERAGE = 0.9
+"""The part of a view's influence on its own residuals that is corrected. It is below 1, because nothing is left of the
+residuals if a view alone decides. A larger part widens the covariances of squares that few views show."""
+
 
 @dataclass(frozen=True)
 class Corners:
     """The corners that V views of squares show. Each view belongs to one square.
 
     square: (V,) index of the square. origin: (V, 3) m in map, where the rays begin. direction: (V, 4, 3) unit, in map.
-    sigma: (V,) rad.
+    sigma: (V,) rad, the noise of one corner. whitening: (V, 8, 8) what the eight residuals of a view are multiplied with,
+    after a division by sigma: the identity if the corners err independently (see `with_pose_noise`).
     """
 
     square: Ints
     origin: Floats
     direction: Floats
     sigma: Floats
+    whitening: Floats
 
     def __len__(self) -> int:
         return len(self.square)
@@ -63,6 +69,7 @@ class Squares:
 def costs(seen: Corners, squares: Squares) -> Floats:
     """Return the cost (H,) of each square: Cauchy's loss of its corners' deviations, summed."""
     residual, _, ahead = _residuals(seen, squares.corners)
+    residual = (seen.whitening @ residual.reshape(len(seen), 8, 1)).reshape(-1, 4, 2)
     return _cost(residual, ahead, seen, len(squares.side))
 
 
@@ -102,16 +109,46 @@ def _moved(squares: Squares, step: Floats) -> Squares:
 
 
 def _residuals(seen: Corners, corners: Floats) -> tuple[Floats, Floats, Bools]:
-    """Return whitened residuals (V, 4, 2), derivatives (V, 4, 2, 3) by the corners in map, and which (V, 4) are ahead."""
+    """Return residuals (V, 4, 2) in units of `sigma`, their derivatives (V, 4, 2, 3) by the corners in map, and which (V, 4)
+    are ahead. The axes of the four corners of a view are parallel."""
     to = corners[seen.square] - seen.origin[:, None]
     along = np.einsum("vci,vci->vc", seen.direction, to)
     ahead = along > _BEHIND * np.linalg.norm(to, axis=2)
     safe = np.where(ahead, along, 1.0)
-    basis = tangent_basis(seen.direction.reshape(-1, 3)).reshape(*seen.direction.shape, 2)
+    first = tangent_basis(_middle(seen))[:, None, :, 0]
+    first = first - np.einsum("vci,vji->vcj", seen.direction, first) * seen.direction
+    first /= np.linalg.norm(first, axis=2, keepdims=True)
+    basis = np.stack([first, np.cross(seen.direction, first)], axis=3)
     plane = np.einsum("vcij,vci->vcj", basis, to) / safe[..., None]
     by_point = np.swapaxes(basis, 2, 3) - plane[..., None] * seen.direction[:, :, None, :]
     by_point /= (safe * seen.sigma[:, None])[..., None, None]
     return plane / seen.sigma[:, None, None], by_point, np.asarray(ahead)
+
+
+def _middle(seen: Corners) -> Floats:
+    """Return the unit directions (V, 3) to the middle of each view."""
+    middle = seen.direction.mean(axis=1)
+    return np.asarray(middle / np.linalg.norm(middle, axis=1, keepdims=True))
+
+
+def with_pose_noise(seen: Corners, squares: Squares, angle: Floats, place: Floats) -> Corners:
+    """Return views whose cameras have noise in their rotation, angle (V,) rad, and position, place (V,) m, per axis.
+
+    The noise of a camera moves the four corners of its view together: the residuals have the covariance sigma^2 I + J S J^T.
+    J is taken at the given squares (H), so it is the same for each pose that is then compared.
+    """
+    _, by_point, _ = _residuals(seen, squares.corners)
+    by_place = by_point.reshape(len(seen), 8, 3) * place[:, None, None]
+    # A turn of the camera moves its whole image. By how much the image turns about the line of sight is left out.
+    by_turn = np.tile(np.eye(2), (4, 1)) * (angle / seen.sigma)[:, None, None]
+    shared = np.concatenate([by_place, by_turn], axis=2)
+    root = np.linalg.cholesky(np.eye(8) + shared @ np.swapaxes(shared, 1, 2))
+    return replace(seen, whitening=np.linalg.inv(root))
+
+
+def independent(count: int) -> Floats:
+    """Return the whitening (V, 8, 8) of V views whose corners err independently."""
+    return np.tile(np.eye(8), (count, 1, 1))
 
 
 def _cost(residual: Floats, ahead: Bools, seen: Corners, count: int) -> Floats:
@@ -120,13 +157,18 @@ def _cost(residual: Floats, ahead: Bools, seen: Corners, count: int) -> Floats:
     return np.asarray(np.bincount(seen.square, each.sum(axis=1), count), dtype=np.float64)
 
 
-def scatter(seen: Corners, squares: Squares, free: Bools) -> Floats:
+def scatter(seen: Corners, squares: Squares, free: Bools, covariance: Floats) -> Floats:
     """Return the sums (H, 7, 7) of the squared gradients of each square's views. The corners of a view may share errors.
 
-    Between two inverses of the information, this is the covariance of a fit (cluster-robust; Liang and Zeger 1986).
+    Between two inverses of the information, covariance (H, 7, 7), this is the covariance of a fit (cluster-robust; Liang and
+    Zeger 1986). A fit leaves smaller residuals than the errors are, most of all in the views that decide it. So the
+    residuals of each view are those of a fit without this view (Mancl and DeRouen 2001).
     """
-    _, weighted, residual, _ = _jacobians(seen, squares, free)
-    gradient = np.einsum("vak,va->vk", weighted, residual.reshape(len(seen), 8))
+    flat, weighted, residual, _ = _jacobians(seen, squares, free)
+    leverage = flat @ covariance[seen.square] @ np.swapaxes(weighted, 1, 2)
+    own = np.eye(8) - _MOST_LEVERAGE * leverage
+    without = np.linalg.solve(own, residual.reshape(len(seen), 8, 1))[..., 0]
+    gradient = np.einsum("vak,va->vk", weighted, without)
     result = np.zeros((len(squares.side), 7, 7))
     np.add.at(result, seen.square, gradient[:, :, None] * gradient[:, None, :])
     return result
@@ -153,7 +195,9 @@ def _jacobians(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Fl
         [-skew(local), np.broadcast_to(np.eye(3), (count, 4, 3, 3)), (local * free[:, None, None])[..., None]], axis=3
     )
     turned = np.einsum("hij,hcjk->hcik", rotation, by_square)
-    jacobian = np.einsum("vcai,vcik->vcak", by_point, turned[seen.square])
+    jacobian = np.einsum("vcai,vcik->vcak", by_point, turned[seen.square]).reshape(len(seen), 8, 7)
+    jacobian = (seen.whitening @ jacobian).reshape(-1, 4, 2, 7)
+    residual = (seen.whitening @ residual.reshape(len(seen), 8, 1)).reshape(-1, 4, 2)
     weight = np.where(ahead, 1 / (1 + (residual**2).sum(axis=2) / CAUCHY_K**2), 0.0)[..., None]
     weighted = jacobian * weight[..., None]
     return jacobian.reshape(len(seen), 8, 7), weighted.reshape(len(seen), 8, 7), residual, ahead
@@ -166,8 +210,7 @@ def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
     first pose is that of the homography between the square and its image. The second one has the normal on the other side
     of the line of sight. Both are then fitted to the corners of their view. shapes: (V, 4, 3).
     """
-    middle = seen.direction.mean(axis=1)
-    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    middle = _middle(seen)
     axes = np.concatenate([tangent_basis(middle), middle[:, :, None]], axis=2)
     local = np.einsum("vij,vci->vcj", axes, seen.direction)
     image = local[..., :2] / local[..., 2:]
@@ -188,7 +231,7 @@ def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
     views = replace(seen, square=np.arange(len(seen)))
     twice = Corners(
         np.concatenate([views.square, views.square + len(seen)]),
-        *(np.concatenate([part, part]) for part in (seen.origin, seen.direction, seen.sigma)),
+        *(np.concatenate([part, part]) for part in (seen.origin, seen.direction, seen.sigma, seen.whitening)),
     )
     return fit(twice, both, np.zeros(len(both.side), dtype=bool), iterations)[0]
 

@@ -69,6 +69,11 @@ class Diagnosis:
         return any(finding.spoils for finding in self.findings)
 
     @property
+    def certain(self) -> bool:
+        """Whether the log itself shows that the input is wrong, so that no solve can refute it."""
+        return any(finding.spoils and finding.basis == "log" for finding in self.findings)
+
+    @property
     def refutable(self) -> bool:
         """Whether a solve that explains the boxes may refute one of the findings."""
         return any(finding.basis != "log" for finding in self.findings)

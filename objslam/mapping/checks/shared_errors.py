@@ -1,10 +1,12 @@
-"""A check of the shared errors that names wrong input, because an error far beyond its prior has a cause."""
+"""Checks of the shared errors and of the noise, because an error far beyond its prior has a cause."""
 
 import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
+from objslam.core.estimate import Estimate
+from objslam.core.noise import MOST_NOISE, NoiseFactors
 from objslam.mapping.checks.finding import Finding
 
 MOST_SIGMAS = 3.0
@@ -21,6 +23,16 @@ _CAUSES = {
     "roll": "is base_T_camera right?",
     "range_scale": "is the depth in metres (depth_scale)?",
     "focal": "are the camera matrix and the boxes of the same image size?",
+}
+
+
+_NOISES = {
+    "rays": "of the boxes",
+    "ranges": "of the depths",
+    "range_bias": "that all depths of an object share",
+    "along": "of the odometry along the path",
+    "across": "of the odometry across the path",
+    "turning": "of the odometry's heading",
 }
 
 
@@ -42,7 +54,13 @@ def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
             ledger.warn(f"the shared error {name} is {of['value']:.3g}{unit}, {far}: {cause}")
 
 
-def uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
+def at_bounds(estimate: Estimate, bounds: Floats) -> list[Finding]:
+    """Return a finding for each shared error that ended at its bound (P,), and for each noise that did."""
+    errors = [] if estimate.calibration is None else _uncorrected(estimate.calibration, bounds)
+    return errors + ([] if estimate.noise is None else _with_most_noise(estimate.noise))
+
+
+def _uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
     """Return a finding for each shared error that ended at its bound (P,). The true error may be larger and is not
     corrected.
 
@@ -58,4 +76,21 @@ def uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
         )
         for name, bound, at in zip(calibration.names, bounds.tolist(), ended.tolist(), strict=True)
         if at
+    ]
+
+
+def _with_most_noise(noise: NoiseFactors) -> list[Finding]:
+    """Return a finding for each noise that ended at its bound. With so much noise, wrong input fits too.
+
+    Wheels may slip so much, but no detector is off by so many pixels. So the noise of the boxes spoils the positions.
+    """
+    return [
+        Finding(
+            f"noise {name} at its bound",
+            f"the boxes agree only if the noise {words} is {MOST_NOISE:.3g} times what the settings say, or more: unless it "
+            "really is, the input is wrong",
+            spoils=name == "rays",
+        )
+        for name, words in _NOISES.items()
+        if getattr(noise, name) >= 0.999 * MOST_NOISE
     ]

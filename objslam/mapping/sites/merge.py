@@ -14,8 +14,9 @@ from objslam.association.registration.object_maps import register
 from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
 from objslam.core.bodies.body import Body, surer_body, turned
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.geometry import inverse
-from objslam.core.object_map import MapObject, ObjectMap, SeenFrom, TagPose
+from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
 from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session

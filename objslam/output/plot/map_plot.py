@@ -28,6 +28,7 @@ _LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map, and its l
 _EDGE = 0.985  # The triangle of a far object is this share of the way from the centre of the picture to its edge.
 _TRIANGLE = 18.0  # The triangle of a far object has this length, px.
 _PATH = 2.0  # The width, px, of a path.
+_TAG, _NORMAL = 4.0, 0.3  # The width, px, of the outline of a fiducial, and the length, m, of the line along its normal.
 _USED, _REJECTED = (0.561, 0.749, 0.933), (0.937, 0.561, 0.525)  # Used rays are light blue, and rejected rays are light red.
 _BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # The colours of the path before and after the estimation.
 _NEUTRAL = (0.333, 0.333, 0.333)  # The legend shows objects in this colour, because each label has its own colour.
@@ -142,6 +143,9 @@ def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[
         outline = body_outline(o) if plane == [0, 1] else None  # A body stands along z.
         if outline is not None:
             below.append(Line(outline, colour, _PATH))
+        if o.tag is not None:
+            below.append(Line(o.tag.outline(o.position)[:, plane], colour, _TAG))
+            below.append(Line(np.stack([o.position, o.position + _NORMAL * o.tag.rotation[:, 2]])[:, plane], colour, _PATH))
     return below, dots
 
 
@@ -153,6 +157,8 @@ def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
         entries.append(Marks(nowhere, "dot", _NEUTRAL, _WHITE, _DOT, "objects, 2 sigma"))
     if any(o.body is not None for o in result.map):
         entries.append(Line(nowhere, _NEUTRAL, _PATH, "their bodies"))
+    if any(o.tag is not None for o in result.map):
+        entries.append(Line(nowhere, _NEUTRAL, _TAG, "fiducials and their normals"))
     if resolved < len(result.map):
         entries.append(Marks(nowhere, "dot", _WHITE, _NEUTRAL, _DOT - 1, "unresolved"))
     return tuple(entries)

@@ -7,6 +7,7 @@ import rerun as rr
 
 from objslam.core.arrays import Floats
 from objslam.core.bodies.body import Body
+from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.geometry import lift_se2
 from objslam.core.object_map import ObjectMap
 from objslam.core.rotation import quaternion_from_rotation
@@ -17,6 +18,7 @@ from objslam.output.viewer.view_point import ViewPoint, label_places
 
 _MAX_LABELS = 60  # Labels are hidden at first if the map has more objects than this. More labels would overlap.
 _OPACITY = 90  # The opacity of bodies, 0 to 255. More opaque bodies hide the points and ellipsoids inside them.
+_AXES = ((220, 50, 47), (70, 160, 60), (40, 110, 220))  # The RGB colours of the axes x, y and z.
 _TRUTH, _TEXT, _LEADER = (0, 0, 0), (255, 255, 255), (170, 170, 170)  # The RGB colours are black, white, grey.
 
 
@@ -26,10 +28,11 @@ def colours(objects: ObjectMap) -> list[tuple[int, int, int]]:
 
 
 def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path: Floats, *, static: bool = True) -> None:
-    """Log the resolved objects as points, `map/objects`, and six entities below it.
+    """Log the resolved objects as points, `map/objects`, and the entities below it.
 
     `uncertainty` has the 2-sigma ellipsoids of resolved objects, and `extent` has boxes of their size. `bodies` has
-    filled ellipsoids, and `cuboids` has boxes, of objects with a body. `unresolved` has the
+    filled ellipsoids, and `cuboids` has boxes, of objects with a body. `tags` has the outlines of fiducials, and `tags/axes`
+    their axes: x red, y green, z blue. `unresolved` has the
     ray of each unresolved object. `labels` has the captions of all objects.
 
     Args:
@@ -66,6 +69,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     )
     log("/extent", boxes, bool(sized))
     _log_bodies(log, [(o.position, o.body, colour[i]) for i, o in enumerate(every) if o.body is not None])
+    _log_tags(log, [(o.position, o.tag, colour[i]) for i in resolved if (o := every[i]).tag is not None])
     named = [i for i, o in enumerate(every) if np.isfinite(o.position).all()]
     unresolved = [(i, (ray[0], every[i].position)) for i in named if (ray := every[i].ray) is not None]
     ways = [way for _, way in unresolved]
@@ -97,6 +101,19 @@ def _log_bodies(log: Any, bodies: list[tuple[Floats, Body, tuple[int, int, int]]
             fill_mode="solid",
         )
         log(name, shapes, bool(some))
+
+
+def _log_tags(log: Any, tags: list[tuple[Floats, TagPose, tuple[int, int, int]]]) -> None:
+    """Log the outlines of fiducials at places, and three arrows as long as their side: x red, y green, z blue."""
+    outlines = [tag.outline(place) for place, tag, _ in tags]
+    log("/tags", rr.LineStrips3D(outlines, colors=[c for *_, c in tags], radii=rr.Radius.ui_points(1.5)), bool(tags))
+    axes = rr.Arrows3D(
+        origins=[place for place, _, _ in tags for _ in _AXES],
+        vectors=[tag.size * axis for _, tag, _ in tags for axis in tag.rotation.T],
+        colors=[colour for _ in tags for colour in _AXES],
+        radii=rr.Radius.ui_points(1.5),
+    )
+    log("/tags/axes", axes, bool(tags))
 
 
 def log_truth(recording: Any, truth: Truth) -> None:

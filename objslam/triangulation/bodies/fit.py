@@ -75,7 +75,7 @@ def fit(
     most: int = _ITERATIONS,
 ) -> Fit:
     """Return the most probable bodies of one kind. start: (N, 7). still: as `STILL`. most: the most steps."""
-    values = start.copy()
+    values, now = start.copy(), residuals(edges, start, kind)
     moving = np.arange(len(start))
     damping = np.full(len(start), _DAMPING[0])
     steps = 0
@@ -86,13 +86,13 @@ def fit(
         some = replace(some, body=np.searchsorted(part, some.body))
         mine = Weights(weights.variance[boxes], weights.spread[boxes], weights.robust)
         own = Prior(prior.mean[part], prior.information[part])
-        values[part], damping[part], rest, steps = _steps(
-            some, values[part], damping[part], own, mine, kind, (steps, most, still)
+        values[part], damping[part], found, rest, steps = _steps(
+            some, values[part], damping[part], now.take(boxes), own, mine, kind, (steps, most, still)
         )
+        now.put(boxes, found)
         moving = part[~rest]
-    now = residuals(edges, values, kind)
     weight = _weight(now, weights)
-    information, _, _ = _normal(edges.body, np.argsort(edges.body, kind="stable"), now, weight, prior, values)
+    information, _, _ = _normal(edges.body, now, weight, prior, values)
     return Fit(values, weight, now, information, prior.information)
 
 
@@ -100,22 +100,23 @@ def _steps(
     edges: BoxEdges,
     values: Floats,
     damping: Floats,
+    now: Residuals,
     prior: Prior,
     weights: Weights,
     kind: Kind,
     limits: tuple[int, int, float],
-) -> tuple[Floats, Floats, Bools, int]:
-    """Take steps until few bodies are unfinished. Return bodies, dampings, which bodies are finished, and the steps so far.
+) -> tuple[Floats, Floats, Residuals, Bools, int]:
+    """Take steps until few bodies are unfinished. Return bodies, dampings, residuals, which bodies are finished, and the
+    steps so far.
 
-    limits: the number of steps so far, the most steps, and the value for `STILL`.
+    now: the residuals before. limits: the number of steps so far, the most steps, and the value for `STILL`.
     """
     steps, most, enough = limits
-    order, still = np.argsort(edges.body, kind="stable"), np.zeros(len(values), dtype=bool)
-    now = residuals(edges, values, kind)
+    still = np.zeros(len(values), dtype=bool)
     while steps < most and (~still).mean() > _REMAIN:
         steps += 1
         weight = _weight(now, weights)
-        information, gradient, cost = _normal(edges.body, order, now, weight, prior, values)
+        information, gradient, cost = _normal(edges.body, now, weight, prior, values)
         damped = information + (damping[:, None] * np.einsum("nii->ni", information))[..., None] * np.eye(PARAMETERS)
         step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
         longest = np.abs(step[:, 3:]).max(axis=1)
@@ -128,7 +129,7 @@ def _steps(
         now = new if better.all() else _chosen(better[edges.body], new, now)
         still |= (promised < enough) | (damping >= _DAMPING[2])
         damping = np.clip(np.where(better, damping / 10, damping * 10), *_DAMPING[1:])
-    return values, damping, still, steps
+    return values, damping, now, still, steps
 
 
 def _chosen(which: Bools, new: Residuals, old: Residuals) -> Residuals:
@@ -136,16 +137,19 @@ def _chosen(which: Bools, new: Residuals, old: Residuals) -> Residuals:
         np.where(which[:, None], new.value, old.value),
         np.where(which[:, None, None], new.by, old.by),
         np.where(which[:, None], new.use, old.use),
-        old.sigma,
     )
 
 
-def grouped(body: Ints, order: Ints, rows: Floats, count: int) -> Floats:
-    """Return the sums (count, ...) of rows (B, ...) of each body (B,). order: indices that sort the bodies."""
+def grouped(group: Ints, rows: Floats, count: int) -> Floats:
+    """Return the sums (count, ...) of rows (B, ...) of each group (B,). It is fastest if the groups are in order."""
     total = np.zeros((count, *rows.shape[1:]))
-    if len(order):
-        which, begin = np.unique(body[order], return_index=True)
-        total[which] = np.add.reduceat(rows[order], begin, axis=0)
+    if not len(group):
+        return total
+    if (np.diff(group) < 0).any():
+        order = np.argsort(group, kind="stable")
+        group, rows = group[order], rows[order]
+    begin = np.concatenate([[0], np.flatnonzero(np.diff(group)) + 1])
+    total[group[begin]] = np.add.reduceat(rows, begin, axis=0)
     return total
 
 
@@ -159,9 +163,7 @@ def _weight(now: Residuals, weights: Weights) -> Floats:
     return np.asarray(weight / (1 + squared / CAUCHY_K**2))
 
 
-def _normal(
-    body: Ints, order: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats
-) -> tuple[Floats, Floats, Floats]:
+def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the information (N, 7, 7), the gradient (N, 7) and the cost (N,) of the bodies."""
     weighted = now.by * weight[..., None]
     total = np.concatenate(
@@ -171,7 +173,7 @@ def _normal(
         ],
         axis=1,
     )
-    sums = grouped(body, order, total, len(values))
+    sums = grouped(body, total, len(values))
     split = PARAMETERS**2
     information = sums[:, :split].reshape(-1, PARAMETERS, PARAMETERS) + prior.information
     gradient = sums[:, split:] + np.einsum("nij,nj->ni", prior.information, values - prior.mean)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 
@@ -28,13 +28,20 @@ class Residuals:
 
     value: (B, 5), predicted minus measured: the shift in x and y (px), half of the width and of the height (px), and the
     range (m). If an edge of an axis is a bound, the two edges of this axis replace its shift and its size. by: (B, 5, 7)
-    derivatives of `value` by the parameters of the bodies. use: (B, 5) whether a residual counts. sigma: (B, 5) its noise.
+    derivatives of `value` by the parameters of the bodies. use: (B, 5) whether a residual counts.
     """
 
     value: Floats
     by: Floats
     use: Floats
-    sigma: Floats
+
+    def take(self, boxes: Bools | Ints) -> Residuals:
+        """Select boxes by a mask or by indices."""
+        return Residuals(self.value[boxes], self.by[boxes], self.use[boxes])
+
+    def put(self, boxes: Bools | Ints, new: Residuals) -> None:
+        """Overwrite the residuals of some boxes."""
+        self.value[boxes], self.by[boxes], self.use[boxes] = new.value, new.by, new.use
 
 
 def edge_gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
@@ -42,14 +49,15 @@ def edge_gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floa
     (B, 4, 3) in map at which the bodies come closest to the planes."""
     own = values[edges.body]
     reach, by_shape, points = kind.support(own[:, None], edges.normal)
-    gap = (edges.normal * (own[:, :3] - edges.origin)[:, None]).sum(axis=2) + reach
+    gap = np.einsum("bei,bi->be", edges.normal, own[:, :3] - edges.origin) + reach
     return gap, np.concatenate([edges.normal, by_shape], axis=2), own[:, None, :3] + points
 
 
 def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     """Return the residuals of bodies (N, 7) of one kind. The derivatives treat the distance to touched points as fixed."""
     gap, by_gap, points = edge_gaps(edges, values, kind)
-    scale = np.maximum(np.linalg.norm(points - edges.origin[:, None], axis=2) * edges.turn, _LEAST)  # m per px
+    away = points - edges.origin[:, None]
+    scale = np.maximum(np.sqrt(np.einsum("bei,bei->be", away, away)) * edges.turn, _LEAST)  # m per px
     off, by = gap / scale, by_gap / scale[..., None]
     count = len(edges)
     value, use = np.empty((count, ROWS)), np.ones((count, ROWS))
@@ -62,7 +70,7 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
         value[row, place], jacobian[row, place] = off[row, place], by[row, place]
         use[row, place] = ~(edges.bound[row, place] & (off[row, place] > 0))
     value[:, 4], jacobian[:, 4], use[:, 4] = _ranges(edges, values, kind)
-    return Residuals(value, jacobian, use, nominal_noise(edges))
+    return Residuals(value, jacobian, use)
 
 
 def nominal_noise(edges: BoxEdges) -> Floats:

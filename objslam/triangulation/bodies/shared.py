@@ -30,6 +30,8 @@ _SHARES = 41
 """The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
 """The largest share that `share_of` tries, in standard deviations of its prior. A larger value admits worse outlines."""
+_AT_ONCE = 64
+"""The number of bodies whose likelihood of a share is computed at once. A larger number needs more memory."""
 _NOMINAL = 20.0
 """With this many residuals, their scatter weighs as much as the nominal noise of the settings. A larger number gives the
 nominal noise more weight."""
@@ -53,9 +55,9 @@ def sides_of(edges: BoxEdges, centre: Floats) -> Sides:
     """Return the sides of bodies with centres (N, 3) m in map."""
     towards = centre[edges.body] - edges.origin
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    pairs = np.column_stack([edges.body, (towards @ evenly_spread(SIDES).T).argmax(axis=1)])
-    pairs, cell = np.unique(pairs, axis=0, return_inverse=True)
-    cell, owner = cell.ravel(), pairs[:, 0]
+    seen = edges.body * SIDES + (towards @ evenly_spread(SIDES).T).argmax(axis=1)
+    seen, cell = np.unique(seen, return_inverse=True)
+    owner = seen // SIDES
     number = np.bincount(cell).astype(np.float64)
     mean = np.stack([np.bincount(cell, part) for part in towards.T], axis=1)
     mean = mean / np.linalg.norm(mean, axis=1, keepdims=True)
@@ -79,16 +81,16 @@ def some_of_each_side(sides: Sides, most: int) -> Ints:
     return np.flatnonzero((rank * kept) // total != ((rank - 1) * kept) // total)
 
 
-def white_factors(now: Residuals, sides: Sides, which: Bools) -> Floats:
+def white_factors(edges: BoxEdges, now: Residuals, sides: Sides, which: Bools) -> Floats:
     """Return the factors (2,) on the nominal noise of shifts and of sizes, from the scatter of boxes within a side.
 
     which: (B,) the boxes that count.
     """
-    number = np.bincount(sides.cell)
+    number, sigma = np.bincount(sides.cell), nominal_noise(edges)
     free = np.sqrt(1 - 1 / number)[sides.cell]
     factors = np.ones(2)
     for kind, rows in enumerate((slice(0, 2), slice(2, 4))):
-        deviation = now.value[:, rows] / now.sigma[:, rows]
+        deviation = now.value[:, rows] / sigma[:, rows]
         mean = np.stack([np.bincount(sides.cell, part) for part in deviation.T], axis=1) / number[:, None]
         some = (which & (number[sides.cell] > 1))[:, None] & (now.use[:, rows] > 0)
         off = np.abs(deviation - mean[sides.cell])[some] / np.broadcast_to(free[:, None], some.shape)[some]
@@ -129,7 +131,7 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = np.tile(-0.5 * (shares / prior) ** 2, (2, 1))
-    white, size = _white(fit.found.sigma, factors)[:, :4], edges.size / 2
+    white, size = _white(nominal_noise(edges), factors)[:, :4], edges.size / 2
     weight = fit.weight[:, :4] > 0
     total = np.stack([np.bincount(sides.cell, w) for w in (weight / white**2).T], axis=1)
     total = np.maximum(total, 1e-12)
@@ -138,30 +140,38 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
         / total
         for parts in (fit.found.value[:, :4].T, np.repeat(size[None], 4, axis=0))
     )
-    order = np.argsort(sides.cell, kind="stable")
-    by = (
-        grouped(sides.cell, order, (weight / white**2)[..., None] * fit.found.by[:, :4], len(sides.owner)) / total[..., None]
-    )
+    by = grouped(sides.cell, (weight / white**2)[..., None] * fit.found.by[:, :4], len(sides.owner)) / total[..., None]
     bounds = np.searchsorted(sides.owner, np.arange(len(fit.values) + 1))
-    for body, (begin, end) in enumerate(pairwise(bounds.tolist())):
-        if end - begin < 2 or not which[body]:
-            continue
-        mine = slice(begin, end)
-        root = np.sqrt(total[mine])  # (c, 4)
-        value, slope = (mean[mine] * root).T.ravel(), np.swapaxes(by[mine] * root[..., None], 0, 1).reshape(-1, by.shape[2])
-        part = (scale[mine] * root).T  # (4, c)
-        eigen, vectors = np.linalg.eigh(part[:, :, None] * sides.alike[body] * part[:, None, :])
-        count = end - begin
-        value = np.einsum("kij,ki->kj", vectors, value.reshape(4, count)).ravel()
-        slope = np.einsum("kij,kid->kjd", vectors, slope.reshape(4, count, -1)).reshape(4 * count, -1)
-        for kind in range(2):  # The first half of the rows are shifts.
-            half = slice(2 * count * kind, 2 * count * (kind + 1))
-            variance = 1 + shares[:, None] ** 2 * np.maximum(eigen.ravel()[half], 0.0)
-            matrix = np.einsum("ki,kj,sk->sij", slope[half], slope[half], 1 / variance) + fit.prior[body]
-            vector = np.einsum("ki,k,sk->si", slope[half], value[half], 1 / variance)
-            explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
-            squares = (value[half] ** 2 / variance + np.log(variance)).sum(axis=1)
-            likelihood[kind] -= 0.5 * (squares + np.linalg.slogdet(matrix)[1] - explained)
+    number = np.diff(bounds)
+    told = np.flatnonzero(which & (number > 1))
+    for begin in range(0, len(told), _AT_ONCE):
+        some = told[begin : begin + _AT_ONCE]
+        # Bodies with fewer sides get sides that measure nothing, so that all arrays have one shape.
+        most = int(number[some].max())
+        cell = bounds[some, None] + np.arange(most)
+        real = np.arange(most) < number[some, None]
+        cell = np.where(real, cell, 0)
+        root = np.sqrt(total[cell]) * real[..., None]  # (n, c, 4)
+        alike = np.zeros((len(some), most, most))
+        for at, body in enumerate(some.tolist()):
+            alike[at, : number[body], : number[body]] = sides.alike[body]
+        part = np.swapaxes(scale[cell] * root, 1, 2)  # (n, 4, c)
+        eigen, vectors = np.linalg.eigh(part[..., :, None] * alike[:, None] * part[..., None, :])
+        turn = np.swapaxes(vectors, 2, 3)
+        value = (turn @ np.swapaxes(mean[cell] * root, 1, 2)[..., None])[..., 0]
+        slope = turn @ np.swapaxes(by[cell] * root[..., None], 1, 2)  # (n, 4, c, 7)
+        for kind in range(2):  # The first two rows are shifts.
+            rows = slice(2 * kind, 2 * kind + 2)
+            off, lean, wide = (
+                one[:, rows].reshape(len(some), 2 * most, *one.shape[3:]) for one in (value, slope, np.maximum(eigen, 0.0))
+            )
+            variance = 1 + shares[:, None] ** 2 * wide[:, None]  # (n, s, 2 c)
+            square = (lean[..., :, None] * lean[..., None, :]).reshape(len(some), 2 * most, -1)
+            matrix = (1 / variance @ square).reshape(len(some), _SHARES, *fit.prior.shape[1:]) + fit.prior[some, None]
+            vector = 1 / variance @ (lean * off[..., None])
+            explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=2)
+            squares = (off[:, None] ** 2 / variance + np.log(variance)).sum(axis=2)
+            likelihood[kind] -= 0.5 * (squares + np.linalg.slogdet(matrix)[1] - explained).sum(axis=0)
     chance = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
     return np.asarray(np.sqrt((chance * shares**2).sum(axis=1) / chance.sum(axis=1)))
 
@@ -172,12 +182,12 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
     An estimate that weighs residuals with W has the covariance A^-1 (J^T W V W J + P) A^-1, where V is the true covariance
     of the residuals, P the information of the prior, and A = J^T W J + P.
     """
-    count, order = len(fit.values), np.argsort(edges.body, kind="stable")
+    count = len(fit.values)
     pulled = fit.found.by * fit.weight[..., None]
-    noisy = pulled * _white(fit.found.sigma, factors)[..., None]
-    middle = grouped(edges.body, order, np.swapaxes(noisy, 1, 2) @ noisy, count) + fit.prior
+    noisy = pulled * _white(nominal_noise(edges), factors)[..., None]
+    middle = grouped(edges.body, np.swapaxes(noisy, 1, 2) @ noisy, count) + fit.prior
     together = pulled * _scale(edges, share)[..., None]
-    by_side = grouped(sides.cell, np.argsort(sides.cell, kind="stable"), together, len(sides.owner))
+    by_side = grouped(sides.cell, together, len(sides.owner))
     bounds = np.searchsorted(sides.owner, np.arange(count + 1))
     for body, (begin, end) in enumerate(pairwise(bounds.tolist())):
         mine = by_side[begin:end]

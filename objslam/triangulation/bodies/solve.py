@@ -86,9 +86,9 @@ class Bodies:
 class _State:
     """The noise, the prior and the bodies of the rounds so far.
 
-    rounds, balls: (N, 7) ellipsoids and spheres. cuboids: (N, 7), the starts of the next fit. evidence, shape: see `Bodies`.
-    best: the better of ellipsoid and cuboid, None before the first round. covariance: (N, 7, 7) of `best`. sized: (N,)
-    whether the size is known, so that no sphere is chosen.
+    rounds, balls, dots: (N, 7) ellipsoids, spheres and points. cuboids: (N, 7), the starts of the next fit. evidence, shape:
+    see `Bodies`. best: the better of ellipsoid and cuboid, None before the first round. covariance: (N, 7, 7) of `best`.
+    sized: (N,) whether the size is known, so that no sphere is chosen.
     """
 
     factors: Floats
@@ -97,6 +97,7 @@ class _State:
     rounds: Floats
     cuboids: tuple[Floats, ...]
     balls: Floats
+    dots: Floats
     evidence: Floats
     shape: Ints
     best: Fit | None
@@ -128,12 +129,13 @@ def solve_bodies(
     label = np.unique(np.array(names), return_inverse=True)[1].ravel()
     weak = weak_prior(points, half)
     nothing = np.zeros((4, len(points))), np.zeros(len(points), dtype=np.int64), None, np.zeros((len(points), 7, 7))
-    balls = sphere_prior(weak).mean
+    balls, dots = sphere_prior(weak).mean, dot_prior(weak).mean
     sized = np.array([name in (sizes or {}) for name in names])
-    now = _State(np.ones(2), np.full(2, share), weak, weak.mean, (), balls, *nothing, sized)
+    now = _State(np.ones(2), np.full(2, share), weak, weak.mean, (), balls, dots, *nothing, sized)
     for number in range(_ROUNDS + 1):
         some = edges.take(few)
-        now = _round(some, sides_of(some, points), now, side[few])
+        some_sides = sides_of(some, points)
+        now = _round(some, some_sides, now, side[few])
         best = now.best
         if number == _ROUNDS or best is None:
             break
@@ -144,8 +146,8 @@ def solve_bodies(
             prior = known_sizes(prior, now.rounds, names, sizes)
         now = replace(now, prior=prior)
         if learn and (now.shape != _POINT).any():
-            some_sides, which = sides_of(some, points), now.shape != _POINT
-            factors = white_factors(best.found, some_sides, which[some.body])
+            which = now.shape != _POINT
+            factors = white_factors(some, best.found, some_sides, which[some.body])
             found = share_of(some, best, some_sides, factors, share, which)
             now = replace(now, factors=factors, share=found)
         if bent:
@@ -163,9 +165,10 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
     square, square_prior = _best_cuboids(edges, now.cuboids, now.prior, weights)
     ball_prior = sphere_prior(now.prior)
     ball = fit(edges, now.balls, ball_prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    dots, dot_evidence = _dots(edges, now, weights, side)
     evidence = np.stack(
         [
-            _dot_evidence(edges, now.prior, weights, side),
+            dot_evidence,
             log_evidence(edges, ball, ball_prior, weights) - np.log(_RARE) - 1e9 * now.sized,
             log_evidence(edges, rounds, now.prior, weights),
             log_evidence(edges, square, square_prior, weights),
@@ -177,6 +180,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
         rounds=rounds.values,
         cuboids=(square.values,),
         balls=ball.values,
+        dots=dots,
         evidence=evidence,
         shape=evidence.argmax(axis=0),
         best=best,
@@ -235,14 +239,13 @@ def _to_centre(edges: BoxEdges, centre: Floats, gap: Floats) -> Floats:
     return np.asarray(towards / away - predicted)
 
 
-def _dot_evidence(edges: BoxEdges, prior: Prior, weights: Weights, side: Floats) -> Floats:
-    """Return the logarithm of the evidence (N,) of points, which do not explain the sides of boxes."""
-    dots, variance, spread = dot_prior(prior), weights.variance.copy(), weights.spread.copy()
+def _dots(edges: BoxEdges, now: _State, weights: Weights, side: Floats) -> tuple[Floats, Floats]:
+    """Return points (N, 7), which do not explain the sides of boxes, and the logarithm of their evidence (N,)."""
+    prior, variance, spread = dot_prior(now.prior), weights.variance.copy(), weights.spread.copy()
     variance[:, 2:4] = spread[:, 2:4] = np.inf
-    found = fit(
-        edges, dots.mean, dots, replace(weights, variance=variance, spread=spread), ELLIPSOID, still=_ENOUGH, most=_STEPS
-    )
-    return log_evidence(edges, found, dots, weights, free_side=side)
+    free = replace(weights, variance=variance, spread=spread)
+    found = fit(edges, now.dots, prior, free, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    return found.values, log_evidence(edges, found, prior, weights, free_side=side)
 
 
 def _cuboid_starts(rounds: Floats) -> tuple[Floats, Floats]:
