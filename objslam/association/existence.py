@@ -85,9 +85,15 @@ def existence(state: State, gate: float) -> Floats:
     """Return the probability (N,) that each landmark is a static object."""
     from scipy.special import expit
 
+    return np.asarray(expit(static_odds(state)) * expit(chance_odds(state, gate)))
+
+
+def static_odds(state: State, fitted: int = 0) -> Floats:
+    """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
+    motion. fitted: as in `rest_odds`."""
     rates = detection_rates(state.history, state.label, len(state.unassigned))
-    by_rate = prior_odds(state) + rates.log_odds(state.history, state.label) + size_odds(state) + rest_odds(state)
-    return np.asarray(expit(by_rate) * expit(chance_odds(state, gate)))
+    by_rate = prior_odds(state) + rates.log_odds(state.history, state.label)
+    return np.asarray(by_rate + size_odds(state) + rest_odds(state, fitted))
 
 
 def chance_odds(state: State, gate: float) -> Floats:
@@ -137,16 +143,18 @@ def _no_stronger(number: Ints, label: Ints) -> Ints:
     return np.asarray(total[last] - total[first])
 
 
-def rest_odds(state: State) -> Floats:
+def rest_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
     the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes,
-    which looks like motion. So only a few rays count, and motion within the object's size does not count.
+    which looks like motion. So only a few rays count, and motion within the object's size does not count. fitted: the number
+    of measured coordinates that a moving point explains even by chance. They matter where rays are few.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]
     explained, way = velocity_gain(obs, state.assigned, state.owner, landmarks.position, landmarks.noise, stamps)
     size = 2.0 * np.clip(state.ray_count, 1, _COUNTED_RAYS)  # Each ray measures two coordinates.
-    odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * size * np.log(np.clip(1 - explained, 1e-6, 1.0))
+    left = np.clip(2.0 * state.ray_count - fitted, 0.0, size)
+    odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * left * np.log(np.clip(1 - explained, 1e-6, 1.0))
     return np.where(way > _WITHIN_SIZE * state.size, np.minimum(odds, 0.0), 0.0)

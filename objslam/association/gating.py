@@ -1,19 +1,22 @@
-"""Gate matches between rays and landmarks, and assign at most one ray of a frame to each landmark."""
+"""Gate matches between rays and landmarks, assign at most one ray of a frame to each landmark, and refine landmarks."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from objslam.association.landmarks import Landmarks
+from objslam.association.landmarks import Landmarks, State
 from objslam.association.observations import MIN_DEPTH, Observations
-from objslam.association.refinement import range_costs, variance
+from objslam.association.refinement import range_costs, refine, variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
 TRACK_GAIN = 2.0
 """The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
 trusts the tracker more."""
+_ALTERNATIONS = 3  # The most alternations after a change. A larger value converges further.
+_FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
@@ -210,3 +213,38 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
 def gate_limit(share: float) -> float:
     """Return the squared deviation (chi-squared, 2 degrees of freedom) below which a `share` of correct matches lies."""
     return float(-2 * np.log1p(-share))
+
+
+def alternate(
+    state: State,
+    gate: float,
+    plausible: Callable[[State], Bools],
+    times: int = _ALTERNATIONS,
+    unmatched: Callable[[State, Edges], Floats] | None = None,
+) -> State:
+    """Alternate between assignment and refinement until no ray changes its landmark, at most `times` times.
+
+    plausible: returns which landmarks (N,) stay. unmatched: returns the cost (E,) of a ray without a landmark, instead of
+    each match. Without it, this cost is the gate.
+    """
+    for _ in range(times):
+        obs, old, before = state.obs, state.landmarks, state.matched
+        edges = gated_edges(obs, old, gate)
+        most = gate
+        cost = edges.cost - track_bonus(edges, obs.track, before)
+        if unmatched is not None:
+            cost, most = cost - unmatched(state, edges), 0.0
+        matched = best_assignment(edges, cost, obs.frame, most)
+        held = np.flatnonzero(matched >= 0)
+        position = refine(obs, held, matched[held], old.position, old.noise)
+        state = State(obs, state.view, replace(old, position=position), matched)
+        stays = plausible(state)
+        state = replace(state, landmarks=replace(state.landmarks, noise=state.noise)).keep(stays)
+        if np.array_equal(matched, before):
+            break
+    return state
+
+
+def near(state: State) -> Bools:
+    """Return which landmarks (N,) are not so far away that only parallel rays meet there."""
+    return np.asarray((np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1))

@@ -10,14 +10,14 @@ import numpy as np
 
 from objslam import config
 from objslam.association.existence import chance_odds, existence
-from objslam.association.gating import best_assignment, gate_limit, gated_edges, track_bonus
+from objslam.association.gating import alternate, gate_limit, near
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
 from objslam.association.observations import observe
-from objslam.association.refinement import grouped_sums, refine
-from objslam.association.visibility import CameraFrames
+from objslam.association.refinement import grouped_sums
+from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_quantile
@@ -25,7 +25,6 @@ from objslam.core.types import Association, Keyframes, Rays
 
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
-_ALTERNATIONS = 3  # The most alternations of assignment and refinement after a change. A larger value converges further.
 _SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames. Later searches use other frames.
 _FRAMES = 12  # The fewest frames that a search uses. An object is where rays of several frames meet.
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
@@ -33,7 +32,6 @@ _MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits 
 _ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
-_FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
 
 
 @dataclass(frozen=True)
@@ -72,9 +70,7 @@ def associate_globally(
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
-    margins = settings.rays.border, settings.rays.border_share
-    camera = keyframes.camera[keyframe]
-    view = CameraFrames(keyframes.stamps[keyframe], cameras, camera, map_T_camera[keyframe], *margins)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
@@ -83,23 +79,27 @@ def associate_globally(
         landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
         state = replace(state, landmarks=landmarks, matched=association.object[ray])
         state = _alternate(task, state.keep(_plausible(task, state)))
+    refuted = np.zeros(len(ray), dtype=bool)
     for turn in range(_TURNS):
         before = state.count
         state = _alternate(task, _discover(task, state, turn, _PARALLAX), 2)
         state = _merge_round(task, state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS))
-        state = _drop(task, state, existence(state, task.gate))
+        kept = _drop(task, state, existence(state, task.gate))
+        refuted |= (state.matched >= 0) & (kept.matched < 0)
+        state = kept
         if state.count <= before:
             break
     state = _add_distant(task, state)
     for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
         merged = _merge_all(task, state)
         state, likely = _drop_all(task, merged)
+        refuted |= (merged.matched >= 0) & (state.matched < 0)
         if state.count == merged.count:
             break
     if settings.association.fuse_labels:
         landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
-    return _result(state, likely, ray)
+    return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])
 
 
 def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
@@ -142,26 +142,13 @@ def _add_distant(task: _Task, state: State) -> State:
     return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)
 
 
-def _alternate(task: _Task, state: State, times: int = _ALTERNATIONS) -> State:
-    """Alternate between assignment and refinement until no ray changes its landmark, at most `times` times."""
-    for _ in range(times):
-        obs, old, before = state.obs, state.landmarks, state.matched
-        edges = gated_edges(obs, old, task.gate)
-        matched = best_assignment(edges, edges.cost - track_bonus(edges, obs.track, before), obs.frame, task.gate)
-        held = np.flatnonzero(matched >= 0)
-        position = refine(obs, held, matched[held], old.position, old.noise)
-        state = State(obs, state.view, replace(old, position=position), matched)
-        plausible = _plausible(task, state)
-        state = replace(state, landmarks=replace(state.landmarks, noise=state.noise)).keep(plausible)
-        if np.array_equal(matched, before):
-            break
-    return state
+def _alternate(task: _Task, state: State, times: int = 3) -> State:
+    return alternate(state, task.gate, lambda now: _plausible(task, now), times)
 
 
 def _plausible(task: _Task, state: State) -> Bools:
     """Return which landmarks (N,) have enough rays and are not so far away that only parallel rays meet there."""
-    near = (np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1)
-    return np.asarray((state.ray_count >= task.settings.min_rays) & near)
+    return (state.ray_count >= task.settings.min_rays) & near(state)
 
 
 def _merge_round(task: _Task, state: State, across_labels: bool = False) -> State:

@@ -7,11 +7,13 @@ import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.association.refinement import grouped_sums
+from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.geometry import evenly_spread
 from objslam.core.object_map import SeenFrom
 from objslam.core.statistics import grouped_median, grouped_quantile, grouped_quantiles
+from objslam.core.types import Keyframes
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
 _USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
@@ -46,6 +48,14 @@ class CameraFrames:
         """Mean solid angle (sr) of a frame."""
         each = np.array([camera.solid_angle for camera in self.cameras])
         return float(each[self.camera].mean()) if len(self.camera) else 1.0
+
+
+def frames_of(
+    keyframes: Keyframes, order: Ints, cameras: tuple[Camera, ...], map_T_camera: Floats, settings: Settings
+) -> CameraFrames:
+    """Return keyframes in an order (K,) as observed frames. map_T_camera: (K, 4, 4) of the keyframes."""
+    poses, margins = map_T_camera[order], (settings.rays.border, settings.rays.border_share)
+    return CameraFrames(keyframes.stamps[order], cameras, keyframes.camera[order], poses, *margins)
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,10 @@ class AssociationSettings(Section):
     min_rays: Annotated[int, Field(ge=2)] = 3
     """Minimum number of rays of an object, because two rays of different things often intersect. One or two more rays are
     needed while the poses have not converged. A larger value finds fewer and more certain objects."""
+    few_rays: bool = True
+    """Search for objects with fewer rays than min_rays, in fixed mode with a localisation. Two rays, or one ray with a
+    depth, are enough where so few hardly meet by chance. The probability of such an object still has to reach
+    min_existence."""
     duplicate_distance: Positive = 1.0
     """Distance in m above which two objects of one label are never merged. A larger value merges more on a drifted path."""
     loop_evidence: Positive = 7.0

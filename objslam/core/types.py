@@ -275,13 +275,17 @@ class Association:
 
     object: (R,) index of the object, or -1. label: (N,) the label of each object, as an index into label_names of the rays.
     label_weights: (N, L) the share of each label among the boxes of each object, None if unknown. existence: (N,) the
-    probability that the object exists, None if unknown.
+    probability that the object exists, None if unknown. refuted: (R,) whether a ray belonged to an object that was dropped,
+    None if unknown. few_rays: (N,) whether the object was found by the search for objects with few rays, None without this
+    search.
     """
 
     object: Ints
     label: Ints
     label_weights: Floats | None = None
     existence: Floats | None = None
+    refuted: Bools | None = None
+    few_rays: Bools | None = None
 
     @property
     def count(self) -> int:

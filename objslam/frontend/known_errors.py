@@ -15,6 +15,9 @@ from objslam.errors import ConfigError
 from objslam.frontend.corrected_log import AXES, ODOMETRY, take_out
 from objslam.io.calibration_yaml import load_calibration
 
+COARSE = 0.3
+"""The noise of given poses, m, from which on they reveal no error of a camera. A robot at 1 to 2 m/s drives less than this
+during its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
 _CAMERA = ("clock", *AXES, "focal", "x", "y", "z")
 
 
@@ -44,8 +47,13 @@ def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
     """
     use = settings.calibration.use
     if settings.mode == "fixed":
-        return use is not False and localized
+        return localized and (use is True or (use == "auto" and not coarse(settings)))
     return odometry if use == "auto" else use
+
+
+def coarse(settings: Settings) -> bool:
+    """Return whether given poses err by so much that they reveal no error of a camera."""
+    return settings.localization.xy >= COARSE
 
 
 def possible(log: Log, settings: Settings) -> list[str]:

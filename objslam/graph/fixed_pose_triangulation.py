@@ -53,7 +53,8 @@ def _triangulate(
         settings.triangulation,
         seed=settings.seed,
         ranges=rays.range if np.isfinite(rays.range).any() else None,
-        range_sigma=rays.range_sigma,
+        range_sigma=np.hypot(rays.range_sigma, place),
         range_bias=rays.range_bias,
         position_sigma=place,
+        judged=association.few_rays,
     )

@@ -53,6 +53,9 @@ def solve(
             association, rounds = at.associate(), tuple[dict[str, int], ...]()
             progress("solve", 0, 0)
             estimate = at.solve(association, trace)
+            every_object = at.add_few(association, estimate)
+            if every_object.count > association.count:
+                association, estimate = every_object, at.solve(every_object, trace)
         else:
             at, association, estimate, rounds = calibrate_fixed(at, errors, ledger, progress, trace)
             keyframes, rays_of_keyframes = at.seen, at.rays_seen

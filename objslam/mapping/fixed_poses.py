@@ -75,6 +75,31 @@ class FixedPoses:
             seed=settings.seed,
         )
 
+    def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
+        """Add the objects that few rays show, if the poses are localised and the settings allow it.
+
+        estimate: of the objects, None if there are none. more: as in `associate`."""
+        from objslam.association.few_rays.additional_objects import add_few_ray_objects
+        from objslam.graph.fixed_pose_triangulation import pose_noise
+
+        settings = self.settings
+        if association.existence is None or not (settings.association.few_rays and self.frames.localized_every):
+            return association
+        sigma, place = pose_noise(self.rays, self.frames, settings)
+        placed = np.zeros((0, 3)) if estimate is None else np.where(estimate.solved[:, None], estimate.positions, np.nan)
+        return add_few_ray_objects(
+            self.rays,
+            self.frames,
+            self.cameras,
+            settings,
+            association,
+            placed,
+            map_T_camera=self.frames.map_T_camera,
+            sigma=np.hypot(sigma, more),
+            position_sigma=place,
+            seed=settings.seed,
+        )
+
     def solve(self, association: Association, trace: Trace | None, parameters: Parameters | None = None) -> Estimate:
         """Triangulate the objects of an association, and record a round. parameters: the shared errors that were removed."""
         from objslam.graph import batch_solver
@@ -135,6 +160,13 @@ def calibrate_fixed(
         ledger.warn(f"the shared errors still change after {_ROUNDS} rounds of association")
     now = at.without(errors, calibration.values)
     estimate = now.solve(association, trace, _parameters(calibration))
+    every_object = now.add_few(association, estimate, told)
+    if every_object.count > association.count:
+        association = every_object
+        estimate = now.solve(association, trace, _parameters(calibration))
+        placed = np.where(estimate.solved[:, None], estimate.positions, np.nan)
+        sensitivity = calibrate_at_poses(errors, association, placed, calibration.values, noise).sensitivity
+        found = replace(found, sensitivity=sensitivity)
     return now, association, _with_covariance(estimate, found), rounds
 
 

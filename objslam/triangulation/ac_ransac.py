@@ -48,13 +48,14 @@ def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[Poin
         better = objects & (nfa < log_nfa)
         return xp.where(better[bundle.index], agreeing, inlier), xp.where(better, nfa, log_nfa)
 
-    searched = indices_of((bundle.number > 2) & ~_within_noise(bundle, result.point))
+    fitting = _within_noise(bundle, result.point)
+    searched = indices_of((bundle.number > 2) & ~fitting)
     pair_point = xp.asarray(result.point, copy=True)
     pair_point[searched] = best_pair(bundle, searched, hypotheses, jitter)
     for candidate in (pair_point, _far_ahead(bundle)):
         inlier, log_nfa = improve(candidate, xp.ones_like(result.determined))
     alone = group_sum(as_type(inlier, log_nfa), bundle.index, len(log_nfa)) < 2
-    inlier |= alone[bundle.index]
+    inlier |= (alone | fitting)[bundle.index]  # With much noise, a subset may look better by chance.
     for _ in range(_MAX_ROUNDS):
         changed = group_sum(as_type(inlier != used, log_nfa), bundle.index, len(log_nfa)) > 0
         if not bool(changed.any()):

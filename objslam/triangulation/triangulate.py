@@ -63,13 +63,14 @@ def triangulate(
     range_sigma: ArrayLike | None = None,
     range_bias: ArrayLike = 0.0,
     position_sigma: float = 0.0,
+    judged: ArrayLike | None = None,
 ) -> Triangulation:
     """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
 
     An object is ok if at least 2 rays agree more closely than by chance, if their parallax and the relative precision meet
     the limits of the settings, and if the object lies ahead of most of these rays. A measured range replaces the parallax.
     Without `settings.consensus`, all rays are used, and chance is not judged. Ranges are fused only for an object whose rays
-    fail these limits, or for which one range is more precise than all rays. Other objects keep the position of Eq. 1,
+    fail these limits, or for which all ranges are more precise than all rays. Other objects keep the position of Eq. 1,
     because a range ends on the surface of an object and its rays meet inside. The result for an object does not depend on
     other objects or on ray order.
 
@@ -81,6 +82,8 @@ def triangulate(
         ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
         range_bias: (R,) or one number, m, the standard deviation of the error that all ranges of an object share.
         position_sigma: m, the noise of the origins along each axis.
+        judged: (N,) whether the association has found that the rays of an object do not meet by chance. Then few rays with
+            much noise can give an object that is ok.
     Raises:
         ValueError: the arrays do not fit together or are not finite.
         ConfigError: the device does not exist.
@@ -97,7 +100,8 @@ def triangulate(
         if not (shared[np.isfinite(known)] >= 0).all():
             raise ValueError("range_bias must be at least 0")
     with array_backend(settings.device, len(m) >= _LARGE) as backend:
-        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, known, spread, shared, backend)
+        given = known, spread, shared, np.broadcast_to(False if judged is None else np.asarray(judged, dtype=bool), count)
+        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, *given, backend)
 
 
 def _triangulate(
@@ -112,6 +116,7 @@ def _triangulate(
     ranges: Floats | None,
     range_sigma: Floats | None,
     range_bias: Floats | None,
+    judged: Bools,
     backend: Backend,
 ) -> Triangulation:
     """Triangulate rays that are already checked. The arguments are those of `triangulate`."""
@@ -120,7 +125,7 @@ def _triangulate(
     if settings.consensus:
         jitter = as_tensor(np.random.default_rng(seed).random(settings.hypotheses), backend)
         result, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, jitter)
-        by_chance = log_nfa >= 0
+        by_chance = (log_nfa >= 0) & ~as_tensor(judged, backend)
     else:
         use = xp.ones_like(bundle.index, dtype=xp.bool)
         result = minimise_distances(bundle)
@@ -141,8 +146,11 @@ def _triangulate(
         measured = as_tensor(np.where(ranges > 0, ranges, np.nan)[where], backend)
         fused, fused_covariance = spread_of.fuse_ranges(bundle, use, measured, spread, bias)
         ranged = xp.isfinite(measured)
-        one_range = spread_of.object_median(xp.hypot(spread, bias)[ranged], bundle.index[ranged], count)
-        taken = xp.isfinite(fused[:, 0]) & ~(carried & (spread_of.largest_sigma(covariance) <= one_range))
+        here = bundle.index[ranged]
+        spreads, biases = (spread_of.object_median(one[ranged], here, count) for one in (spread, bias))
+        number = xp.bincount(here, minlength=count).clip(min=1)
+        all_ranges = xp.hypot(spreads / number**0.5, biases)  # The mean of ranges keeps the error that they share.
+        taken = xp.isfinite(fused[:, 0]) & ~(carried & (spread_of.largest_sigma(covariance) <= all_ranges))
         point = xp.where(taken[:, None], fused, point)
         covariance = xp.where(taken[:, None, None], fused_covariance, covariance)
         gradient = xp.where(taken, xp.nan, gradient)

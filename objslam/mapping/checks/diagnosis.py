@@ -10,7 +10,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Ints
 from objslam.core.types import Log
 from objslam.errors import LogError
-from objslam.frontend.known_errors import estimates, possible
+from objslam.frontend.known_errors import coarse, estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes, check_stamps
 from objslam.mapping.checks.finding import Finding
@@ -99,7 +99,7 @@ def diagnose(
     if not any(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None):
         return Diagnosis(tuple(findings))
     part = bounded_part(log, settings)
-    if part.crowd > _CROWD:
+    if part.crowd > _CROWD or (settings.mode == "fixed" and coarse(settings)):
         return Diagnosis(tuple(findings))
     found = agreement(part, part.log, settings)
     trials: list[Trial] = []

@@ -1,0 +1,189 @@
+"""Find objects that few rays show, among the rays that the global association leaves over.
+
+The objects of the global association stay as they are. A new object needs no least number of rays: it has to be likelier
+than stray boxes that meet by chance.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam import config
+from objslam.association.existence import detection_rates, static_odds
+from objslam.association.few_rays.chance import Strays, chance_odds, unmatched_costs
+from objslam.association.few_rays.sparse_search import SparseSearch, discover_sparse
+from objslam.association.gating import alternate, gate_limit, near
+from objslam.association.landmarks import Landmarks, State
+from objslam.association.merging import close_pairs, merge_targets
+from objslam.association.observations import observe
+from objslam.association.visibility import frames_of
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera
+from objslam.core.types import Association, Keyframes, Rays
+
+_MOVING = 6
+"""The number of coordinates of a moving point: those of its position and of its velocity. So it explains any three rays."""
+_ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
+_TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
+_POWER = 0.4
+"""The power of the likelihood of strays in a probability. The boxes of near objects mix, so strays are less independent than
+they are taken to be. On simulated streets, 0.5 makes the probabilities as large as the shares of objects that are there. A
+larger power gives more certain objects. The least odds of an object stay 0 with any power."""
+_SAMPLE = 512  # The most rays of one label in a search, in whole frames. A larger number costs time squared.
+_PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
+
+
+def add_few_ray_objects(
+    rays: Rays,
+    keyframes: Keyframes,
+    cameras: tuple[Camera, ...],
+    settings: config.Settings,
+    association: Association,
+    positions: Floats,
+    *,
+    map_T_camera: Floats,
+    sigma: Floats,
+    position_sigma: float,
+    seed: int = 0,
+) -> Association:
+    """Return the association with the objects that few rays without an object show. They come after the other objects.
+
+    rays, keyframes: all observed frames and their rays. positions: (N, 3) m of the objects, NaN where unknown.
+    map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, position_sigma: m, the noise of the rays' angles and origins.
+    """
+    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
+    known = np.isfinite(positions).all(axis=1)
+    labels = len(rays.label_names)
+    held = Landmarks.new(positions[known], np.ones(known.sum()), association.label[known], labels)
+    state = State(obs, view, held, np.append(np.where(known, np.cumsum(known) - 1, -1), -1)[association.object[ray]])
+    state = replace(state, landmarks=replace(held, noise=state.noise))
+    free = association.object[ray] < 0
+    if association.refuted is not None:
+        free &= ~association.refuted[ray]
+    gate, least = gate_limit(settings.association.gate), settings.association.min_existence
+    few = _Few(state, np.flatnonzero(free), Strays.of(obs, view, labels), gate)
+    found = few.search(least, seed)
+    old, new = association.count, found.count
+    index = association.object.copy()
+    index[ray[few.free]] = np.where(found.matched < 0, -1, found.matched + old)
+    weights = found.label_count / np.maximum(found.ray_count, 1)[:, None]
+    before = association.label_weights, association.existence
+    return replace(
+        association,
+        object=index,
+        label=np.append(association.label, found.label),
+        label_weights=None if before[0] is None else np.concatenate([before[0], weights]),
+        existence=None if before[1] is None else np.append(before[1], few.existence(found)),
+        few_rays=np.arange(old + new) >= old,
+    )
+
+
+@dataclass(frozen=True)
+class _Few:
+    """A search for more landmarks beside known ones. free: (F,) the rays that may show others. strays: of all rays. gate:
+    the largest squared deviation of a match."""
+
+    known: State
+    free: Ints
+    strays: Strays
+    gate: float
+
+    def search(self, least: float, seed: int) -> State:
+        """Return the landmarks of the free rays whose probability to exist is not below `least`."""
+        labels, obs = len(self.known.unassigned), self.known.obs.take(self.free)
+        nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), labels)
+        found = State(obs, self.known.view, nothing, np.full(len(obs), -1, dtype=np.int64))
+        for turn in range(_TURNS):
+            before = found.count
+            found = self.settled(self.discover(found, np.random.default_rng([seed, turn])), 2)
+            found = self.dropped(self.merged(found), least)
+            if found.count <= before:
+                break
+        for _ in range(_ROUNDS):
+            before = found.count
+            found = self.dropped(self.settled(self.merged(found)), least)
+            if found.count == before:
+                break
+        return found
+
+    def discover(self, found: State, rng: np.random.Generator) -> State:
+        """Add landmarks where few unassigned rays of one label agree."""
+        obs, noise, landmarks = found.obs, self.known.class_noise, found.landmarks
+        strays = self.strays.take(self.free)
+        for label in np.flatnonzero(found.unassigned).tolist():
+            rays = _some_frames(obs.frame, np.flatnonzero((obs.label == label) & (found.matched < 0)), rng)
+            pool = obs.take(rays)
+            pool = replace(pool, sigma=pool.sigma * noise[label], position_sigma=pool.position_sigma * noise[label])
+            search = SparseSearch(strays.take(rays), float(found.unassigned[label]), self.gate, _PARALLAX, 0.0)
+            points = discover_sparse(pool, search)
+            new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
+            landmarks = landmarks.and_also(new)
+        return replace(found, landmarks=landmarks)
+
+    def settled(self, found: State, times: int = 3) -> State:
+        """Alternate between assignment and refinement."""
+        strays = self.strays.take(self.free)
+        return alternate(
+            found, self.gate, _plausible, times, lambda now, edges: unmatched_costs(now, edges, strays, self.gate)
+        )
+
+    def merged(self, found: State) -> State:
+        """Merge new landmarks that are one object. Drop those that are one object with a known landmark."""
+        every, known = self.joined(found), self.known.count
+        if every.count < 2:
+            return found
+        target = merge_targets(every, self.gate, across_labels=False)
+        taken = np.zeros(every.count, dtype=bool)
+        taken[target[:known]] = True
+        taken[known:] |= target[known:] < known
+        own = np.where(target >= known, target - known, np.arange(every.count) - known)[known:]
+        return found.merge(own).keep(~taken[known:][own == np.arange(found.count)])
+
+    def dropped(self, found: State, least: float) -> State:
+        """Drop landmarks until all others are likely enough to exist.
+
+        If two neighbours both fail, the one with more rays stays for one more turn. It may get rays of the other one.
+        """
+        while (failing := self.existence(found) < least).any():
+            number, label = found.ray_count, found.label
+            a, b = close_pairs(found, self.gate)
+            rivals = failing[a] & failing[b] & (label[a] == label[b])
+            keep = ~failing
+            keep[np.where(number[a] > number[b], a, b)[rivals]] = True
+            left = self.settled(found.keep(keep))
+            if left.count == found.count:
+                return self.settled(found.keep(~failing))
+            found = left
+        return found
+
+    def existence(self, found: State) -> Floats:
+        """Return the probability (N,) that each new landmark is a static object, and no strays that meet by chance."""
+        from scipy.special import expit
+
+        every = self.joined(found)
+        rates = detection_rates(every.history, every.label, len(every.unassigned))
+        odds = chance_odds(every, self.gate, self.strays, rates)
+        return np.asarray(expit(static_odds(every, fitted=_MOVING)) * expit(_POWER * odds))[self.known.count :]
+
+    def joined(self, found: State) -> State:
+        """Return the known landmarks, followed by the new ones."""
+        matched = self.known.matched.copy()
+        matched[self.free] = np.where(found.matched < 0, -1, found.matched + self.known.count)
+        return replace(self.known, landmarks=self.known.landmarks.and_also(found.landmarks), matched=matched)
+
+
+def _plausible(state: State) -> Bools:
+    """Return which landmarks (N,) have two rays or a range, and are near enough."""
+    ranged = np.bincount(state.owner, np.isfinite(state.obs.range[state.assigned]), state.count) > 0
+    return np.asarray(((state.ray_count > 1) | ranged) & near(state))
+
+
+def _some_frames(frame: Ints, rays: Ints, rng: np.random.Generator) -> Ints:
+    """Return the rays of a random part of the frames if there are more than `_SAMPLE` rays."""
+    if len(rays) <= _SAMPLE:
+        return rays
+    order = rng.permutation(np.unique(frame[rays]))
+    number = np.cumsum(np.bincount(frame[rays], minlength=int(frame[rays].max()) + 1)[order])
+    chosen = rays[np.isin(frame[rays], order[: max(int(np.searchsorted(number, _SAMPLE)), 2)])]
+    return chosen if len(chosen) <= _SAMPLE else np.sort(rng.permutation(chosen)[:_SAMPLE])

@@ -1,0 +1,285 @@
+"""Estimate how unlikely it is that the rays of a landmark meet by chance.
+
+Two explanations of the rays are compared: one object, or as many stray boxes. The strays are as frequent, and lie in the
+images and in range, as the boxes of the label in this log. The odds need no least number of rays. They are the score of a
+track in multiple hypothesis tracking (Blackman, IEEE AES Magazine 19, 2004), with the unknown position integrated out.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.association.existence import Rates
+from objslam.association.gating import Edges
+from objslam.association.landmarks import State
+from objslam.association.observations import Observations
+from objslam.association.refinement import grouped_sums, range_costs, variance
+from objslam.association.visibility import CameraFrames
+from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import grouped_median
+
+MOST_ODDS = 20.0
+"""The largest absolute log odds against chance. This limit only keeps them finite."""
+_BINS = 256
+"""The number of bins of a density along one coordinate. A larger number resolves narrower densities, and is slower."""
+_OUTSIDE = 1e-6
+"""The density of boxes where no box of the log is near. It only keeps logarithms finite."""
+_LOG_RANGE = 4.6
+"""The width of the uniform density of ln range if no range is known. It is a factor of 100 in range."""
+_WRONG_RANGE = 0.1
+"""The share of correct boxes with a wrong range. A larger share trusts ranges less."""
+_TRIED = 25
+"""The number of shares of strays, and of densities of objects, that are tried. A larger number is more exact."""
+_DENSITIES = (1e-4, 10.0)
+"""The limits of the factor on the density of objects that follows from the density of boxes. Objects do not lie everywhere
+where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
+_PRIOR_STRAYS = 1.0
+"""The number of strays of each label that are assumed beside those of the log. A larger number keeps fewer landmarks."""
+_LOOK = np.radians(2.0)
+"""The angle (rad) between two rays at their landmark from which on strays on them are independent. It is the least parallax
+of a position. A larger angle drops more of what moves, and of what is seen from nearly one place."""
+_PRIOR = 0.5
+"""The prior share of boxes that see an object. A larger share keeps more landmarks with few rays."""
+
+
+@dataclass(frozen=True)
+class _Density:
+    """The densities of the boxes of each label along one coordinate. low: of the first bin. width: of a bin. value:
+    (L, bins)."""
+
+    low: float
+    width: float
+    value: Floats
+
+    @classmethod
+    def of(cls, x: Floats, label: Ints, labels: int, noise: Floats, reach: float = 0.0) -> "_Density":
+        """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel. Values can reach `reach`.
+
+        Few boxes leave gaps between their kernels. So the fewer boxes lie in a kernel, the more a uniform density weighs.
+        """
+        pad = 2 * float(noise.max(initial=1e-6))
+        low, high = (float(x.min()) - pad, float(x.max()) + pad) if len(x) else (-pad, pad)
+        if reach:
+            low, high = min(low, -reach), max(high, reach)
+        width = (high - low) / _BINS
+        counts = np.bincount(label * _BINS + _bins(x, low, width), minlength=labels * _BINS).reshape(labels, _BINS)
+        number = counts.sum(axis=1)
+        value = np.empty((labels, _BINS))
+        for i, sigma in enumerate((noise / width).tolist()):
+            spread = _smoothed(counts[i], max(sigma, 0.5))
+            in_kernel = number[i] * min(2 * sigma / _BINS, 1.0)
+            value[i] = (spread * in_kernel / max(number[i], 1) + 1 / _BINS) / (1 + in_kernel)
+        return cls(low, width, value / value.sum(axis=1, keepdims=True) / width)
+
+    def at(self, x: Floats, label: Ints) -> Floats:
+        """Return the density at values x of any shape, among the boxes of labels of a shape that fits."""
+        inside = np.abs((x - self.low) / self.width - _BINS / 2) <= _BINS / 2
+        return np.where(inside, self.value[label, _bins(x, self.low, self.width)], _OUTSIDE)
+
+
+def _smoothed(counts: Ints, sigma: float) -> Floats:
+    """Return counts (n,) spread by a Gaussian kernel with a standard deviation of `sigma` bins."""
+    half = min(int(4 * sigma) + 1, len(counts))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
+    return np.asarray(np.convolve(np.pad(counts.astype(np.float64), half, "edge"), kernel / kernel.sum(), "valid"))
+
+
+def _bins(x: Floats, low: float, width: float) -> Ints:
+    return np.clip((x - low) / width, 0, _BINS - 1).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Strays:
+    """The density of stray boxes.
+
+    image: (R,) sr^-1, the density of the boxes of a ray's label in the image at the ray. frames: the number of frames.
+    log_range: the densities of ln range, None if no ray has a range. ranged: (L,) the share of boxes with a range.
+    """
+
+    image: Floats
+    frames: int
+    log_range: _Density | None
+    ranged: Floats
+
+    @classmethod
+    def of(cls, obs: Observations, view: CameraFrames, labels: int) -> "Strays":
+        """Estimate the density from all boxes of the log.
+
+        The coordinates in the image are the angle about the vertical axis of the camera and the sine of the angle to its
+        horizontal plane. Equal areas are equal solid angles. The coordinates are taken as independent, so boxes that all lie
+        in one row need no rule of their own.
+        """
+        x, y, z = np.einsum("rji,rj->ir", view.map_T_camera[obs.frame, :3, :3], obs.direction)
+        known = np.flatnonzero(np.isfinite(obs.range))
+        angle = obs.sigma.copy()
+        angle[known] = np.hypot(angle[known], obs.position_sigma / obs.range[known])
+        noise = np.nan_to_num(grouped_median(angle, obs.label, labels))
+        wide = min(max(camera.view_angle for camera in view.cameras), np.pi)
+        columns = (np.arctan2(x, z), wide), (y, min(view.solid_angle / (4 * wide), 1.0))
+        image = np.ones(len(obs))
+        for column, reach in columns:
+            image *= _Density.of(column, obs.label, labels, noise, reach).at(column, obs.label)
+        if not len(known):
+            return cls(image, len(view.camera), None, np.zeros(labels))
+        noise = np.nan_to_num(grouped_median(obs.range_sigma[known] / obs.range[known], obs.label[known], labels))
+        log_range = _Density.of(np.log(obs.range[known]), obs.label[known], labels, noise)
+        each = np.maximum(np.bincount(obs.label, minlength=labels), 1)
+        return cls(image, len(view.camera), log_range, np.bincount(obs.label[known], minlength=labels) / each)
+
+    def take(self, rays: Ints) -> "Strays":
+        """Select rays."""
+        return replace(self, image=self.image[rays])
+
+    def per_frame(self, number: Floats | float) -> Floats:
+        """Return the mean number of strays in a frame. At least one stray is taken to be in the log."""
+        return np.asarray(np.maximum(number, 1.0) / max(self.frames, 1))
+
+    def along(self, distance: Floats, label: Ints) -> Floats:
+        """Return the density, m^-1, of distances (E,) m at which there are boxes of a label (E,)."""
+        anywhere = 1 / _LOG_RANGE
+        if self.log_range is None:
+            return anywhere / distance
+        share = self.ranged[label]
+        return (share * self.log_range.at(np.log(distance), label) + (1 - share) * anywhere) / distance
+
+
+def ray_odds(
+    obs: Observations,
+    strays: Strays,
+    number: Floats | float,
+    off2: Floats,
+    distance: Floats,
+    noise: Floats | float,
+    gate: float,
+) -> tuple[Floats, Floats]:
+    """Return the log odds (..., R) that each ray sees its point over being stray, and the density of strays, m^-2.
+
+    number: (..., R) strays of the label in the log. off2, distance: (..., R) m^2, m, of the point from the ray and from the
+    camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs no more.
+    """
+    spread = noise**2 * ((obs.sigma * distance) ** 2 + obs.position_sigma**2)
+    density = strays.per_frame(number) * strays.image / distance**2
+    odds = -0.5 * np.minimum(off2 / spread, gate) - np.log(2 * np.pi * spread * density)
+    ranged = np.flatnonzero(np.isfinite(obs.range))
+    if len(ranged):
+        told, sigma = obs.range[ranged], obs.range_sigma[ranged]
+        away = distance[..., ranged]
+        fit = np.exp(-0.5 * ((away - told) / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
+        chance = strays.along(told, obs.label[ranged])
+        wrong = _WRONG_RANGE * np.minimum(strays.along(away, obs.label[ranged]) * away * _LOG_RANGE, 1.0)
+        odds[..., ranged] += np.log((1 - _WRONG_RANGE) * fit / chance + wrong)
+    return odds, density
+
+
+def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> Floats:
+    """Return the cost (E,) of a ray without a landmark, instead of each match.
+
+    It is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most `gate`.
+    So it matters only where strays are dense compared with the noise of the rays. Boxes within the gate of the landmark do
+    not count as strays.
+    """
+    obs, noise = state.obs.take(edges.ray), state.landmarks.noise[edges.landmark]
+    distance = np.linalg.norm(state.landmarks.position[edges.landmark] - obs.origin, axis=1)
+    near = np.bincount(edges.landmark[state.matched[edges.ray] < 0], minlength=state.count)
+    number = np.maximum(state.unassigned[obs.label] - near[edges.landmark], 1.0)
+    odds, _ = ray_odds(obs, strays.take(edges.ray), number, np.zeros(len(distance)), distance, noise, gate)
+    return np.clip(2 * odds + range_costs(obs, distance), 0.0, gate)
+
+
+def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
+    """Return the log odds (N,) of one object over stray boxes, from the rays of each landmark. Misses do not count.
+
+    One object: its position x is anywhere where boxes of its label are, and p(rays) = int p(x) prod p(ray | x) dx by
+    Laplace's method. Strays: each box has the density of the label's strays.
+    """
+    total, label = _evidence(state, gate, strays, rates), state.label
+    share, density = _likeliest(total, _looks(state), label, *_expected(state, rates))
+    return np.clip(total + np.log(density[label]) - _looks(state) * np.log(share[label]), -MOST_ODDS, MOST_ODDS)
+
+
+def _evidence(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
+    """Return the log odds (N,) of each landmark if all boxes of its label may be strays."""
+    held, owner, label = state.assigned, state.owner, state.label
+    obs, distance = state.obs.take(held), np.maximum(state.distance, 1e-3)
+    off2 = state.deviation**2 * variance(obs, distance, 1.0)
+    boxes = state.label_count.sum(axis=0) + state.unassigned
+    odds, _ = ray_odds(obs, strays.take(held), boxes[label][owner], off2, distance, state.landmarks.noise[owner], gate)
+    looks = _looks(state) / np.maximum(state.ray_count, 1)
+    return np.asarray(looks * np.bincount(owner, odds, state.count) - log_places(state, strays, rates))
+
+
+def _looks(state: State) -> Floats:
+    """Return the number (N,) of independent looks at each landmark.
+
+    Strays from nearly one place are often one thing: an error that the detector repeats in the next image, or an object
+    that moves slowly. So a ray counts by the angle between it and the ray before it, seen from the landmark, up to 1.
+    """
+    order = np.lexsort((state.obs.frame[state.assigned], state.owner))
+    owner = state.owner[order]
+    to = state.landmarks.position[owner] - state.obs.origin[state.assigned[order]]
+    to = to / np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-9)
+    turn = np.linalg.norm(np.diff(to, axis=0, prepend=to[:1]), axis=1)
+    counted = np.where(np.diff(owner, prepend=-1) != 0, 1.0, np.minimum(turn / _LOOK, 1.0))
+    return np.asarray(np.bincount(owner, counted, state.count).astype(np.float64))
+
+
+def _expected(state: State, rates: Rates) -> tuple[Ints, Floats]:
+    """Return the number (L,) of boxes of each label, and the number of objects (L,) that would give these boxes."""
+    boxes = np.asarray(state.label_count.sum(axis=0) + state.unassigned)
+    landmarks = np.maximum(np.bincount(state.label, minlength=len(boxes)), 1)
+    looks = rates.mean * np.bincount(state.label, state.history.expected, len(boxes)) / landmarks
+    return boxes, np.asarray(_PRIOR * boxes / np.maximum(looks, 1.0))
+
+
+def _likeliest(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: Floats) -> tuple[Floats, Floats]:
+    """Return the share (L,) of the boxes of each label that are stray, and the factor (L,) on the density of its objects.
+
+    Strays and objects are Poisson distributed, with c n of the n boxes and m times the nominal number of objects. Then the
+    likelihood is c^n exp(-c n - m objects), times 1 + m o c^-k for each landmark with k rays and the odds o at c = m = 1.
+    odds, number, label: (N,). boxes, objects: (L,), the nominal numbers of boxes and objects.
+    """
+    log_share, log_density = np.log(np.geomspace(1e-4, 1.0, _TRIED)), np.log(np.geomspace(*_DENSITIES, _TRIED))
+    grid = np.zeros((len(boxes), _TRIED, _TRIED))
+    for j in np.flatnonzero(boxes).tolist():
+        mine = label == j
+        gain = odds[mine, None] - number[mine, None] * log_share
+        grid[j] = [np.logaddexp(0.0, gain + m).sum(axis=0) for m in log_density]
+    grid += boxes[:, None, None] * (log_share - np.exp(log_share)) + _PRIOR_STRAYS * log_share
+    grid -= objects[:, None, None] * np.exp(log_density)[:, None]
+    density, share = np.unravel_index(grid.reshape(len(boxes), -1).argmax(axis=1), (_TRIED, _TRIED))
+    return np.exp(log_share[share]), np.exp(log_density[density])
+
+
+def log_places(state: State, strays: Strays, rates: Rates) -> Floats:
+    """Return ln of the number (N,) of places that each landmark could have been at.
+
+    It is the volume in which its rays leave its position, against the density of objects. This density is taken from the
+    boxes at its rays: each object is detected in a frame with the rate of its class.
+    """
+    held, owner, label = state.assigned, state.owner, state.label
+    distance = np.maximum(state.distance, 1e-3)
+    boxes = state.label_count.sum(axis=0) + state.unassigned
+    density = strays.per_frame(boxes[label][owner]) * strays.image[held] / distance**2
+    density = density * strays.along(distance, label[owner])
+    number = np.maximum(state.ray_count, 1)
+    objects = _PRIOR / rates.mean[label] * np.bincount(owner, density, state.count) / number
+    return np.asarray(-np.log(np.maximum(objects, 1e-300)) - _volume(state))
+
+
+def log_volume(information: Floats, distance: Floats) -> Floats:
+    """Return ln of the volume (N,) m^3 of a position with this information (N, 3, 3) m^-2. It is never longer than the
+    distance (N,) m from the cameras."""
+    least = 1 / np.maximum(distance, 1e-3) ** 2
+    eigen = np.maximum(np.linalg.eigvalsh(information), least[:, None])
+    return np.asarray(1.5 * np.log(2 * np.pi) - 0.5 * np.log(eigen).sum(axis=1))
+
+
+def _volume(state: State) -> Floats:
+    obs, held, owner = state.obs, state.assigned, state.owner
+    to = state.landmarks.position[owner] - obs.origin[held]
+    to = to / np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-9)
+    along = to[:, :, None] * to[:, None, :]
+    weight = np.nan_to_num(1 / obs.range_sigma[held] ** 2)
+    each = (np.eye(3) - along) / state.variance[:, None, None] + weight[:, None, None] * along
+    information = grouped_sums(each.reshape(-1, 9), owner, state.count).reshape(-1, 3, 3)
+    return log_volume(information, np.bincount(owner, state.distance, state.count) / np.maximum(state.ray_count, 1))
