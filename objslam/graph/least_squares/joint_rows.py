@@ -221,9 +221,7 @@ def _steps(measured: Measurements) -> Ints:
     return np.flatnonzero(measured.keyframes.measured)
 
 
-def _pattern(
-    measured: Measurements, rays: Rays, landmark: Ints, landmarks: int, squares: SquareRows
-) -> tuple[Ints, Ints]:
+def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: int, squares: SquareRows) -> tuple[Ints, Ints]:
     """Return the columns of all entries of the Jacobian, row by row, and the first entry of each row."""
     first_pose = 3 * landmarks
     on_landmark = 3 * landmark[:, None] + np.arange(3)
