@@ -87,7 +87,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
         return ray[ahead], index[ahead]
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
     turn, move = np.zeros((2, len(obs.label)))
-    if pose is not None:  # Whatever rotation and position correlate, twice their own blocks bound the covariance.
+    if pose is not None:  # Twice its diagonal blocks bound it, however strongly both are correlated.
         turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
     centre = obs.origin.mean(axis=0)

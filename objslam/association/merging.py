@@ -145,8 +145,8 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
 
 
 def _ray_costs(r: Observations, position: Floats, noise: Floats, gate: float) -> Floats:
-    """Return -2 ln likelihood (R,) of each ray for its point, up to a constant. It is at most `gate`, as without a
-    landmark."""
+    """Return -2 ln likelihood (R,) of each ray for its point, up to a constant. It is at most `gate`, the cost of
+    a ray without a landmark."""
     off2, distance = squared_offsets(r, position)
     return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise) + range_costs(r, distance), gate)
 

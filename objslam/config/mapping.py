@@ -140,8 +140,8 @@ class Bodies(Section):
     """Configure the bodies of objects: upright ellipsoids that fit the edges of their boxes."""
 
     use: bool = True
-    """Give each object the body that its boxes carry. Its position is then the centre of the body. Without bodies, the
-    position is the point at which the rays through the box centres meet."""
+    """Give each object a body if its boxes show one. Its position is then the centre of the body. Otherwise, the position
+    is the point at which the rays through the box centres meet."""
     sizes: dict[str, tuple[Positive, Positive, Positive]] = Field(default_factory=dict)
     """Known length, width and height in m by label. The sizes of other labels are learnt from the log."""
 

@@ -18,8 +18,8 @@ class Noise(Section):
     rays: Estimated = "auto"
     """rays.pixel_sigma and rays.box_sigma, with one common factor."""
     ranges: Estimated = "auto"
-    """depth.sigma and depth.sigma_per_m, with one common factor, and depth.bias, with a factor of its own. auto does not
-    estimate it if a camera has its own depth_noise."""
+    """depth.sigma and depth.sigma_per_m, with one common factor, and depth.bias, with a factor of its own. auto
+    estimates none of them if a camera has its own depth_noise."""
     odometry: Estimated = "auto"
     """the noise of the odometry along, across and in turning, with a factor for each."""
     prior: Positive = 10.0

@@ -86,7 +86,7 @@ class PathScores:
     errors: Floats  # The translation errors (N,) in m after the alignment of the path.
     errors_with_map: Floats | None  # Errors (N,) in m after the alignment of the objects; None if no true objects exist.
     outside: int  # The number of timestamps without a true pose.
-    transform: Transform  # The alignment of the path.
+    transform: Transform  # The alignment of the path with the truth, from map to truth.
 
 
 @dataclass(frozen=True)

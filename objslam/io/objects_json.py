@@ -206,14 +206,14 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
             raise _Malformed("ray must have an origin and a direction")
         ray = (_vector(ray.get("origin"), "ray.origin"), _vector(ray.get("direction"), "ray.direction"))
         if not valid_positions(ray[0]) or not abs(float(np.linalg.norm(ray[1])) - 1) < _UNIT:
-            raise _Malformed(f"ray must have an origin below {MAX_POSITION:g} m and a direction of length 1")
+            raise _Malformed(f"ray must have an origin within {MAX_POSITION:g} m of 0 and a direction of length 1")
     if labels is not None:
         if not isinstance(labels, dict):
             raise _Malformed("labels must be a mapping of labels to shares")
         labels = {_text(name, "a name in labels"): _number(share, "a share in labels") for name, share in labels.items()}
     position = _vector(entry.get("position"), "position", null=status == "unresolved")
     if status == "ok" and not valid_positions(position):
-        raise _Malformed(f"position is not below {MAX_POSITION:g} m")
+        raise _Malformed(f"position is not within {MAX_POSITION:g} m of 0")
     return MapObject(
         id=_integer(entry, "id"),
         label=_text(entry.get("label"), "label"),
@@ -303,7 +303,7 @@ def _life(value: Any) -> Life:
         raise _Malformed("the counts of life must not be below 0")
     place = None if moved is None else _vector(moved, "life.moved_from")
     if place is not None and not valid_positions(place):
-        raise _Malformed(f"life.moved_from is not below {MAX_POSITION:g} m")
+        raise _Malformed(f"life.moved_from is not within {MAX_POSITION:g} m of 0")
     return Life(state, probability, **counts, updated=_stamp(value, "updated"), moved_from=place)
 
 

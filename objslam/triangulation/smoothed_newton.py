@@ -1,4 +1,7 @@
-"""Solve Eq. 1 where lines pass through or near the solution: smoothed distances first, then the exact optimum."""
+"""Find the point closest to all lines (Eq. 1 of Staszak and Belter) where lines pass through or near this point.
+
+Smoothed distances are minimised first, and then the distances themselves.
+"""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ class _Few:
         return found
 
     def existence(self, found: State) -> Floats:
-        """Return the probability (N,) that each new landmark is a static object, and no strays that meet by chance."""
+        """Return the probability (N,) that each new landmark is a static object, and not strays that meet by chance."""
         from scipy.special import expit
 
         every = self.joined(found)

@@ -76,7 +76,7 @@ class InnerSolve(Linearised):
         return state
 
     def _damped(self) -> Self:
-        """Return the state after iterations of Levenberg-Marquardt."""
+        """Return the state after at most `_INNER` iterations of Levenberg-Marquardt."""
         landmarks = self.landmarks
         graph, values = self.measured.whole(self.association.object, self.used, self.map_T_camera, self.positions)
         found = levenberg_marquardt(graph, values, _INNER, _TOLERANCE).values

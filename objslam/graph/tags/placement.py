@@ -18,8 +18,8 @@ _VIEWS = 64
 _STEPS, _STEPS_LAST = 6, 15
 """The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
 _TOLD = 4.0
-"""The least information about the logarithm of an unknown side: 1 / 0.5^2. With more, fewer fiducials of unknown size have a
-pose."""
+"""The least information about the logarithm of an unknown side: 1 / 0.5^2. A larger value gives fewer fiducials of unknown
+size a pose."""
 _SAME = np.radians(3.0)
 """The largest angle (rad) between two poses that count as one. With a larger angle, more fiducials have a single pose."""
 _CLEARLY = 1.0
@@ -29,10 +29,10 @@ A decrease by 1 means odds of e^(1/2). A larger value leaves more fiducials wher
 
 @dataclass(frozen=True)
 class Placement:
-    """T fiducials at given camera poses, each with a second pose.
+    """The best pose of each of T fiducials for given camera poses, and a second one.
 
-    best, other: the square of each. cost, other_cost: (T,), Cauchy's loss. The cost of a fiducial without a pose, or without
-    a second one, is infinite. information: (T, 7, 7) of the best, as in `square_fit.fit`.
+    best, other: the squares at these poses. cost, other_cost: (T,), Cauchy's loss, infinite for a fiducial without that
+    pose. information: (T, 7, 7) of the best, as in `square_fit.fit`.
     """
 
     best: Squares

@@ -14,7 +14,7 @@ from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
 
-_MOUNTS = 4096  # The mounts that are kept for each camera. With more, frames may arrive later. More cost memory.
+_MOUNTS = 4096  # The mounts that are kept for each camera. With a larger number, frames may arrive later. It costs memory.
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from objslam.live.mapper.state import MapState
 
 _NEWEST = 1 / 3  # The newest keyframes that stay, as a share of live.max_keyframes. A larger share removes more old ones.
 _OLDEST = 1 / 30  # The oldest keyframes that stay, as a share of live.max_keyframes. They tie the map to its start.
-_SHARE = 0.25  # The share of live.max_keyframes that one culling removes. With more, culling is rarer and takes longer.
-_AGAIN = 0.1  # The new keyframes before the next culling, as a share of live.max_keyframes. With more, culling is rarer.
+_SHARE = 0.25  # The share of live.max_keyframes that one culling removes. A larger share makes culling rarer and longer.
+_AGAIN = 0.1  # New keyframes before the next culling, as a share of live.max_keyframes. A larger share culls less often.
 _ENOUGH = 10  # The rays that every landmark keeps. A larger number keeps more keyframes and more certain landmarks.
 _LEAST = 3  # The rays that every landmark keeps if too many keyframes stay (_CROWDED). Three rays still fix a position.
 _CROWDED = 1.2  # If _ENOUGH keeps more than this times live.max_keyframes, _LEAST applies. A larger value costs memory.

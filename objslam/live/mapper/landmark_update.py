@@ -14,7 +14,7 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
 _JUMP = np.radians(2.0)  # The residual (rad) above which the graph relinearises soon. A larger one relinearises more rarely.
-_TRACKS = 4096  # The detector tracks whose landmark is stored. With more, a track id is known after a longer absence.
+_TRACKS = 4096  # The detector tracks whose landmark is stored. A larger number knows a track id after a longer absence.
 
 
 @dataclass(frozen=True)

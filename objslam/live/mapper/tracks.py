@@ -13,7 +13,7 @@ from objslam.graph.isam2 import IncrementalGraph
 
 _DEPTH = 2.5  # The first guess of a track's distance (m) without a range: about the middle of a room.
 _DEPTH_SIGMA = 2.0  # The prior's sigma (m) of a track along its last ray. With a larger one, rays move the track more.
-_DAMPING = 1e-3  # The prior's information (m^-2) in all directions. With more, rays move the track less.
+_DAMPING = 1e-3  # The prior's information (m^-2) in all directions. With a larger value, rays move the track less.
 _STEPS = 3  # The Gauss-Newton steps from a track's previous position, which is near. More steps take longer in every frame.
 _RECENT = 30  # The newest rays that define a track's position. More rays average noise better, but span more drift.
 _LONGEST = 200  # The most rays of a track. Above it, every second ray of the older half goes. More cost memory and time.

@@ -1,4 +1,4 @@
-"""Find boxes of another recording in a log: nearly all boxes of a frame fit, or hardly any."""
+"""Detect that a log mixes frames of two recordings: in some frames nearly all boxes fit, in others hardly any."""
 
 import numpy as np
 
