@@ -29,14 +29,16 @@ _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed to
 _MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end earlier if the agreement stops growing.
 
 
-def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[PointSolution, Tensor, Tensor]:
+def fit_consensus(
+    bundle: Bundle, hypotheses: int, jitter: Tensor, judged: Tensor | None = None
+) -> tuple[PointSolution, Tensor, Tensor]:
     """Solve Eq. 1 for each object on its agreeing rays. Return the solutions, the agreeing rays (R,) and the log NFA (N,).
 
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
     far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
     within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
-    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. hypotheses, jitter: for
-    `best_pair`.
+    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. So does a `judged` (N,)
+    object, whose rays do not meet by chance, if all agree within noise. hypotheses, jitter: for `best_pair`.
     """
     xp = module_of(bundle.origin)
     used = xp.ones_like(bundle.index, dtype=xp.bool)
@@ -55,7 +57,8 @@ def fit_consensus(bundle: Bundle, hypotheses: int, jitter: Tensor) -> tuple[Poin
     for candidate in (pair_point, _far_ahead(bundle)):
         inlier, log_nfa = improve(candidate, xp.ones_like(result.determined))
     alone = group_sum(as_type(inlier, log_nfa), bundle.index, len(log_nfa)) < 2
-    inlier |= (alone | fitting)[bundle.index]  # With much noise, a subset may look better by chance.
+    whole = alone if judged is None else alone | (fitting & judged)  # A part of few noisy rays may look better by chance.
+    inlier |= whole[bundle.index]
     for _ in range(_MAX_ROUNDS):
         changed = group_sum(as_type(inlier != used, log_nfa), bundle.index, len(log_nfa)) > 0
         if not bool(changed.any()):

@@ -124,8 +124,9 @@ def _triangulate(
     xp = module_of(base)
     if settings.consensus:
         jitter = as_tensor(np.random.default_rng(seed).random(settings.hypotheses), backend)
-        result, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, jitter)
-        by_chance = (log_nfa >= 0) & ~as_tensor(judged, backend)
+        sure = as_tensor(judged, backend)
+        result, use, log_nfa = ac_ransac.fit_consensus(bundle, settings.hypotheses, jitter, sure)
+        by_chance = (log_nfa >= 0) & ~sure
     else:
         use = xp.ones_like(bundle.index, dtype=xp.bool)
         result = minimise_distances(bundle)
