@@ -71,6 +71,7 @@ def run(
                 say(diagnosis, ledger)
         if diagnosis.certain and settings.mode == "joint":
             ledger.warn("the poses stay as they are, because no solve corrects wrong input")
+            diagnosis = diagnosis.proven()  # No joint solve will test the other findings.
             settings = settings.model_copy(update={"mode": "fixed"})
         frames = build_keyframes(log, settings, ledger)
         if settings.mode == "fixed" and not frames.localized_every and not diagnosis.certain:

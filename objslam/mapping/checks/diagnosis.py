@@ -73,6 +73,10 @@ class Diagnosis:
         """Whether the log itself shows that the input is wrong, so that no solve can refute it."""
         return any(finding.spoils and finding.basis == "log" for finding in self.findings)
 
+    def proven(self) -> Self:
+        """Return the diagnosis with only the findings that the log itself shows."""
+        return replace(self, findings=tuple(finding for finding in self.findings if finding.basis == "log"))
+
     @property
     def refutable(self) -> bool:
         """Whether a solve that explains the boxes may refute one of the findings."""
