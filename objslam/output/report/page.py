@@ -15,12 +15,12 @@ import numpy as np
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.bodies.body import UNKNOWN_YAW
 from objslam.core.types import Images
+from objslam.core.validity import is_date
 from objslam.errors import ConfigError, OutputError, printable
 from objslam.evaluation.alignment import lay_truth
 from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
-from objslam.output.plot.style import is_date
 from objslam.output.report.cards import make_cards
 from objslam.output.report.charts import histogram
 from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of
