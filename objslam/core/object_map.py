@@ -165,8 +165,8 @@ class ObjectMap:
         return replace(self, objects=self.objects[index]) if isinstance(index, slice) else self.objects[index]
 
     def __repr__(self) -> str:
-        lost = len(self) - len(self.resolved())
-        head = f"ObjectMap of {len(self)} objects ({lost} unresolved) in the frame {self.frame!r}"
+        lost, plural = len(self) - len(self.resolved()), "" if len(self) == 1 else "s"
+        head = f"ObjectMap of {len(self)} object{plural} ({lost} unresolved) in the frame {self.frame!r}"
         more = [f"  ... and {len(self) - _SHOWN} more"] if len(self) > _SHOWN else []
         return "\n".join([head, *(f"  {o}" for o in self.objects[:_SHOWN]), *more])
 

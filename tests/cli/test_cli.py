@@ -118,7 +118,7 @@ def test_the_console_script_runs_evaluates_and_leaves_a_whole_result(log_folder,
     run = in_process_of_its_own("run", log_folder, "-o", out, "--set", "calibration.use=false")
     assert run.code == 0, run.err
     assert "tall chair" in run.out
-    assert "4 objects (0 unresolved)" in run.out
+    assert "4 objects from" in run.out
     names = {
         "objects.json",
         "trajectory.txt",
