@@ -13,11 +13,13 @@ from objslam.core.rotation import skew
 
 NUMBERS = 7
 """The numbers of a shared error: a shift (3), a rotation vector (3), and the logarithm of a size."""
+SIZE = 6
+"""The place of the size in a shared error."""
 _FEWEST = 3
 """The least number of objects with a shared error. Two objects do not tell a turn about their line."""
 _FLOOR = 1e-3
-"""The least standard deviation (m) of an object's own error in the estimate of the shared one. A larger value keeps the
-linear system better conditioned. This value is far below the errors of real maps."""
+"""The least standard deviation (m) of an object's own error. A larger value keeps linear systems better conditioned, and
+takes less of exact maps as shared. This value is far below the errors of real maps."""
 _INDEFINITE = 1e-10
 """The least eigenvalue of the information about the shared error, relative to the largest one, with lengths in units of the
 map's extent. Directions below it have no shared error. A larger value leaves out more directions."""
@@ -49,7 +51,7 @@ def shared_covariance(points: Floats, covariance: Floats, factor: Floats) -> Flo
     extent = float(max(np.sqrt(((points - centre) ** 2).sum(axis=1).mean()), _FLOOR))
     scale = np.array([1.0] * 3 + [1 / extent] * 4)
     lever = jacobian(points - centre) * scale
-    own = own_part(covariance, factor) + _FLOOR**2 * np.eye(3)
+    own = own_part(covariance, factor)
     told = np.swapaxes(np.linalg.solve(own, np.concatenate([lever, factor], axis=2)), 1, 2)
     both = np.einsum("nki,nil->kl", told, np.concatenate([lever, factor], axis=2))
     alone, across, between = both[:NUMBERS, :NUMBERS], both[:NUMBERS, NUMBERS:], both[NUMBERS:, NUMBERS:]
@@ -83,7 +85,7 @@ def root_of(shared: Floats) -> Floats:
 
 
 def own_part(covariance: Floats, factor: Floats) -> Floats:
-    """Return the covariances (N, 3, 3), m^2, without the part of a factor (N, 3, m), m, which is at least 0."""
+    """Return the covariances (N, 3, 3), m^2, without the part of a factor (N, 3, m), m. They are at least `_FLOOR`^2."""
     own = covariance - factor @ np.swapaxes(factor, 1, 2)
     size, axes = np.linalg.eigh((own + np.swapaxes(own, 1, 2)) / 2)
-    return np.asarray((axes * np.maximum(size, 0.0)[:, None, :]) @ np.swapaxes(axes, 1, 2))
+    return np.asarray((axes * np.maximum(size, _FLOOR**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))

@@ -7,7 +7,7 @@ import numpy as np
 
 from objslam.association.registration.joint_frames import JointFrames, Measured
 from objslam.core.arrays import Floats
-from objslam.core.maps.shared_covariance import NUMBERS, jacobian, own_part, root_of
+from objslam.core.maps.shared_covariance import NUMBERS, SIZE, jacobian, own_part, root_of, shared_covariance
 from objslam.core.object_map import MapObject
 
 Row = tuple[int, int, MapObject]
@@ -32,9 +32,9 @@ def measured_objects(rows: list[Row], shared: Sequence[Floats | None]) -> Measur
 def site_covariances(solved: JointFrames, rows: list[Row], shared: Sequence[Floats | None]) -> tuple[Floats, Floats]:
     """Return the covariances (N, 3, 3) m^2 of the tracks, and their correlated part as a factor (N, 3, m) m.
 
-    Errors repeat from session to session: those of an object's boxes, and those of a robot's odometry. Many sessions do not
-    average them out. So an object's own errors are at least those of the best session, and so are the shared errors of
-    all objects together.
+    Errors repeat from session to session: those of an object's boxes, and the scale of a robot's odometry. Many sessions do
+    not average them out. So the own error of an object is at least that of the session that knew it best, and the size of
+    the site is at least as uncertain as in the session that knew it best.
     """
     measured = measured_objects([(s, k, replace(o, life=None)) for s, k, o in rows], shared)
     assert measured.roots is not None
@@ -46,9 +46,10 @@ def site_covariances(solved: JointFrames, rows: list[Row], shared: Sequence[Floa
     least = rotation @ own[best] @ np.swapaxes(rotation, 1, 2)
     enough = np.trace(solved.own, axis1=1, axis2=2) >= size[best]
     alone = np.where(enough[:, None, None], solved.own, least)
-    count = len(solved.site_T_map)
-    moves = jacobian(measured.position) @ measured.roots[maps]
-    before = np.bincount(maps, (moves**2).sum(axis=(1, 2)), count)
-    after = np.bincount(maps, (solved.correlated**2).sum(axis=(1, 2))[tracks], count)
-    factor = np.sqrt(max(float((before / np.maximum(after, 1e-18)).min()), 1.0)) * solved.correlated
+    factor = solved.correlated
+    found = shared_covariance(solved.positions, alone + factor @ np.swapaxes(factor, 1, 2), factor)
+    if found is not None:
+        more = max(min(0.0 if one is None else float(one[SIZE, SIZE]) for one in shared) - float(found[SIZE, SIZE]), 0.0)
+        column = np.sqrt(more) * (solved.positions - solved.positions.mean(axis=0))
+        factor = np.concatenate([factor, column[..., None]], axis=2)
     return alone + factor @ np.swapaxes(factor, 1, 2), factor
