@@ -52,7 +52,7 @@ class Result:
 
         stamps, first = np.unique(result.keyframes.stamps, return_index=True)
         return cls(
-            ObjectMap(result.map.objects, result.map.frame),
+            ObjectMap(**vars(result.map)),
             Trajectory(stamps, result.map_T_base[first]),
             Trajectory(result.path_after.stamps, result.path_after.poses),
             rays_table(result),

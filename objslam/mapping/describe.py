@@ -14,7 +14,9 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
+from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off, is_planar, widest_angle
+from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
@@ -115,7 +117,16 @@ def describe(
                 tag=estimate.tags.get(j) if known else None,
             )
         )
-    return ObjectMap(tuple(objects)), residual
+    return ObjectMap(tuple(objects), shared_covariance=_shared(objects, estimate)), residual
+
+
+def _shared(objects: list[MapObject], estimate: Estimate) -> Floats | None:
+    """Return the covariance (7, 7) of the error that the resolved objects share, None if it is not known."""
+    known = [j for j, o in enumerate(objects) if o.covariance is not None]
+    if estimate.correlated is None or not known:
+        return None
+    some = ObjectMap(tuple(objects[j] for j in known))
+    return shared_covariance(some.positions, some.covariances, estimate.correlated[known])
 
 
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
