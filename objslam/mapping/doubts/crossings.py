@@ -23,6 +23,9 @@ larger number takes more loose groups for narrow ones."""
 _AROUND = 4.0
 """The surroundings of a place end at this multiple of the distance up to which a ray passes it. A larger multiple gives a
 surer estimate of how many rays pass by chance, from a larger area."""
+_FLAT = 0.5
+"""The largest angle (rad) of the surroundings, seen from a camera. Wider ones are not flat, so their area does not tell how
+many rays pass by chance. A larger angle counts places nearer to the path."""
 _PAIRS = 3000
 """The number of tried pairs of rays of a label. More pairs find groups of fewer rays, and take longer."""
 _NEXT = 30
@@ -61,7 +64,7 @@ def _of_label(evidence: Evidence, mine: Ints, reach: float) -> Iterator[Ints]:
     if not len(places):
         return
     radius = factor * np.sqrt(evidence.gate)
-    deviation = _deviations(obs.take(mine), places) / radius
+    deviation = _deviations(obs.take(mine), places, _SCALES[-1] * _AROUND * radius) / radius
     free, open_ = np.ones(len(mine), dtype=bool), np.ones((len(_SCALES), len(places)), dtype=bool)
     for _ in range(_MOST):
         inside = np.array([(deviation <= scale) & free for scale in _SCALES])
@@ -75,8 +78,8 @@ def _of_label(evidence: Evidence, mine: Ints, reach: float) -> Iterator[Ints]:
         scale = int(standing_out[0])
         place = int(odds[scale].argmax())
         open_[scale, place] = False
-        wider = number[:, place] > _LOOSE * number[scale, place]  # The narrow crowd is a part of a loose one.
-        scale = int(np.flatnonzero(wider)[-1]) if wider[scale:].any() else scale
+        loose = np.flatnonzero(number[:, place] > _LOOSE * number[scale, place])  # The narrow crowd is a part of these.
+        scale = max([scale, *loose.tolist()])
         group = _gathered(obs, mine, free, places[place], inside[scale, place], _SCALES[scale] * radius)
         if group.sum() >= _FEWEST:
             free &= ~group
@@ -102,19 +105,25 @@ def _places(obs: Observations, mine: Ints, reach: float, rng: np.random.Generato
     return places
 
 
-def _deviations(obs: Observations, places: Floats) -> Floats:
-    """Return by how many standard deviations each ray passes each place, (P, R). inf for a place behind the camera."""
+def _deviations(obs: Observations, places: Floats, widest: float = 0.0) -> Floats:
+    """Return by how many standard deviations each ray passes each place, (P, R).
+
+    It is inf for a place behind the camera, and for one so near to it that the surroundings fill its view. widest: the
+    deviation up to which the surroundings reach.
+    """
     centre = obs.origin.mean(axis=0)
     point, origin = places - centre, obs.origin - centre
     depth = point @ obs.direction.T - (origin * obs.direction).sum(axis=1)
     squared = (point**2).sum(axis=1)[:, None] + (origin**2).sum(axis=1) - 2 * point @ origin.T
     across = np.maximum(squared - depth**2, 0.0)
     noise = obs.sigma**2 * squared + obs.position_sigma**2 + 1e-12
-    return np.where(depth > MIN_DEPTH, np.sqrt(across / noise), np.inf)
+    flat = noise * widest**2 <= _FLAT**2 * squared
+    return np.where((depth > MIN_DEPTH) & flat, np.sqrt(across / noise), np.inf)
 
 
 def _gathered(obs: Observations, mine: Ints, free: Bools, place: Floats, group: Bools, radius: float) -> Bools:
-    """Return which rays (M,) pass the point that fits best to a first group (M,). radius: in standard deviations."""
+    """Return which rays (M,) pass the point that fits best to a first group (M,). radius: the deviation up to which a
+    ray passes it."""
     for _ in range(2):
         index = np.zeros(int(group.sum()), dtype=np.int64)
         moved = refine(obs, mine[group], index, place[None], np.ones(1))

@@ -19,11 +19,11 @@ from objslam.graph.fixed_pose_triangulation import pose_noise
 
 @dataclass(frozen=True)
 class Evidence:
-    """The objects with a position (N) and all rays (R) of a result.
+    """The resolved objects (N) and all rays (R) of a result.
 
     state: the objects as landmarks, and the rays sorted by frame. object: (N,) the index of each landmark in the map. ray:
     (R,) the index of each observation in the result. left: (R,) whether an observation belongs to no object. covariance:
-    (N, 3, 3) m^2, NaN for an unresolved object. gate: the largest squared deviation of a ray from its object.
+    (N, 3, 3) m^2. gate: the largest squared deviation of a ray from its object.
     """
 
     state: State
@@ -42,7 +42,8 @@ class Evidence:
 
 
 def evidence_of(result: RunResult) -> Evidence:
-    """Return the evidence of a result. Frames without a box count as misses if the result has its views."""
+    """Return the evidence of a result. Its landmarks are the resolved objects. Frames without a box count as misses if the
+    result has its views."""
     rays, settings, labels = result.rays, result.settings, len(result.rays.label_names)
     solved = replace(result.keyframes, map_T_base=result.map_T_base)
     if settings.mode == "fixed":
@@ -56,9 +57,8 @@ def evidence_of(result: RunResult) -> Evidence:
     obs = replace(obs, origin=result.origins[ray], direction=result.directions[ray])
     objects = result.map.objects
     position = np.array([o.position if o.ray_point is None else o.ray_point for o in objects]).reshape(-1, 3)
-    unknown = np.full((3, 3), np.nan)
-    covariance = np.array([unknown if o.covariance is None else o.covariance for o in objects]).reshape(-1, 3, 3)
-    known = np.flatnonzero(np.isfinite(position).all(axis=1))
+    covariance = np.array([o.covariance for o in objects if o.covariance is not None]).reshape(-1, 3, 3)
+    known = np.array([j for j, o in enumerate(objects) if o.covariance is not None], dtype=np.int64)
     number = np.full(len(objects) + 1, -1)
     number[known] = np.arange(len(known))
     matched = number[result.association.object[ray]]
@@ -67,7 +67,7 @@ def evidence_of(result: RunResult) -> Evidence:
     state = State(obs, view, Landmarks.new(position[known], np.ones(len(known)), label, labels), matched)
     state = replace(state, landmarks=replace(state.landmarks, noise=state.noise))
     left = result.association.object[ray] < 0
-    return Evidence(state, known, ray, left, covariance[known], gate_limit(settings.association.gate))
+    return Evidence(state, known, ray, left, covariance, gate_limit(settings.association.gate))
 
 
 def _all_frames(keyframes: Keyframes, views: Keyframes | None) -> tuple[Keyframes, Ints]:

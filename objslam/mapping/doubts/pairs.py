@@ -71,12 +71,11 @@ def find_pairs(evidence: Evidence) -> Pairs:
 
     state, covariance = evidence.state, evidence.covariance
     position = state.landmarks.position
-    ok = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    if len(ok) < 2:
+    if state.count < 2:
         return _none()
-    near = min(_NEIGHBOURS + 1, len(ok))
-    found = np.asarray(cKDTree(position[ok]).query(position[ok], k=np.arange(1, near + 1))[1])
-    pairs = np.stack([np.repeat(ok, near), ok[found.ravel()]], axis=1)
+    near = min(_NEIGHBOURS + 1, state.count)
+    found = np.asarray(cKDTree(position).query(position, k=np.arange(1, near + 1))[1])
+    pairs = np.stack([np.repeat(np.arange(state.count), near), found.ravel()], axis=1)
     pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
     a, b = pairs[:, 0], pairs[:, 1]
     meets = evidence.accepts[a, state.label[b]] | evidence.accepts[b, state.label[a]]
@@ -92,7 +91,7 @@ def find_pairs(evidence: Evidence) -> Pairs:
     if_one, if_two = TOGETHER * expected + _BESIDES, _BOTH * expected + _BESIDES
     by_frames = frames * np.log(if_one / if_two) + if_two - if_one
     as_one = -0.5 * (np.where(shared, np.minimum(squared, 3.0), squared) + np.linalg.slogdet(2 * np.pi * both)[1])
-    as_two = np.log(_density(position[ok], state.label[ok], state.label[a], len(state.unassigned)))
+    as_two = np.log(_density(position, state.label, state.label[a], len(state.unassigned)))
     probability = expit(as_one - as_two + by_frames + np.log(_PRIOR / (1 - _PRIOR)))
     result = Pairs(evidence.object[a], evidence.object[b], gap, np.sqrt(squared), probability, frames, expected)
     order = np.argsort(-probability, kind="stable")
