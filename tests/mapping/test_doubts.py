@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
 from objslam.simulation import pair, preset, simulate
+from objslam.simulation.settings import DepthNoise
 
 
 def only(result: RunResult) -> Doubt:
@@ -135,6 +137,17 @@ def test_too_few_rays_for_an_object(rooms):
     assert (found.kind, found.reason, found.label) == ("boxes", "few", "kite")
     assert len(found.rays) in (9, 10)
     assert "association.min_rays 12" in found.text
+
+
+def test_ranges_that_end_elsewhere():
+    result = mapped(simulate(preset("rooms", false=0.0, depth=DepthNoise()), 5))
+    ranged = replace(result.rays, range=np.where(result.association.object == 3, 0.6, 1.0) * result.rays.range)
+    without = np.where(result.association.object == 3, -1, result.association.object)
+    without[without > 3] -= 1
+    found = only(reassociated(replace(result, rays=ranged), without))
+    assert (found.kind, found.reason) == ("boxes", "range")
+    assert np.linalg.norm(found.position - result.map.objects[3].position) < 0.1
+    assert set(found.rays) <= set(np.flatnonzero(result.association.object == 3))
 
 
 def test_boxes_of_another_label_on_an_object():
