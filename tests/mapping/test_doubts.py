@@ -50,6 +50,9 @@ def test_two_objects_taken_as_one_may_be_two():
     true = np.bincount(result.association.object)
     assert sorted([found.numbers["rays_first"], found.numbers["rays_second"]]) == pytest.approx(sorted(true), rel=0.1)
     assert "of its rays meet near (1.50, " in found.text
+    frames = result.rays.keyframe
+    both = np.intersect1d(*(frames[result.association.object == j] for j in (0, 1)))
+    assert found.numbers["frames_with_both"] == pytest.approx(len(both), rel=0.1)
 
 
 def test_one_object_taken_as_two_may_be_one():

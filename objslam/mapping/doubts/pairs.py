@@ -17,13 +17,14 @@ _NEIGHBOURS = 8
 """The number of nearest objects that each object is compared with. A larger number is slower, and matters in dense places
 only."""
 _PRIOR = 0.05
-"""The prior probability that an object is in the map twice. In simulation it is lower, on real logs about this. A larger
-value reports more pairs."""
+"""The prior probability that two neighbours are one object. It is chosen, not measured: association has merged nearly all
+copies. A larger value reports more pairs."""
 _LEAST = 0.1
 """The least probability that a reported pair is one object. A larger value reports fewer pairs."""
 _BOTH = 0.5
-"""The least share of the frames with two different objects that is expected to show both. It is below 1, because one thing
-hides another. A larger share counts frames with only one of them more."""
+"""The share of the frames with two independent objects that really show both. One thing hides another, and a detector
+suppresses boxes that overlap. It is chosen, not measured. With a larger share, frames without both say more for one
+object."""
 _BESIDES = 0.2
 """The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
 number, few frames tell less."""

@@ -64,16 +64,20 @@ def _splits(result: RunResult, splits: Splits) -> Iterator[Doubt]:
     for i in np.argsort(-splits.rays.min(axis=1, initial=0), kind="stable").tolist():
         j = int(splits.object[i])
         o, (one, two), (m, n) = result.map.objects[j], splits.centre[i], splits.rays[i].tolist()
+        both = f"; {_frames(int(splits.together[i]))} both" if splits.together[i] else ""
         yield Doubt(
             "split",
             "may be two",
             o.label,
             f"{_name(o)} may be two: {m} of its rays meet near {_place(one)} and {n} near {_place(two)}, "
-            f"{_length(splits.gap[i])} apart as seen, where 3 sigma of a ray are {_length(3 * splits.noise[i])}.",
+            f"{_length(splits.gap[i])} apart as seen, where 3 sigma of a ray are {_length(3 * splits.noise[i])}{both}.",
             (o.id,),
             o.position,
             np.flatnonzero(result.association.object == j),
-            {"rays_first": m, "rays_second": n, "gap_m": splits.gap[i], "sigma_m": splits.noise[i]},
+            {
+                **{"rays_first": m, "rays_second": n, "gap_m": splits.gap[i], "sigma_m": splits.noise[i]},
+                **{"frames_with_both": splits.together[i]},
+            },
         )
 
 
