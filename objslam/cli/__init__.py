@@ -13,6 +13,7 @@ from objslam.cli.demo import demo
 from objslam.cli.detect import detect
 from objslam.cli.doctor import doctor
 from objslam.cli.evaluate import evaluate_result
+from objslam.cli.explain import explain
 from objslam.cli.export import export
 from objslam.cli.fleet import fleet
 from objslam.cli.info import info
@@ -34,6 +35,7 @@ app.command()(run)
 app.command()(live)
 app.command()(calibrate)
 app.command(name="eval")(evaluate_result)
+app.command()(explain)
 app.command(name="report")(report_result)
 app.command(name="register")(register_results)
 app.command(name="merge")(merge_results)

@@ -24,13 +24,14 @@ from objslam.core.types import Association
 from objslam.frontend.up import up_axis
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
+from objslam.mapping.doubts.find import with_doubts
 from objslam.mapping.solution import Solution
 
 
 def make_result(
     solution: Solution, objects: ObjectMap, residual: Floats, summary: dict[str, Any], settings: Settings, **more: Any
 ) -> RunResult:
-    """Return the result of a run, and add the assessment of its quality to the summary.
+    """Return the result of a run with its doubts, and add the assessment of its quality to the summary.
 
     objects, residual: from `describe`. more: the fields of `RunResult` that the solution does not have.
     """
@@ -39,7 +40,7 @@ def make_result(
     judged: dict[str, Any] = {"residual_times": None if np.isnan(missed) else round(missed, 3)}
     judged["assessment"] = assess(evidence_of(summary, missed)).to_dict()
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
-    return RunResult(
+    result = RunResult(
         map=objects,
         keyframes=keyframes,
         map_T_base=estimate.map_T_base,
@@ -55,6 +56,7 @@ def make_result(
         settings=settings,
         **more,
     )
+    return with_doubts(result)
 
 
 def describe(

@@ -21,13 +21,22 @@ from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
 from objslam.output.report.cards import make_cards
 from objslam.output.report.charts import histogram
-from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of
+from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of, spread_over_time
 from objslam.output.report.render import render
 from objslam.output.report.scene import scene_data
 from objslam.output.report.site_page import write_site_report
 from objslam.output.report.trends import trends
 from objslam.results.files import CONFIG, PICTURE, REPORT
-from objslam.results.read import is_site, load_evaluation, load_map, load_path, load_rays, load_summary, load_truth
+from objslam.results.read import (
+    is_site,
+    load_doubts,
+    load_evaluation,
+    load_map,
+    load_path,
+    load_rays,
+    load_summary,
+    load_truth,
+)
 
 _BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
 _LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
@@ -80,11 +89,13 @@ def write_report(
     up = summary.get("up", "z")
     chosen = {o.id: choose_rays(rays, np.flatnonzero(rays.object == o.id), crops) for o in objects}
     unexplained = _unexplained(rays, crops)
+    doubts = load_doubts(out) or ()
+    of_doubt = [spread_over_time(rays, one.rays[one.rays < len(rays)], crops) for one in doubts]
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
     images = _on_one_clock(images, summary.get("calibration"))
     wanted: dict[int, Kind] = {}
-    for some in (*chosen.values(), *unexplained.values()):
+    for some in (*chosen.values(), *unexplained.values(), *of_doubt):
         wanted |= some
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
     if images and wanted and not pictures:
@@ -104,6 +115,7 @@ def write_report(
         duration=float(rays.stamp.max()) - begin if len(rays) else 0.0,
         picture=picture.read_bytes() if picture.is_file() else None,
         cards=cards,
+        ids={o.id for o in objects},
         with_errors=any(card.error is not None for card in cards),
         with_size=any(o.body is not None or o.tag is not None for o in objects),
         unknown_yaw=_KNOWN_YAW,
@@ -121,6 +133,7 @@ def write_report(
             label: (int(((rays.object < 0) & (rays.label == label)).sum()), [pictures[i] for i in index if i in pictures])
             for label, index in unexplained.items()
         },
+        doubts=[(one, [pictures[i] for i in index if i in pictures]) for one, index in zip(doubts, of_doubt, strict=True)],
         dropped=[(why, n, "; ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
         **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},
