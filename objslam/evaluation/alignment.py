@@ -70,7 +70,8 @@ def match_points(source: Floats, target: Floats, same: Bools, radius: float) -> 
     squared = ((source[:, None] - target[None]) ** 2).sum(axis=2)
     allowed = same & (squared <= radius**2)
     if allowed.sum(axis=0).max() <= 1 and allowed.sum(axis=1).max() <= 1:
-        return np.nonzero(allowed)  # No point has a choice. The import below takes longer than the map of a small log.
+        rows, columns = np.nonzero(allowed)  # No point has a choice, so the slow import below is not needed.
+        return rows, columns
     from scipy.optimize import linear_sum_assignment
 
     # A forbidden pair costs more than all allowed pairs together, so the number of allowed pairs is as large as possible.
