@@ -25,8 +25,8 @@ from objslam.graph.calibration.variance_components import estimate_noise, shrink
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers
 
 _ROUNDS = 8
-"""The most outer steps of a search. The MRCLAM robots, whose clocks are 0.2 s off, take 1 or 2 steps before the noise is known,
-and 1 or 2 after. A larger number is slower."""
+"""The most outer steps of a search. The MRCLAM robots, whose clocks are 0.2 s off, take 1 or 2 steps before the noise is
+known, and 1 or 2 after. A larger number is slower."""
 _CONVERGED = 0.2
 """A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _NEARLY = 2.0
