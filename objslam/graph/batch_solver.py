@@ -30,10 +30,9 @@ from objslam.graph.tags.fixed import tags_at_poses
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
-_TOLERANCE, _TOLERANCE_HELD, _TOLERANCE_BEFORE = 1e-6, 1e-4, 1e-2
-"""A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a last solve. The
-second is for a solve with shared errors that stay. The third is for a solve before the shared errors are estimated. The
-estimation moves everything again. Larger values end the solve sooner."""
+_TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
+"""A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a solve without
+shared errors. The second is for a solve with them, whose estimation moves everything again. Larger values end it sooner."""
 _ROUNDS_BEFORE = 2
 """The most rounds of solve and test before the shared errors are estimated. The estimation tests the inliers after each of
 its steps. A larger number is slower, and leads to the same inliers."""
@@ -146,7 +145,7 @@ def solve_joint(
     elif not keyframes.localized_every:
         map_T_camera, positions = initialize_known(measured, association, progress, trace)
     nothing = np.zeros(len(rays), dtype=bool)
-    tolerance = _TOLERANCE if errors is None else _TOLERANCE_HELD if hold else _TOLERANCE_BEFORE
+    tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
     rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
     found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace, tolerance, rounds)
     loose = keyframes.odom_T_base is not None and not keyframes.localized_every
@@ -171,8 +170,6 @@ def solve_joint(
             calibrated = calibrate(errors, measure, association, found, theta, trace)
         except (SolveError, np.linalg.LinAlgError) as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
-            last = reject_outliers(measured, association, found.map_T_camera, found.positions, found.used, nothing, trace)
-            found = replace(last, cost_before=found.cost_before, iterations=found.iterations + last.iterations)
             calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
         else:
             errors, calibration = calibrated.errors, calibrated.calibration
