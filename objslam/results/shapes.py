@@ -41,6 +41,20 @@ class _Localisation(_Shape):
     line: str
 
 
+class _Place(_Shape):
+    x: _Number
+    y: _Number
+    z: _Number
+    yaw_deg: _Number
+
+
+class _SiteSession(_Place):
+    name: str
+    sigma: _Place
+    log_odds: _Number | None = None
+    common_objects: _Integer = 0
+
+
 class Summary(_Shape):
     """The content of summary.json. Each key may be missing, as in the summary of an older run."""
 
@@ -62,6 +76,7 @@ class Summary(_Shape):
     warnings: list[str] = []
     assessment: _Assessment | None = None
     localisation: _Localisation | None = None
+    sessions: list[_SiteSession] = []
 
 
 class _Match(_Shape):

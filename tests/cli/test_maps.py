@@ -1,10 +1,13 @@
 """The commands `merge` and `diff` on the results of two days, between which one object was taken, moved and added."""
 
+import csv
 import json
+import re
 import sys
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 import objslam
 from objslam.cli import main
@@ -70,16 +73,58 @@ def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeyp
     assert [len(site), len(site.gone)] == [14, 1]
     assert {o.life.state for o in site} == {"confirmed", "moved", "new"}
     assert (tmp_path / "site" / "map.png").is_file()
-    for command, missing in (("report", "rays.parquet"), ("view", "recording.rrd")):
-        code, _, error = call(monkeypatch, capsys, command, tmp_path / "site")
-        assert code == 1
-        assert f"this is the map of a site, which has no {missing} (look at map.png" in error
+    code, _, error = call(monkeypatch, capsys, "view", tmp_path / "site")
+    assert code == 1
+    assert "this is the map of a site, which has no recording.rrd (look at map.png" in error
+    reported(call, monkeypatch, capsys, tmp_path / "site", site)
+    exported(call, monkeypatch, capsys, tmp_path / "site", site)
     again = objslam.merge([tmp_path / "site", out / "b"])
     assert len(again) == 1
     assert {o.id for o in again[0].objects} == {o.id for o in site}
     assert all(o.life.sessions_seen >= 2 for o in again[0].objects)
     found = objslam.diff(objslam.Result.load(out / "a"), tmp_path / "site")
     assert found.registration.accepted
+
+
+def reported(call, monkeypatch, capsys, folder, site):
+    """The page has a line for each object and each session. A summary of a wrong shape is one clear line."""
+    assert call(monkeypatch, capsys, "report", folder)[0] == 0
+    page = (folder / "report.html").read_text()
+    lines = [re.sub(r"<[^>]+>", " ", line).split() for line in page.splitlines() if line.startswith("<tr")]
+    states = {o.id: o.life.state for o in (*site, *site.gone)}
+    assert {int(line[0]): line[3] for line in lines if line[0].isdigit()} == states
+    assert sum(str(folder.parent) in line[0] or "days" in line[0] for line in lines) == 2
+    summary = folder / "summary.json"
+    text = summary.read_text()
+    summary.write_text(re.sub(r'"yaw_deg": [^,\n]+', '"yaw_deg": "east"', text))
+    code, _, error = call(monkeypatch, capsys, "report", folder)
+    assert code == 1
+    assert "not what objslam writes" in error
+    summary.write_text(text)
+
+
+def exported(call, monkeypatch, capsys, folder, site):
+    """The files of other tools say what became of each object. There is no path to export."""
+    for to in ("csv", "geojson", "mcap", "ply"):
+        assert call(monkeypatch, capsys, "export", folder, "--to", to)[0] == 0
+    states = {o.id: o.life.state for o in (*site, *site.gone)}
+    rows = list(csv.DictReader((folder / "objects.csv").read_text().splitlines()))
+    assert {int(row["id"]): row["state"] for row in rows} == states
+    (moved,) = (o for o in site if o.life.state == "moved")
+    (row,) = (row for row in rows if row["state"] == "moved")
+    assert [float(row[f"moved_from_{axis}"]) for axis in "xyz"] == moved.life.moved_from.tolist()
+    features = json.loads((folder / "objects.geojson").read_text())["features"]
+    told = {one["id"]: one["properties"]["state"] for one in features if one["properties"]["kind"] == "object"}
+    assert told == states
+    assert not any(one["properties"]["kind"] == "path" for one in features)
+    with AnyReader([folder / "map.mcap"]) as reader:
+        (markers,) = [c for c in reader.connections if c.topic == "/objslam/markers"]
+        ((_, _, data),) = reader.messages([markers])
+        texts = [m.text for m in reader.deserialize(data, markers.msgtype).markers if m.text]
+    assert sorted(text.rpartition(", ")[2] for text in texts) == sorted(states[o.id] for o in site if o.status == "ok")
+    code, _, error = call(monkeypatch, capsys, "export", folder, "--to", "g2o")
+    assert code == 1
+    assert "which has no path" in error
 
 
 def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, monkeypatch, capsys):
