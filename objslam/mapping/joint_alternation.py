@@ -134,20 +134,31 @@ class JointState:
 
         The rounds also end if an earlier association returns, because a few rays could change for ever. drifting: whether to
         allow for the drift of keyframes without an assigned ray.
+        Most of the time of a solve goes into the shared errors, and a few changed rays hardly change them. So they stay
+        as the first round found them until no ray changes its object, and are then estimated again.
         """
-        state, earlier = self, set[bytes]()
+        state, earlier, settled = self, set[bytes](), False
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"association, round {number + 1}", 0, 0)
             found = state._associate(map_T_base, guess, drifting)
             state = state.counted(found)
             if state.rounds[-1]["rays_changed"] == 0 or found.object.tobytes() in earlier:
-                return replace(state, settled=True)
-            earlier.add(found.object.tobytes())
-            state = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera).merged()
+                if state.hold == self.hold:
+                    settled = True
+                    break
+                assert state.association is not None
+                state = replace(state, hold=self.hold).solve("association", state.association, state.solved_poses).merged()
+            else:
+                earlier.add(found.object.tobytes())
+                state = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera)
+                state = replace(state, hold=state.errors is not None).merged()
             assert state.association is not None
             assert state.estimate is not None
             map_T_base, guess = state.estimate.map_T_base, (state.association, state.estimate.positions)
-        return replace(state, settled=False)
+        if state.hold != self.hold:
+            assert state.association is not None
+            state = replace(state, hold=self.hold).solve("association", state.association, state.solved_poses).merged()
+        return replace(state, settled=settled)
 
     def drift_followed(self) -> Self:
         """Return the state after rounds that allow for the drift of keyframes without an assigned ray, if it is `better`.
