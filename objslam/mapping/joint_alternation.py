@@ -10,7 +10,7 @@ import numpy as np
 
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Bools, Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
@@ -22,7 +22,7 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.duplicates import merge_unseen_together
 from objslam.mapping.labels import clock_explains, labels_tell, may_be_by_label, noise_explains, warn_of_noise
 from objslam.mapping.progress import Progress
-from objslam.mapping.solution import without_errors
+from objslam.mapping.solution import rays_moved, without_errors
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -132,26 +132,38 @@ class JointState:
     def alternated(self, map_T_base: Floats, guess: Guess | None, *, drifting: bool = False) -> Self:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
-        The rounds also end if an earlier association returns, because a few rays could change for ever. Then the state since
-        the earlier one counts whose rays are best `explained`. drifting: whether to allow for the drift of keyframes without
-        an assigned ray.
+        If an earlier association returns, a few rays could change for ever. Then the state since the earlier one counts
+        whose rays are best `explained`. A few changed rays hardly change the shared errors, which take most of the time of a
+        solve. So these stay as the first round found them until the rounds end, and are then estimated again. drifting:
+        whether to allow for the drift of keyframes without an assigned ray.
         """
         state, earlier = self, dict[bytes, Self]()
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"association, round {number + 1}", 0, 0)
             found = state._associate(map_T_base, guess, drifting)
-            state = state.counted(found)
-            if state.rounds[-1]["rays_changed"] == 0:
-                return replace(state, settled=True)
-            if found.object.tobytes() in earlier:
-                returned = list(earlier).index(found.object.tobytes())
-                return state.continued_from(max(list(earlier.values())[returned:], key=lambda one: one.explained))
-            state = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera).merged()
-            earlier[found.object.tobytes()] = state
+            state, key = state.counted(found), found.object.tobytes()
+            same = state.rounds[-1]["rays_changed"] == 0
+            if same or key in earlier:
+                if not same and (state.errors is None or state.hold):
+                    returned = list(earlier).index(key)
+                    state = state.continued_from(max(list(earlier.values())[returned:], key=lambda one: one.explained))
+                if state.hold == self.hold:
+                    return replace(state, settled=True)
+                state = state.released(self.hold)
+            else:
+                state = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera)
+                state = replace(state, hold=state.errors is not None).merged()
+                earlier[key] = state
             assert state.association is not None
             assert state.estimate is not None
             map_T_base, guess = state.estimate.map_T_base, (state.association, state.estimate.positions)
-        return replace(state, settled=False)
+        return replace(state if state.hold == self.hold else state.released(self.hold), settled=False)
+
+    def released(self, hold: bool) -> Self:
+        """Return the state after one more solve, which estimates the shared errors again unless they are to `hold`."""
+        assert self.association is not None
+        state = replace(self, hold=hold)
+        return state.solve("association", self.association, self.solved_poses).merged()
 
     def continued_from(self, chosen: Self) -> Self:
         """Return a state of an earlier round, settled, with the rounds until now."""
@@ -329,14 +341,3 @@ def _with_loose_odometry(state: JointState) -> JointState | None:
     keyframes, rays, _ = errors.at(errors.mean if values is None else values)
     unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
     return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
-
-
-def rays_moved(before: Ints, after: Ints) -> int:
-    """Return how many rays (R,) changed their object. Renumbered objects count as the same. -1 means no object."""
-    from scipy.optimize import linear_sum_assignment
-
-    shared = np.zeros((before.max(initial=-1) + 1, after.max(initial=-1) + 1), dtype=np.int64)
-    both = (before >= 0) & (after >= 0)
-    np.add.at(shared, (before[both], after[both]), 1)
-    stayed = shared[linear_sum_assignment(shared, maximize=True)].sum() + ((before < 0) & (after < 0)).sum()
-    return len(before) - int(stayed)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.bodies.body import PlacedBody
 from objslam.core.trace import Round
 from objslam.core.types import Association, Keyframes, Rays
@@ -59,3 +59,14 @@ def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
     """Return the keyframes that have a ray, and the rays with indices into these keyframes."""
     kept, keyframe = np.unique(rays.keyframe, return_inverse=True)
     return keyframes.take(kept), replace(rays, keyframe=keyframe.astype(np.int64))
+
+
+def rays_moved(before: Ints, after: Ints) -> int:
+    """Return how many rays (R,) changed their object. Renumbered objects count as the same. -1 means no object."""
+    from scipy.optimize import linear_sum_assignment
+
+    shared = np.zeros((before.max(initial=-1) + 1, after.max(initial=-1) + 1), dtype=np.int64)
+    both = (before >= 0) & (after >= 0)
+    np.add.at(shared, (before[both], after[both]), 1)
+    stayed = shared[linear_sum_assignment(shared, maximize=True)].sum() + ((before < 0) & (after < 0)).sum()
+    return len(before) - int(stayed)

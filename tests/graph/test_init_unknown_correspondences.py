@@ -13,8 +13,7 @@ from objslam.graph import init_unknown_correspondences
 from objslam.graph.init_unknown_correspondences import _planar_sigmas, initialize_unknown
 from objslam.graph.loop_closure import distribute_correction
 from objslam.mapping import pipeline
-from objslam.mapping.joint_alternation import rays_moved
-from objslam.mapping.solution import seen_something
+from objslam.mapping.solution import rays_moved, seen_something
 from objslam.simulation import preset, simulate
 
 STEP = {"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0}

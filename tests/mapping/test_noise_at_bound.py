@@ -17,6 +17,15 @@ def test_a_noise_at_its_bound_is_said(name, spoils):
     assert found.spoils == spoils
 
 
+@pytest.mark.parametrize("depth", ["ranges", "range_bias"])
+def test_depths_and_odometry_are_not_both_so_bad(depth):
+    """A recorded drive with the identity for base_T_camera had both, and objects that were off by 4 m."""
+    alone, both = (NoiseFactors(**dict.fromkeys(names, MOST_NOISE)) for names in ((depth,), (depth, "along")))
+    told = [at_bounds(SimpleNamespace(calibration=None, noise=noise), np.zeros(0)) for noise in (alone, both)]
+    assert [finding.spoils for finding in told[0]] == [False]
+    assert [finding.spoils for finding in told[1]] == [True, True]
+
+
 def test_the_noise_of_bad_wheels_is_not_said():
     """The odometry of a MRCLAM robot is only the commanded speed."""
     assert at_bounds(SimpleNamespace(calibration=None, noise=NoiseFactors(along=6.3)), np.zeros(0)) == []

@@ -34,6 +34,7 @@ _NOISES = {
     "across": "of the odometry across the path",
     "turning": "of the odometry's heading",
 }
+_DEPTHS, _ODOMETRY = ("ranges", "range_bias"), ("along", "across", "turning")
 
 
 def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
@@ -82,15 +83,18 @@ def _uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
 def _with_most_noise(noise: NoiseFactors) -> list[Finding]:
     """Return a finding for each noise that ended at its bound. With so much noise, wrong input fits too.
 
-    Wheels may slip so much, but no detector is off by so many pixels. So the noise of the boxes spoils the positions.
+    Wheels may slip so much, or a depth image may be so bad. But no detector is off by so many pixels, and depths and
+    odometry are not both so bad. So the noise of the boxes spoils the positions. The noise of depths and odometry together
+    spoils them too.
     """
+    ended = [name for name in _NOISES if getattr(noise, name) >= 0.999 * MOST_NOISE]
+    depths, odometry = ([name for name in names if name in ended] for names in (_DEPTHS, _ODOMETRY))
     return [
         Finding(
             f"noise {name} at its bound",
-            f"the boxes agree only if the noise {words} is {MOST_NOISE:.3g} times what the settings say, or more: unless it "
-            "really is, the input is wrong",
-            spoils=name == "rays",
+            f"the boxes agree only if the noise {_NOISES[name]} is {MOST_NOISE:.3g} times what the settings say, or more: "
+            "unless it really is, the input is wrong",
+            spoils=name == "rays" or bool(depths and odometry),
         )
-        for name, words in _NOISES.items()
-        if getattr(noise, name) >= 0.999 * MOST_NOISE
+        for name in ended
     ]
