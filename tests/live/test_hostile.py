@@ -90,6 +90,7 @@ def test_numbers_that_are_none_and_stamps_that_cannot_be(robot):
         send("/odom", ODOMETRY, good[:4] + struct.pack("<iI", seconds, 2**32 - 1) + good[12:])
     for cut in range(0, len(good), 7):
         send("/odom", ODOMETRY, good[:cut])
+    entry.end()
     lost = sum(messages.ledger.dropped.values()) + sum(entry.counters.dropped().values())
     assert lost == 4 + 3 + len(range(0, len(good), 7)) + (1 if len(taken) == 1 else 0)
     assert entry.newest == 1.0
