@@ -12,11 +12,14 @@ from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP
 from objslam.ros.bag.records import Connection, plain
 from objslam.ros.message_limits import check_size
 from objslam.ros.messages.decode import DecodeError, make_decoder
-from objslam.ros.messages.topic_types import IMAGES, LATCHED
+from objslam.ros.messages.topic_types import IMAGES, LATCHED, is_read
 
 _LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
 _TAKE = 200  # The most messages that one call takes from a reader. A larger number makes fewer calls, and costs memory.
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
+_MAX_PUBLICATIONS = 1000
+"""The most publishers of types that objslam reads. With a larger number, it takes longer to choose topics among made-up
+ones."""
 _MIN_BUFFER = 2 << 20  # With a smaller socket buffer, bytes, raw images bring a warning. A larger value warns more often.
 _Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
@@ -91,16 +94,22 @@ class DdsAdapter:
     def _look_around(self, found: Any) -> None:
         from cyclonedds.core import InstanceState
 
-        while samples := found.take(_TAKE):
+        for _ in range(QUEUE // _TAKE):  # Messages of the readers do not wait longer, even if publishers come without end.
+            samples = found.take(_TAKE)
             for sample in samples:
                 handle = sample.sample_info.instance_handle
                 if sample.sample_info.instance_state != InstanceState.Alive or not sample.sample_info.valid_data:
                     self._publications.pop(handle, None)
                     continue
                 topic, type_ = ros_topic(sample.topic_name), ros_type(sample.type_name)
-                if topic is not None and type_ is not None:
-                    publication = _Publication(plain(topic), type_, _kind(sample.qos, type_), sample.type_id)
-                    self._publications[handle] = publication
+                if topic is None or type_ is None or not is_read(type_):
+                    continue
+                if handle not in self._publications and len(self._publications) >= _MAX_PUBLICATIONS:
+                    self.messages.refuse(f"publisher beyond the first {_MAX_PUBLICATIONS}", topic)
+                    continue
+                self._publications[handle] = _Publication(plain(topic), type_, _kind(sample.qos, type_), sample.type_id)
+            if len(samples) < _TAKE:
+                return
 
     def _open(self, age: float) -> list[_Reader]:
         """Open readers for the wanted topics that have none, and return them. age: the time since the start, s."""
