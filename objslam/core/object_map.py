@@ -31,10 +31,13 @@ COLUMNS: dict[str, str] = {
     **dict.fromkeys(("parallax_deg", "rms_deg", "width", "height", "first_seen", "last_seen", "existence"), "float64"),
     **BODY_COLUMNS,
     **TAG_COLUMNS,
+    **{"state": "string", "probability": "float64", "sessions_expected": "int64", "sessions_seen": "int64"},
+    **dict.fromkeys(("updated", "moved_from_x", "moved_from_y", "moved_from_z"), "float64"),
 }
 """The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s,
 yaws in rad. size_l, size_w and size_h are length, width and height of the body. width and height are those of the boxes.
-tag_qx to tag_qw are the unit quaternion of map_R_tag of a fiducial."""
+tag_qx to tag_qw are the unit quaternion of map_R_tag of a fiducial. The columns from state on are those of `Life`, and only
+the map of a site has values there."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +130,7 @@ class MapObject:
             ),
             *body_row(self.body),
             *tag_row(self.tag),
+            *_life_row(self.life),
         )
         known = (None if isinstance(value, float) and not np.isfinite(value) else value for value in values)
         return dict(zip(COLUMNS, known, strict=True))
@@ -136,6 +140,13 @@ class MapObject:
         place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) m" if self.sigma is not None else self.status
         sigma = "" if self.sigma is None else f", sigma {self.sigma:.3f} m"
         return f"{self.label} #{self.id} {place}{sigma}, {self.rays} rays"
+
+
+def _life_row(life: Life | None) -> tuple[str | float | None, ...]:
+    if life is None:
+        return (None,) * 8
+    before = (None,) * 3 if life.moved_from is None else life.moved_from.tolist()
+    return (life.state, life.probability, life.sessions_expected, life.sessions_seen, life.updated, *before)
 
 
 @dataclass(frozen=True)

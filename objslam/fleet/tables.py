@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 _POINT_Z = 1001  # The number of a 3D point in the ISO form of well-known binary.
 _WKB = np.dtype([("order", "u1"), ("kind", "<u4"), ("place", "<f8", 3)])  # One point, little endian.
-_LIFE = ("state", "probability", "sessions_expected", "sessions_seen", "updated")
 
 
 def session_schema() -> pa.Schema:
@@ -74,10 +73,7 @@ def session_row(
 
 
 def object_rows(objects: Iterable[MapObject], frame_T_map: Floats, more: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each object, moved by frame_T_map (4, 4). more: columns that all rows share.
-
-    An object of a site also has the columns of its life.
-    """
+    """Return a row for each object, moved by frame_T_map (4, 4). more: columns that all rows share."""
     turn, rows = frame_T_map[:3, :3], []
     for o in objects:
         row = {**more, **o.row()}
@@ -86,8 +82,9 @@ def object_rows(objects: Iterable[MapObject], frame_T_map: Floats, more: dict[st
         if o.covariance is not None:
             spread = turn @ o.covariance @ turn.T
             row |= {f"cov_{'xyz'[i]}{'xyz'[k]}": float(spread[i, k]) for i in range(3) for k in range(i, 3)}
-        if o.life is not None:
-            row |= {name: getattr(o.life, name) for name in _LIFE}
+        if o.life is not None and o.life.moved_from is not None:
+            before = turn @ o.life.moved_from + frame_T_map[:3, 3]
+            row |= {f"moved_from_{name}": float(value) for name, value in zip("xyz", before, strict=True)}
         rows.append(row)
     return rows
 
@@ -102,16 +99,13 @@ def dump_sessions(rows: Sequence[dict[str, Any]]) -> bytes:
 def dump_objects(rows: Sequence[dict[str, Any]], *, lives: bool = False) -> bytes:
     """Return the content of a GeoParquet file of objects. The geometry of an unresolved object is null.
 
-    lives: whether the objects are those of a site. Then the columns `_LIFE` replace session, source and robot.
+    lives: whether the objects are those of a site. Then there are no columns session, source and robot.
     """
     import pyarrow as pa
 
     text = ("session", "source", "robot")
     columns = [("island", pa.int64()), *(() if lives else ((name, pa.string()) for name in text))]
     columns += [(name, pa.type_for_alias(kind)) for name, kind in COLUMNS.items()]
-    if lives:
-        kinds = (pa.string(), pa.float64(), pa.int64(), pa.int64(), pa.float64())
-        columns += list(zip(_LIFE, kinds, strict=True))
     table = pa.Table.from_pylist(list(rows), pa.schema(columns))
     places = np.array([[np.nan if row[name] is None else row[name] for name in "xyz"] for row in rows]).reshape(-1, 3)
     known = np.isfinite(places).all(axis=1) & np.array([row["status"] == "ok" for row in rows], dtype=bool)

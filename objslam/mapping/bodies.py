@@ -20,7 +20,7 @@ from objslam.triangulation.bodies.edges import BoxEdges, contacts, tangent_plane
 from objslam.triangulation.bodies.prior import apparent_half_axes
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 
-_FEWEST = 5
+FEWEST = 5
 """The least number of boxes of a body. With a larger number, more objects stay points."""
 _CLEAR = 1.0
 """The angle between the centre of a body and that of its box, in standard deviations of the error that boxes share, above
@@ -161,7 +161,7 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     # Rays that place nothing can have their point at the camera. Such a point has no direction.
     ray = ray[np.linalg.norm(estimate.positions[association.object[ray]] - origin, axis=1) > MIN_DEPTH]
     number = np.bincount(association.object[ray], minlength=association.count)
-    objects = np.flatnonzero(fit & (number >= _FEWEST))
+    objects = np.flatnonzero(fit & (number >= FEWEST))
     ray = ray[np.isin(association.object[ray], objects)]
     ray = ray[np.argsort(association.object[ray], kind="stable")]  # Sums over the boxes of a body are then fast.
     return _Views(

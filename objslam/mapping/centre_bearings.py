@@ -14,7 +14,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import grouped_median
-from objslam.core.types import Association, Rays
+from objslam.core.types import Association, Keyframes, Rays
 from objslam.mapping.bodies import with_bodies
 from objslam.mapping.solution import Solution, with_noise_of, without_errors
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from objslam.mapping.joint_alternation import JointState
 
 _KEPT = 0.5
-"""The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. If one
-is lost, all bearings stay as they were."""
+"""The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. The
+bearings of a lost object stay as they were."""
 _WORTH = 0.1
 """The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
 shift repeats in all bearings of the object, so 0.1 is as much as the noise of 100 of them. A larger value solves fewer logs
@@ -34,12 +34,11 @@ again."""
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
     """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
 
-    If no body shifts its bearings enough (`_WORTH`), or if an object would be lost, the estimate is as before, and the
-    second value is None. A second round, from the bodies at the new poses, would change the path by 1 mm and the objects by
-    less than their noise (24 simulated drives between large objects).
+    The bearings of an object that would be lost stay at the centres of its boxes. If no body shifts its bearings enough
+    (`_WORTH`), or if an object would still be lost, the estimate is as before, and the second value is None. A second
+    round, from the bodies at the new poses, would change the path by 1 mm and the objects by less than their noise (24
+    simulated drives between large objects).
     """
-    from objslam.graph import batch_solver
-
     if not state.settings.bodies.use:
         return estimate, None
     # An object that the boxes' centres brought into the graph may have a little less parallax by the centres of bodies.
@@ -53,16 +52,37 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     held = association.object >= 0
     if shift is None or not _any_object((np.linalg.norm(shift, axis=1) / rays.sigma)[held], association.object[held]):
         return estimate, None
+    state = replace(state, settings=settings)
+    solved = _solve(state, keyframes, rays, association, estimate, shift)
+    lost = estimate.solved & ~solved.solved
+    if lost.any():
+        shift = np.where((held & lost[association.object])[:, None], 0.0, shift)
+        solved = _solve(state, keyframes, rays, association, estimate, shift)
+    if (estimate.solved & ~solved.solved).any():
+        return estimate, None
+    if state.trace is not None:
+        state.trace.end_round("bodies", association, solved)
+    return solved, shift
+
+
+def _solve(
+    state: JointState, keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, shift: Floats
+) -> Estimate:
+    """Solve poses and objects once more, with `shift` (R, 3) added to the measured directions.
+
+    keyframes, rays: those of the state without the shared errors of the estimate.
+    """
+    from objslam.graph import batch_solver
+
     measured = state.rays if state.errors is None else state.errors.rays
-    turned = to_centres(measured, shift)
-    errors = None
+    turned, errors = to_centres(measured, shift), None
     if state.errors is not None:
-        errors = replace(with_noise_of(state.errors, estimate), rays=turned, settings=settings)
-    solved = batch_solver.solve_joint(
+        errors = replace(with_noise_of(state.errors, estimate), rays=turned, settings=state.settings)
+    return batch_solver.solve_joint(
         keyframes,
         turned if errors is None else rays,
         association,
-        settings,
+        state.settings,
         state.ledger,
         partial(state.progress, "bodies"),
         estimate.map_T_base @ keyframes.base_T_camera,
@@ -70,11 +90,6 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
         errors,
         None if estimate.calibration is None else estimate.calibration.values,
     )
-    if (estimate.solved & ~solved.solved).any():
-        return estimate, None
-    if state.trace is not None:
-        state.trace.end_round("bodies", association, solved)
-    return solved, shift
 
 
 def to_centres(rays: Rays, added: Floats) -> Rays:

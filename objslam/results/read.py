@@ -122,9 +122,14 @@ def load_truth(path: Path) -> Truth | None:
     return None
 
 
+def is_site(out: Path) -> bool:
+    """Return whether the folder `out` is the map of a site, which has no path. OutputError as `load_summary`."""
+    return (out / files.SUMMARY).is_file() and load_summary(out).get("map_frame") == files.SITE_FRAME
+
+
 def refuse_site(out: Path, name: str) -> None:
     """Raise OutputError if the folder `out` is the map of a site, which never has the file `name` of a run."""
-    if (out / files.SUMMARY).is_file() and load_summary(out).get("map_frame") == files.SITE_FRAME:
+    if is_site(out):
         hint = f"look at {files.PICTURE}, or give the result of one of its sessions"
         raise OutputError(f"this is the map of a site, which has no {name}", where=str(out), hint=hint)
 

@@ -1,10 +1,12 @@
 """The commands `merge` and `diff` on the results of two days, between which one object was taken, moved and added."""
 
+import csv
 import json
 import sys
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 import objslam
 from objslam.cli import main
@@ -74,12 +76,37 @@ def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeyp
         code, _, error = call(monkeypatch, capsys, command, tmp_path / "site")
         assert code == 1
         assert f"this is the map of a site, which has no {missing} (look at map.png" in error
+    exported(call, monkeypatch, capsys, tmp_path / "site", site)
     again = objslam.merge([tmp_path / "site", out / "b"])
     assert len(again) == 1
     assert {o.id for o in again[0].objects} == {o.id for o in site}
     assert all(o.life.sessions_seen >= 2 for o in again[0].objects)
     found = objslam.diff(objslam.Result.load(out / "a"), tmp_path / "site")
     assert found.registration.accepted
+
+
+def exported(call, monkeypatch, capsys, folder, site):
+    """The files of other tools say what became of each object. There is no path to export."""
+    for to in ("csv", "geojson", "mcap", "ply"):
+        assert call(monkeypatch, capsys, "export", folder, "--to", to)[0] == 0
+    states = {o.id: o.life.state for o in (*site, *site.gone)}
+    rows = list(csv.DictReader((folder / "objects.csv").read_text().splitlines()))
+    assert {int(row["id"]): row["state"] for row in rows} == states
+    (moved,) = (o for o in site if o.life.state == "moved")
+    (row,) = (row for row in rows if row["state"] == "moved")
+    assert [float(row[f"moved_from_{axis}"]) for axis in "xyz"] == moved.life.moved_from.tolist()
+    features = json.loads((folder / "objects.geojson").read_text())["features"]
+    told = {one["id"]: one["properties"]["state"] for one in features if one["properties"]["kind"] == "object"}
+    assert told == states
+    assert not any(one["properties"]["kind"] == "path" for one in features)
+    with AnyReader([folder / "map.mcap"]) as reader:
+        (markers,) = [c for c in reader.connections if c.topic == "/objslam/markers"]
+        ((_, _, data),) = reader.messages([markers])
+        texts = [m.text for m in reader.deserialize(data, markers.msgtype).markers if m.text]
+    assert sorted(text.rpartition(", ")[2] for text in texts) == sorted(states[o.id] for o in site if o.status == "ok")
+    code, _, error = call(monkeypatch, capsys, "export", folder, "--to", "g2o")
+    assert code == 1
+    assert "which has no path" in error
 
 
 def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, monkeypatch, capsys):

@@ -15,8 +15,9 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import OBSERVABLE, Calibration
 from objslam.live.calibration.collected import collect
 from objslam.live.calibration.recalibration import recalibrate
-from objslam.live.calibration.worker import Request, Worker
+from objslam.live.calibration.request import CalibrationRequest
 from objslam.live.counters import Counters
+from objslam.live.worker import Worker
 from objslam.sources.journal.records import CalibrationMessage
 
 if TYPE_CHECKING:
@@ -70,8 +71,10 @@ class Calibrator:
         """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
-        self._asked: tuple[int, Request] | None = None  # The keyframes when a calibration began, and what the worker got.
-        self._worker: Worker | None = None
+        self._asked: tuple[int, CalibrationRequest] | None = (
+            None  # The keyframes when a calibration began, and what the worker got.
+        )
+        self._worker: Worker[Calibration | None] = Worker()
         self._known: deque[CalibrationMessage] = deque()
         self._replaying = False
 
@@ -83,7 +86,7 @@ class Calibrator:
         """Continue after the journal of a resumed session. Repeat a calibration that had begun but not been applied."""
         self._replaying = False
         if self._asked is not None:
-            self._worker = Worker(self._asked[1])
+            self._worker.ask(self._asked[1])
 
     def after_keyframe(self) -> bool:
         """Start or apply a calibration if it is due, and return whether the map was corrected."""
@@ -91,7 +94,7 @@ class Calibrator:
         while self._known and self._known[0].keyframe <= number:
             self._take_up(self._known.popleft().calibration)
             self._asked, changed = None, True
-        if self._worker is not None:
+        if self._worker.busy:
             changed |= self._finish(number)
         if number >= self._next:
             self._next = math.ceil(_GROWTH * number)
@@ -101,8 +104,7 @@ class Calibrator:
 
     def close(self) -> None:
         """End the worker."""
-        if self._worker is not None:
-            self._worker.close()
+        self._worker.close()
 
     def _ask(self, number: int) -> None:
         """Begin a calibration with all keyframes, if shared errors are to be estimated and there are objects.
@@ -115,21 +117,20 @@ class Calibrator:
             return
         settings = m.given.model_copy(update={"noise": Noise(rays=False, ranges=False, odometry=False)})
         errors = replace(found.errors, settings=settings)
-        request = Request(errors, found.theta, found.association, found.map_T_camera, settings)
+        request = CalibrationRequest(errors, found.theta, found.association, found.map_T_camera, settings)
         self._asked = number, request
         if not self._replaying:
-            self._worker = Worker(request)
+            self._worker.ask(request)
 
     def _finish(self, number: int) -> bool:
         """Apply the worker's calibration if it is due and changes an error enough. Return whether it was applied."""
         worker, m = self._worker, self._mapper.state
-        assert worker is not None
         assert self._asked is not None
         due = number >= self._asked[0] * (1 + _DELAY) and not m.graph.is_rebuilding
         if not due or not (self._patient or worker.done):
             return False
-        found = worker.result()
-        self._worker = self._asked = None
+        found, self._asked = worker.result(), None
+        worker.close()  # Calibrations are rare, and the process takes memory.
         if found is None:
             self._counters.accept("calibrations given up")
             return False

@@ -18,6 +18,7 @@ from objslam.errors import OutputError, one_line
 from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
+from objslam.live.session.body_estimation import BodyEstimator
 from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import TOO_SLOW, FrameQueue
 from objslam.live.session.intake import Intake
@@ -79,7 +80,8 @@ class Session(Intake):
         self._busy = self._running = self._stopping = False
         self.failure: Exception | None = None
         self._thread = threading.Thread(target=self._work, name="objslam session", daemon=True)
-        self._describer = Describer()
+        self._bodies = BodyEstimator()
+        self._describer = Describer(self._bodies)
         self._asked = -np.inf  # When the oldest request without an answer came, s (`time.perf_counter`).
         self._snapshot = Snapshot(np.nan, ObjectMap(()), Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
 
@@ -149,6 +151,7 @@ class Session(Intake):
         if self._thread.is_alive():
             self._thread.join()
         self._calibrator.close()
+        self._bodies.close()
         if self._journal is not None:
             try:
                 self._journal.close()

@@ -14,6 +14,7 @@ from objslam.graph.maps.live_prior_map import covariance_in_map, map_T_graph
 from objslam.live.mapper.landmark_table import covariances
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
+from objslam.live.session.body_estimation import BodyEstimator
 from objslam.live.session.landmark_description import describe_landmark, describe_track
 
 _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
@@ -22,9 +23,12 @@ _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A s
 class Describer:
     """Describes the objects of a map, and keeps each description until its object is seen again."""
 
-    def __init__(self) -> None:
+    def __init__(self, bodies: BodyEstimator | None = None) -> None:
+        """Prepare for a session. bodies: gives the landmarks bodies, None for points only."""
+        self._bodies = bodies
         # By landmark id: the number of its rays and its last stamp, s, when it was described, and the description.
         self._described: dict[int, tuple[tuple[int, float], MapObject]] = {}
+        self._covariances: dict[int, Floats] = {}  # Of the described landmarks in the graph, (3, 3) m^2, by their ids.
         # By track id: the number of its rays when it was described, and the description.
         self._waiting: dict[int, tuple[int, MapObject]] = {}
         self._tied = False  # Whether the covariances of the descriptions are relative to a prior map.
@@ -53,10 +57,17 @@ class Describer:
                 described = describe_landmark(m, row, points[row], covariances(landmarks, np.array([row]))[0])
                 state = (-1, -np.inf)
             else:
-                described = describe_landmark(m, row, points[row], self._covariance(m, j), from_graph=True)
+                self._covariances[j] = self._covariance(m, j)
+                described = describe_landmark(m, row, points[row], self._covariances[j], from_graph=True)
             found[j] = (state, described)
         self._described = found
         objects = [found[j][1] for j in sorted(found)]
+        if self._bodies is not None:
+            resolved = (o.id for o in objects if o.status == "ok")
+            self._covariances = {j: self._covariances[j] for j in resolved if j in self._covariances}
+            if not whole:
+                self._bodies.update(m, self._covariances)
+            objects = [self._bodies.described(o) for o in objects]
         first = int(landmarks.id.max(initial=-1)) + 1
         waiting = [track for track in m.tracks if len(track.rays) >= m.settings.live.min_rays]
         now = {track.id: self._wait(m, track, whole, end) for track in waiting}

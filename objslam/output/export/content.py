@@ -11,7 +11,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 from objslam.errors import ConfigError
 from objslam.io.odometry_parquet import Motions
-from objslam.results.read import load_map, load_motions, load_trajectory
+from objslam.results.read import is_site, load_map, load_motions, load_trajectory
 
 _SEMI_MAJOR = 6_378_137.0  # The semi-major axis of the WGS 84 ellipsoid, m.
 _FLATTENING = 1 / 298.257223563  # The flattening of the WGS 84 ellipsoid.
@@ -66,11 +66,13 @@ class Content:
 
     out: Path  # The result folder. Error messages name it.
     objects: ObjectMap
-    path: Trajectory  # map_T_base at the stamp of each keyframe.
+    path: Trajectory  # map_T_base at the stamp of each keyframe. The map of a site has no path.
     motions: Motions | None  # The odometry between consecutive poses of the path. None without odometry.
     datum: Datum | None = None  # The position of the map on the earth. None if unknown.
 
 
 def load_content(out: Path, datum: Datum | None = None) -> Content:
-    """Read a result folder. OutputError names a missing or malformed file."""
-    return Content(out, load_map(out), load_trajectory(out), load_motions(out), datum)
+    """Read a result folder or the map of a site. OutputError names a missing or malformed file."""
+    objects = load_map(out)
+    path = Trajectory(np.zeros(0), np.zeros((0, 4, 4))) if is_site(out) else load_trajectory(out)
+    return Content(out, objects, path, load_motions(out), datum)

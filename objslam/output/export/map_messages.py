@@ -92,6 +92,8 @@ class MapMessages:
     def markers(self, stamp: float, objects: ObjectMap, clear_first: bool = False) -> Any:
         """Make a visualization_msgs/MarkerArray: a ball, a 2-sigma ellipsoid and a caption for each resolved object.
 
+        In the map of a site, the caption also says the state of the object.
+
         Args:
             clear_first: whether the first marker deletes all earlier markers.
         """
@@ -101,6 +103,7 @@ class MapMessages:
         for number, (o, name) in enumerate(zip(objects.objects, captions(objects), strict=True)):
             if o.status != "ok":
                 continue
+            name = name if o.life is None else f"{name}, {o.life.state}"
             colour = colours[o.label]
             turn, size = _upright(o)
             size = np.maximum(size, _MIN_SIZE)

@@ -17,7 +17,8 @@ _FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
 def _dump(content: Content) -> bytes:
-    """Return the objects as UTF-8 text. Numbers have all digits of their floats. An unknown value is empty.
+    """Return the objects as UTF-8 text, with those that are gone last. Numbers have all digits of their floats. An unknown
+    value is empty.
 
     A label that a spreadsheet would take for a formula gets an apostrophe in front, as OWASP advises against CSV injection.
     """
@@ -26,7 +27,7 @@ def _dump(content: Content) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(COLUMNS)
-    writer.writerows([_cell(value) for value in o.row().values()] for o in content.objects)
+    writer.writerows([_cell(value) for value in o.row().values()] for o in (*content.objects, *content.objects.gone))
     return text.getvalue().encode()
 
 

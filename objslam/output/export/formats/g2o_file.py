@@ -21,6 +21,9 @@ def _dump(content: Content) -> bytes:
     """
     import numpy as np
 
+    from objslam.results.read import refuse_site
+
+    refuse_site(content.out, "path")
     motions, path = content.motions, content.path
     if motions is None:
         raise OutputError(

@@ -24,10 +24,10 @@ def _dump(content: Content) -> bytes:
     With a datum, coordinates are WGS 84 longitude and latitude, as the RFC requires. Without a datum, coordinates are in m,
     in the map's frame, and the member `coordinates_in` names this frame. Heights are properties, because the height of a map
     above the ellipsoid is unknown. An object with a body has a second feature, its footprint. An unresolved object is a
-    feature without a geometry.
+    feature without a geometry. In the map of a site, an object has its `state`, and objects that are gone come too.
     """
     datum, path = content.datum, content.path
-    features = [_object(o, datum) for o in content.objects.objects]
+    features = [_object(o, datum) for o in (*content.objects.objects, *content.objects.gone)]
     if len(path) > 1:
         geometry = {"type": "LineString", "coordinates": _coordinates(path.poses[:, :3, 3], datum)}
         properties = {"kind": "path", "start": float(path.stamps[0]), "end": float(path.stamps[-1])}
@@ -49,6 +49,11 @@ def _object(o: MapObject, datum: Datum | None) -> dict[str, Any]:
     geometry: dict[str, Any] | None = None
     if o.body is not None:
         properties |= {"shape": o.body.shape, "size": o.body.size.tolist(), "yaw": o.body.yaw}
+    if o.life is not None:
+        properties |= {
+            name: getattr(o.life, name) for name in ("state", "probability", "sessions_expected", "sessions_seen")
+        }
+        properties |= {"updated": _finite(o.life.updated)}
     if o.status == "ok":
         geometry = {"type": "Point", "coordinates": _coordinates(o.position[None], datum)[0]}
     return {"type": "Feature", "geometry": geometry, "properties": properties, "id": o.id}

@@ -1,0 +1,146 @@
+"""Work beside a running session, in a separate process, because GTSAM and numpy stop the other threads of their process."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Generic, Protocol, TypeVar
+
+Answer_co = TypeVar("Answer_co", covariant=True)
+Answer = TypeVar("Answer")
+
+_PATIENT = 600.0
+"""The longest time, s, that a request may take. A larger value waits longer for a process that hangs."""
+_NICE = 10
+"""The niceness of the process, added to the session's (`os.nice`). A larger number leaves more CPU time to the session."""
+_THREADS = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_LENGTH = struct.Struct("<Q")
+"""A message begins with its length, bytes."""
+
+
+class Request(Protocol[Answer_co]):
+    """Work for a process of its own. It is pickled, and so is its answer."""
+
+    def solve(self) -> Answer_co:
+        """Return the answer."""
+
+
+class Worker(Generic[Answer]):
+    """A process that solves one request after another. It starts with the first one, and once more after a failure."""
+
+    def __init__(self) -> None:
+        self._answer: Answer | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread: threading.Thread | None = None
+
+    def ask(self, request: Request[Answer]) -> None:
+        """Send a request. The process must not have an earlier one whose `result` was not taken."""
+        self._answer = None
+        if self._process is None or self._process.poll() is not None:
+            self._process = _start()
+        self._thread = threading.Thread(target=self._run, args=(pickle.dumps(request),), name="objslam worker", daemon=True)
+        self._thread.start()
+
+    @property
+    def busy(self) -> bool:
+        """Whether there is a request whose `result` was not taken."""
+        return self._thread is not None
+
+    @property
+    def done(self) -> bool:
+        """Whether there is a request, and `result` returns at once."""
+        return self._thread is not None and not self._thread.is_alive()
+
+    def result(self) -> Answer | None:
+        """Wait for the answer to the request, and return it. None if the process failed."""
+        if self._thread is not None:
+            self._thread.join()
+        self._thread = None
+        return self._answer
+
+    def close(self) -> None:
+        """End the process without waiting for its answer."""
+        if self._process is not None:
+            self._process.kill()
+        if self._thread is not None:
+            self._thread.join()
+        if self._process is not None:
+            _reap(self._process)
+        self._thread = self._process = None
+
+    def _run(self, request: bytes) -> None:
+        process = self._process
+        if process is None or process.stdin is None or process.stdout is None:
+            return
+        limit = threading.Timer(_PATIENT, process.kill)
+        limit.daemon = True
+        limit.start()
+        with suppress(OSError):  # The process has ended.
+            _write(process.stdin, request)
+            answer = _read(process.stdout)
+            if answer is not None:
+                self._answer = pickle.loads(answer)  # noqa: S301 - this program wrote it
+        limit.cancel()
+        if self._answer is None:  # It failed, or its answer is None. The next request gets a new process.
+            _reap(process)
+
+
+def _start() -> subprocess.Popen[bytes] | None:
+    package = str(Path(__file__).parents[2])
+    paths = os.pathsep.join([package, *filter(None, [os.environ.get("PYTHONPATH")])])
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-m", __name__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, **_THREADS, "PYTHONPATH": paths},
+            start_new_session=True,  # Ctrl+C ends the session, and the session ends this process.
+        )
+    except OSError:  # Then `Worker.result` returns None.
+        return None
+
+
+def _reap(process: subprocess.Popen[bytes]) -> None:
+    """End a process, and close its pipes."""
+    process.kill()
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with suppress(OSError):  # What was not written yet cannot be written any more.
+                pipe.close()
+    process.wait()
+
+
+def _write(pipe: IO[bytes], content: bytes) -> None:
+    pipe.write(_LENGTH.pack(len(content)) + content)
+    pipe.flush()
+
+
+def _read(pipe: IO[bytes]) -> bytes | None:
+    """Return the next message, None at the end of the pipe."""
+    head = pipe.read(_LENGTH.size)
+    if len(head) < _LENGTH.size:
+        return None
+    (length,) = _LENGTH.unpack(head)
+    content = pipe.read(length)
+    return content if len(content) == length else None
+
+
+def main() -> None:
+    """Read requests from stdin, and write their answers to stdout."""
+    os.nice(_NICE)
+    with os.fdopen(os.dup(sys.stdout.fileno()), "wb") as answers:
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # What a library prints must not get between the answers.
+        while (content := _read(sys.stdin.buffer)) is not None:
+            request: Request[object] = pickle.loads(content)  # noqa: S301 - this program wrote it
+            _write(answers, pickle.dumps(request.solve()))
+
+
+if __name__ == "__main__":
+    main()
