@@ -44,11 +44,11 @@ class _Stream(Generic[T]):
         usual = sorted(self.steps)[(len(self.steps) - 1) // 2] if self.steps else None
         return stamp + (_APART if usual is None else max(_LAG, _STEPS * usual))
 
-    def leaps(self, stamp: float, clock: float) -> bool:
+    def leaps(self, stamp: float, clock: float, alone: bool) -> bool:
         """Return whether a stamp is too far ahead of the stream, and of the clock of the others."""
-        if self.last is None:
-            return -float("inf") < clock < stamp - _LAG
-        return stamp > clock + _LAG and stamp > self.reach(self.last)
+        if clock == -float("inf") and not (alone and self.last is not None):  # There is nothing to compare it with.
+            return False
+        return stamp > clock + _LAG and (self.last is None or stamp > self.reach(self.last))
 
     def chain(self) -> list[float]:
         """Return the stamps that wait and lead to the newest of them, in order."""
@@ -90,7 +90,7 @@ class StampLeaps(Generic[T]):
         """
         s = self._streams.setdefault(stream, _Stream())
         before = s.last
-        if s.leaps(stamp, clock):
+        if s.leaps(stamp, clock, alone):
             s.waiting.append((stamp, message))
             chain = s.chain()
             if len(chain) < _SURE or not (alone or stamp <= clock + _APART):
