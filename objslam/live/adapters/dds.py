@@ -15,7 +15,9 @@ from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED, is_read
 
 _LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
-_TAKE = 200  # The most messages that one call takes from a reader. A larger number makes fewer calls, and costs memory.
+_TAKE = 50
+"""The most messages that are taken from one reader before the next reader's turn. With a larger number, a flood of one topic
+delays the other topics more, and each message costs a little less."""
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
 _MAX_PUBLICATIONS = 1000
 """The most publishers of types that objslam reads. With a larger number, it takes longer to choose topics among made-up
@@ -161,22 +163,18 @@ class DdsAdapter:
         return _Reader(publication, entity, make_decoder(Connection(topic, type_, "cdr")), time.monotonic())
 
     def _take(self, reader: _Reader, found: Any) -> None:
-        """Push the messages that wait in a reader, at most QUEUE, so that other readers and a stop do not wait long."""
-        for _ in range(QUEUE // _TAKE):
-            samples = reader.entity.take(_TAKE)
-            for sample in samples:
-                info = sample.sample_info
-                if not info.valid_data or not self._is_mine(reader, info.publication_handle, found):
-                    continue
-                try:
-                    check_size(reader.of.type, sample.data, "cdr")
-                    message = reader.decode(sample.data)
-                except DecodeError as error:
-                    self.messages.refuse("message that cannot be decoded", f"{reader.of.topic}: {error}")
-                    continue
-                self.messages.receive(reader.of.type, reader.of.topic, message, info.source_timestamp / 1e9)
-            if len(samples) < _TAKE:
-                return
+        """Push messages that wait in a reader, at most _TAKE, so that other readers and a stop do not wait long."""
+        for sample in reader.entity.take(_TAKE):
+            info = sample.sample_info
+            if not info.valid_data or not self._is_mine(reader, info.publication_handle, found):
+                continue
+            try:
+                check_size(reader.of.type, sample.data, "cdr")
+                message = reader.decode(sample.data)
+            except DecodeError as error:
+                self.messages.refuse("message that cannot be decoded", f"{reader.of.topic}: {error}")
+                continue
+            self.messages.receive(reader.of.type, reader.of.topic, message, info.source_timestamp / 1e9)
 
     def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
         """Return whether this reader pushes a message of the publisher with this handle.
