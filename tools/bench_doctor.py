@@ -71,7 +71,7 @@ def told(log: Log, settings: Settings, solve: bool) -> str:
     """What the checks say of a log, and how the errors of a map compare with its sigmas."""
     try:
         if not solve:
-            return "; ".join(finding.message for finding in diagnose(log, settings).findings) or "-"
+            return "; ".join(finding.message for finding in diagnose(log, settings, Ledger()).findings) or "-"
         ledger = Ledger()
         result = pipeline.run(log, settings, ledger)
     except ObjslamError as error:
@@ -107,7 +107,7 @@ def clean(number: int, modes: list[str]) -> None:
     """Print how many clean logs are found fault with."""
     alarms, logs = 0, 0
     for mode, log in drives(number, modes):
-        found = diagnose(log, load_settings(None, (f"mode={mode}",)), thorough=True).findings
+        found = diagnose(log, load_settings(None, (f"mode={mode}",)), Ledger(), thorough=True).findings
         alarms, logs = alarms + bool(found), logs + 1
         for finding in found:
             print(f"{mode}: {finding.message}", flush=True)

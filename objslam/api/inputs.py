@@ -32,7 +32,10 @@ class Trajectory(types.Trajectory):
 
         poses: (N, 3) x, y, yaw, (N, 7) x, y, z, qx, qy, qz, qw, or (N, 4, 4), in m and rad. ValueError names a wrong row.
         """
-        return cls(as_stamps(stamps), as_poses(poses))
+        times, rows = as_stamps(stamps), as_poses(poses)
+        if len(times) != len(rows):
+            raise ValueError(f"a trajectory needs one pose for each stamp, got {len(rows)} for {len(times)}")
+        return cls(times, rows)
 
     def to_arrow(self) -> pa.Table:
         """Return a pyarrow table with the columns stamp, x, y, z, qx, qy, qz, qw."""
@@ -78,8 +81,12 @@ class Detections(types.Detections):
         times = as_stamps(stamps)
         if len(frames) != len(times):
             raise ValueError(f"boxes needs one list for each stamp, got {len(frames)} for {len(times)}")
-        if [len(one) for one in labels] != counts:
-            raise ValueError("labels needs one list for each frame, with one name for each of its boxes")
+        if len(labels) != len(counts):
+            raise ValueError(f"labels needs one list for each frame, got {len(labels)} for {len(counts)}")
+        for k, (one, count) in enumerate(zip(labels, counts, strict=True)):
+            if isinstance(one, str) or len(one) != count:
+                got = repr(one) if isinstance(one, str) else len(one)
+                raise ValueError(f"frame {k}: labels needs one list with one name for each of its {count} boxes, got {got}")
         if max(counts, default=0) > types.MAX_BOXES:
             raise ValueError(f"a frame has more than {types.MAX_BOXES} boxes")
         corners, score = np.concatenate([*frames, np.zeros((0, 4))]), per_box(scores, counts, 1.0, "scores")

@@ -11,7 +11,7 @@ import numpy as np
 
 from objslam.api.inputs import Trajectory
 from objslam.core import types
-from objslam.core.result import RunResult
+from objslam.core.result import Doubt, RunResult
 from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
 from objslam.io.views_parquet import Views
@@ -52,7 +52,7 @@ class Result:
 
         stamps, first = np.unique(result.keyframes.stamps, return_index=True)
         return cls(
-            ObjectMap(result.map.objects, result.map.frame),
+            ObjectMap(**vars(result.map)),
             Trajectory(stamps, result.map_T_base[first]),
             Trajectory(result.path_after.stamps, result.path_after.poses),
             rays_table(result),
@@ -110,6 +110,15 @@ class Result:
         run = self._run.result
         margins = run.settings.rays.border, run.settings.rays.border_share
         return None if run.views is None else Views.of(run.views, run.cameras, *margins)
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What is doubtful in the map, in words and numbers. Empty for a result of an older version."""
+        from objslam.results import read
+
+        if self._run is not None:
+            return self._run.result.doubts
+        return () if self.folder is None else read.load_doubts(self.folder) or ()
 
     @property
     def localised(self) -> bool:

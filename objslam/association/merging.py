@@ -55,7 +55,7 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
     if len(a) == 0:
         return target
     pairs = _with_rays(a, b, state)
-    both_seen, both_expected, seen_a, seen_b = _common_frames(state.history, a, b)
+    both_seen, both_expected, seen_a, seen_b = common_frames(state.history, a, b)
     gain = _gains(state, gate, pairs, both_seen, both_expected)
     apart = _seen_apart(obs, pairs, state.matched)
     should = seen_a * seen_b / np.maximum(both_expected, 1.0)  # The frames with both, if detections are independent.
@@ -151,7 +151,7 @@ def _ray_costs(r: Observations, position: Floats, noise: Floats, gate: float) ->
     return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise) + range_costs(r, distance), gate)
 
 
-def _common_frames(history: DetectionHistory, a: Ints, b: Ints) -> list[Ints]:
+def common_frames(history: DetectionHistory, a: Ints, b: Ints) -> list[Ints]:
     """Return four counts (P,) of frames: both landmarks detected, both expected, a detected and b expected, a expected
     and b detected."""
     from scipy.sparse import csr_array
@@ -175,8 +175,8 @@ def _seen_apart(obs: Observations, pairs: _Pairs, matched: Ints) -> Ints:
 
 
 def overlap(one: Floats, two: Floats) -> Floats:
-    """Return the intersection over union (B,) of each pair of boxes (B, 4)."""
-    low, high = np.maximum(one[:, :2], two[:, :2]), np.minimum(one[:, 2:], two[:, 2:])
-    common = np.maximum(high - low, 0.0).prod(axis=1)
-    total = (one[:, 2:] - one[:, :2]).prod(axis=1) + (two[:, 2:] - two[:, :2]).prod(axis=1) - common
+    """Return the intersection over union of boxes (..., 4), for shapes that fit together."""
+    low, high = np.maximum(one[..., :2], two[..., :2]), np.minimum(one[..., 2:], two[..., 2:])
+    common = np.maximum(high - low, 0.0).prod(axis=-1)
+    total = (one[..., 2:] - one[..., :2]).prod(axis=-1) + (two[..., 2:] - two[..., :2]).prod(axis=-1) - common
     return np.asarray(common / np.maximum(total, 1e-12))

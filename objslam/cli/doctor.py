@@ -43,7 +43,7 @@ def doctor(
         chosen = chosen_poses(given, settings)
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
-        found = diagnose(said, settings, show, thorough=True)
+        found = diagnose(said, settings, ledger, show, thorough=True)
         solved = _solved(given, settings, show) if found.refutable and settings.mode == "joint" else None
     report(ledger)
     _show_trials(found)

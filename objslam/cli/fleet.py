@@ -207,6 +207,6 @@ def _say(found: FleetResult, summary: dict[str, Any]) -> None:
         state = "" if one.changed else ", as before"
         say(f"{one.site}: {one.objects} objects ({one.gone} gone) from {one.sessions} sessions{more}{state}")
     for failure in found.failures[:20]:
-        say(f"failed ({failure.kind}): {failure.name}: {failure.error}", stderr=True)
+        say(f"failed ({failure.kind}): {failure.name}: {failure.error.removeprefix(f'{failure.name}: ')}", stderr=True)
     say(f"{len(found.mapped)} logs mapped, {found.new} of them now, in {summary['seconds']:.0f} s")
     say(f"wrote {summary['out']}")

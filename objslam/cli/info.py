@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from objslam.sources.ros_bag.info import BagInfo
     from objslam.sources.summary import Contents, Timing
 
-_EPOCH = 1e8  # Larger timestamps (s) count from 1970, because no drive takes 3 years. No recording is older than 1973.
 _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
 
 
@@ -33,7 +32,8 @@ def info(
 ) -> None:
     """Describe a recording: streams, rates, gaps, times, the role of each topic, and what is missing for a run."""
     from objslam.core.diagnostics import Ledger
-    from objslam.mapping.checks.boxes import check_boxes, check_stamps
+    from objslam.mapping.checks.boxes import check_boxes
+    from objslam.mapping.checks.stamps import check_stamps
     from objslam.results.files import dump_json
     from objslam.sources.ros_bag.info import describe
     from objslam.sources.summary import contents
@@ -45,7 +45,7 @@ def info(
         return
     ledger = Ledger()
     log = read(source, ledger, options)
-    for finding in (check_stamps(log), *check_boxes(log)):
+    for finding in (check_stamps(log), *check_boxes(log, ledger)):
         if finding is not None:
             ledger.warn(finding.message)
     found = contents(log)
@@ -121,8 +121,9 @@ def _numbers(when: Timing, begin: float) -> tuple[str, ...]:
 
 
 def _span(start: float, end: float) -> str:
-    epoch = start > _EPOCH
-    first = datetime.fromtimestamp(start, UTC).strftime("%Y-%m-%d %H:%M:%S UTC") if epoch else f"{start:.3f} s"
+    from objslam.core.validity import is_date
+
+    first = datetime.fromtimestamp(start, UTC).strftime("%Y-%m-%d %H:%M:%S UTC") if is_date(start) else f"{start:.3f} s"
     return f"{end - start:.1f} s from {first}"
 
 

@@ -48,7 +48,7 @@ def export(
     journal: Journal,
     out: Annotated[Path, typer.Option("-o", "--out", help="The file to write.")] = Path("journal.jsonl"),
 ) -> None:
-    """Write the messages as JSON lines, which `objslam live stdin` reads. `objslam convert` makes a log folder of them."""
+    """Write the messages as JSON lines, for `objslam live stdin`. For a log folder: `objslam convert JOURNAL LOG`."""
     from collections import Counter
 
     from objslam.core.diagnostics import Ledger

@@ -15,7 +15,10 @@ def report_result(
     ] = None,
     crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Image crops of each object (its best boxes).")] = 4,
 ) -> None:
-    """Write report.html with the map in 3D, objects, residuals, evaluation and settings of a result. It works offline."""
+    """Write report.html with the map in 3D, objects, residuals, evaluation and settings of a result. It works offline.
+
+    The page of a site has its sessions, and what became of each object.
+    """
     from objslam.output.report import write_report
 
     with progress_bar() as show:

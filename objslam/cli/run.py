@@ -161,8 +161,9 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         say(f"noise found in the log, as a multiple of the settings: {', '.join(found)}")
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
+    lost = f" and {counts['unresolved']} unresolved" if counts["unresolved"] else ""
     say(
-        f"{resolved} object{'' if resolved == 1 else 's'} ({counts['unresolved']} unresolved) from {counts['rays']} rays "
+        f"{resolved} object{'' if resolved == 1 else 's'}{lost} from {counts['rays']} rays "
         f"({counts['rays_unexplained']} of no object) in {counts['keyframes']} keyframes{more}"
     )
     if told := result.summary.get("localisation"):

@@ -55,6 +55,12 @@ class Calibration:
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
+    def root(self) -> Floats:
+        """(P, P) a matrix whose product with its own transpose is the covariance."""
+        size, axes = np.linalg.eigh(self.covariance)
+        return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+    @property
     def expected(self) -> Floats:
         """(P,) values that were expected before the solve."""
         return np.zeros(len(self.names)) if self.prior_mean is None else self.prior_mean

@@ -21,7 +21,9 @@ class Estimate:
     of the last solve. For Eq. 1 the error is the sum of distances, m. calibration: the shared errors that were estimated, or
     None. The poses fit measurements that are corrected by them. noise: the estimated noise, None if none was estimated.
     box_offset: the standard deviation of the error that all box centres of an object share, divided by the object's size.
-    None if boxes have no size. tags: the rotation and the size of each fiducial that has them, by the index of its object.
+    None if boxes have no size. correlated: (N, 3, m) m, the part of the errors that is correlated between objects, as a
+    factor of their joint covariance. It is 0 for an object that was not solved, and None if all objects are independent.
+    tags: the rotation and the size of each fiducial that has them, by the index of its object.
     """
 
     map_T_base: Floats
@@ -36,4 +38,5 @@ class Estimate:
     calibration: Calibration | None = None
     noise: NoiseFactors | None = None
     box_offset: float | None = None
+    correlated: Floats | None = None
     tags: Mapping[int, TagPose] = field(default_factory=dict)

@@ -86,7 +86,12 @@ def is_planar(poses: Floats, tolerance: float = 1e-6) -> bool:
 def log_se3(pose: Floats) -> Floats:
     """Return the logarithm (N, 6) of poses (N, 4, 4), the twist whose exponential is the pose."""
     omega = rotation_vector(pose[..., :3, :3])
-    return np.concatenate([omega, (_left_jacobian_inverse(omega) @ pose[..., :3, 3:])[..., 0]], axis=-1)
+    angle, small, safe = _angles(omega)
+    half = safe / 2
+    share = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / safe**2)
+    place, across = pose[..., :3, 3:], skew(omega)
+    once = across @ place  # The inverse of the left Jacobian, times the place (Barfoot, eq. 8.35).
+    return np.concatenate([omega, (place - once / 2 + share * (across @ once))[..., 0]], axis=-1)
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
@@ -139,14 +144,6 @@ def _left_jacobian(omega: Floats) -> Floats:
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
     w = skew(omega)
     return np.eye(3) + a * w + b * (w @ w)
-
-
-def _left_jacobian_inverse(omega: Floats) -> Floats:
-    angle, small, safe = _angles(omega)
-    half = safe / 2
-    b = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / safe**2)
-    w = skew(omega)
-    return np.eye(3) - 0.5 * w + b * (w @ w)
 
 
 def adjoint(pose: Floats) -> Floats:

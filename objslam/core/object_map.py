@@ -154,12 +154,14 @@ class ObjectMap:
     """The objects of one map, in the coordinate frame that `frame` names.
 
     A map is a sequence of its objects. Spatial queries return resolved objects only. A point is x, y, z in m, or x, y to
-    ignore heights. gone: objects of earlier sessions that are no longer there.
+    ignore heights. gone: objects of earlier sessions that are no longer there. shared_covariance: (7, 7) of the error that
+    all objects share (`core.maps.shared_covariance`). The covariances of the objects contain it. None if it is not known.
     """
 
     objects: tuple[MapObject, ...]
     frame: str = "map"
     gone: tuple[MapObject, ...] = ()
+    shared_covariance: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -176,8 +178,8 @@ class ObjectMap:
         return replace(self, objects=self.objects[index]) if isinstance(index, slice) else self.objects[index]
 
     def __repr__(self) -> str:
-        lost = len(self) - len(self.resolved())
-        head = f"ObjectMap of {len(self)} objects ({lost} unresolved) in the frame {self.frame!r}"
+        lost, plural = len(self) - len(self.resolved()), "" if len(self) == 1 else "s"
+        head = f"ObjectMap of {len(self)} object{plural} ({lost} unresolved) in the frame {self.frame!r}"
         more = [f"  ... and {len(self) - _SHOWN} more"] if len(self) > _SHOWN else []
         return "\n".join([head, *(f"  {o}" for o in self.objects[:_SHOWN]), *more])
 
@@ -236,7 +238,8 @@ class ObjectMap:
         objects = [_fuse(o, other.objects[pairs[i]]) if i in pairs else o for i, o in enumerate(self.objects)]
         taken, number = set(pairs.values()), max((o.id for o in self.objects), default=-1) + 1
         rest = [o for k, o in enumerate(other.objects) if k not in taken]
-        return replace(self, objects=(*objects, *(replace(o, id=number + k) for k, o in enumerate(rest))))
+        both = (*objects, *(replace(o, id=number + k) for k, o in enumerate(rest)))
+        return replace(self, objects=both, shared_covariance=None)
 
     def _placed(self, label: str | None) -> tuple[list[MapObject], Floats]:
         objects = [o for o in self.resolved() if label in (None, o.label)]

@@ -1,15 +1,60 @@
-"""The result of a run, from which every output is made."""
+"""The result of a run, from which every output is made, and the doubts about it."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, Self
+
+import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.trace import Round
 from objslam.core.types import Association, Images, Keyframes, Rays, Surface, Trajectory
+
+DoubtKind = Literal["pair", "split", "unresolved", "boxes"]
+DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "unresolved", "boxes")
+"""The kinds of doubts: two objects that may be one, an object that may be two, an object without a position, and boxes that
+became no object."""
+
+
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """One doubt about a map.
+
+    reason: short and fixed, for programs. label: of the object or the boxes. text: one sentence, for people. objects: the
+    ids of the objects that it is about. position: (3,) m, where it is, None if it belongs to no place. rays: the rows of its
+    boxes in rays.parquet. numbers: the measured numbers behind the sentence, with units in their names.
+    """
+
+    kind: DoubtKind
+    reason: str
+    label: str
+    text: str
+    objects: tuple[int, ...]
+    position: Floats | None
+    rays: Ints
+    numbers: dict[str, float]
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> Self:
+        """Return the doubt of an entry of doubts.json. The entry must be valid."""
+        position = None if entry["position"] is None else np.array(entry["position"], dtype=np.float64)
+        numbers = {name: np.nan if value is None else float(value) for name, value in entry["numbers"].items()}
+        kind, reason, label, text = (entry[name] for name in ("kind", "reason", "label", "text"))
+        return cls(
+            kind, reason, label, text, tuple(entry["objects"]), position, np.array(entry["rays"], dtype=np.int64), numbers
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry of doubts.json. `from_dict` returns the same doubt, with numbers rounded to 6 digits."""
+        numbers = {name: round(float(value), 6) if np.isfinite(value) else None for name, value in self.numbers.items()}
+        position = None if self.position is None else [round(float(x), 6) for x in self.position]
+        return {
+            **{"kind": self.kind, "reason": self.reason, "label": self.label, "text": self.text},
+            **{"objects": list(self.objects), "position": position, "numbers": numbers, "rays": self.rays.tolist()},
+        }
 
 
 @dataclass(frozen=True)
@@ -24,7 +69,8 @@ class RunResult:
     camera. surface: the surroundings, None without depth images. surface_before: the surroundings at the poses before the
     estimation, None unless the settings ask for it. calibration: the shared errors that were estimated, None if none were.
     residual_before: (R,) rad, the residual before the correction of the shared errors, None if none were estimated. views:
-    all camera frames on the path, also those without a box, at the solved poses. None if they were not asked for.
+    all camera frames on the path, also those without a box, at the solved poses. None if they were not asked for. doubts:
+    what is doubtful in the result, in words. Their rays are indices into `rays`.
     """
 
     map: ObjectMap
@@ -48,3 +94,4 @@ class RunResult:
     calibration: Calibration | None = None
     residual_before: Floats | None = None
     views: Keyframes | None = None
+    doubts: tuple[Doubt, ...] = ()

@@ -8,8 +8,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 
 _SMALL = 1e-4
-"""If the sine of half a rotation angle is smaller than this, a series replaces angle / sine, which tends to 0 / 0. A larger
-value makes the series less exact. At this value, its relative error is below 1e-17."""
+"""If the sine of a rotation angle, or of half of it, is smaller than this, a series replaces angle / sine, which tends to
+0 / 0. A larger value makes the series less exact. At this value, its relative error is below 1e-17."""
 
 
 def _cross_product_map() -> Floats:
@@ -38,7 +38,19 @@ def rotation_from_vector(omega: Floats) -> Floats:
 
 def rotation_vector(rotation: Floats) -> Floats:
     """Return the vectors (..., 3) about which rotations (..., 3, 3) turn, with the angles, rad in [0, pi], as lengths."""
-    xyzw = quaternion_from_rotation(rotation)
+    r = rotation
+    cosine = (r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1) / 2
+    if not (cosine > 0).all():  # The sine of an angle near pi is small, so that the axis would be inexact.
+        return _vector_of_quaternion(quaternion_from_rotation(rotation))
+    axis = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1) / 2
+    sine = np.sqrt((axis * axis).sum(axis=-1))
+    small = sine < _SMALL
+    ratio = np.where(small, 1 + sine**2 / 6, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))
+    return np.asarray(axis * ratio[..., None])
+
+
+def _vector_of_quaternion(xyzw: Floats) -> Floats:
+    """Return the rotation vectors (..., 3) of unit quaternions (..., 4) x, y, z, w with w >= 0."""
     sine, cosine = np.linalg.norm(xyzw[..., :3], axis=-1, keepdims=True), xyzw[..., 3:]
     small = sine < _SMALL
     angle = 2 * np.arctan2(sine, cosine)

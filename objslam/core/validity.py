@@ -16,6 +16,10 @@ checks of a run can name this mistake."""
 MAX_LIVE_STAMP = 1e11
 """The bound of a stamp of a running robot, s. A larger bound accepts more wrong numbers. At this bound, a float
 resolves 15 us."""
+NO_AREA = "box without area (x2 <= x1 or y2 <= y1)"
+"""The reason for which a box without area is dropped."""
+_LAST_DATE = 9e9
+"""The Unix time, s, up to which a stamp counts as a date. A larger bound overflows the 64 bits of a time in ns."""
 MAX_PIXEL = 1e7
 """The bound of a box corner and of an element of a camera matrix, px. A larger bound accepts more wrong numbers. The largest
 image is a hundredth of it."""
@@ -143,6 +147,11 @@ def _possible(noise: RangeNoise) -> bool:
     return plain and noise.sigma > 0 and noise.sigma_per_m >= 0 and noise.bias >= 0
 
 
+def is_date(stamp: float) -> bool:
+    """Return whether a stamp, s, is Unix time. Other clocks start at 0 and stay below the limit of about three years."""
+    return 1e8 < stamp < _LAST_DATE
+
+
 def is_name(value: object) -> bool:
     """Return whether a value is a printable text on one line that is not blank."""
     return isinstance(value, str) and value.isprintable() and bool(value.strip())
@@ -157,7 +166,7 @@ def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools,
         area = (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])
     return (
         (np.asarray((np.abs(boxes) < MAX_PIXEL).all(axis=1)), "box with a corner that is not finite or too large"),
-        (area, "box without area (x2 <= x1 or y2 <= y1)"),
+        (area, NO_AREA),
         ((scores >= 0) & (scores <= 1), "box with a score outside 0 to 1"),
         (names, "box with a label that is empty or not printable"),
     )

@@ -65,12 +65,15 @@ def match_points(source: Floats, target: Floats, same: Bools, radius: float) -> 
     Returns:
         For each pair, the index of its point in `source` (increasing), and the index of its point in `target`.
     """
-    from scipy.optimize import linear_sum_assignment
-
     if not same.any():
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     squared = ((source[:, None] - target[None]) ** 2).sum(axis=2)
     allowed = same & (squared <= radius**2)
+    if allowed.sum(axis=0).max() <= 1 and allowed.sum(axis=1).max() <= 1:
+        rows, columns = np.nonzero(allowed)  # No point has a choice, so the slow import below is not needed.
+        return rows, columns
+    from scipy.optimize import linear_sum_assignment
+
     # A forbidden pair costs more than all allowed pairs together, so the number of allowed pairs is as large as possible.
     rows, columns = linear_sum_assignment(np.where(allowed, squared, 2 * radius**2 * (min(squared.shape) + 1)))
     kept = allowed[rows, columns]

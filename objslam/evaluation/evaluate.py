@@ -117,6 +117,9 @@ class Evaluation:
         }
 
 
+_NAMED = 3  # The most labels that a warning names. A larger number makes the line longer.
+
+
 def evaluate(
     map: ObjectMap,
     truth: Truth | None,
@@ -197,12 +200,24 @@ def _squared(offset: Floats, covariance: Floats) -> float:
     return float(offset @ np.linalg.pinv(covariance, hermitian=True) @ offset)
 
 
+def _some(names: set[str]) -> str:
+    """Return the first few names of a set, as text."""
+    first = sorted(names)[:_NAMED]
+    return ", ".join(first) + (", ..." if len(names) > len(first) else "")
+
+
 def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Alignment) -> list[str]:
     warnings = []
     few = 4 if kind in ("se3", "sim3") else 3
     if objects is not None and kind != "none" and 0 < len(objects.matches) < few:
         warnings.append(f"the alignment rests on {len(objects.matches)} matched objects only, so their errors mean little")
-    if objects is not None and kind == "none" and objects.false and 2 * len(objects.matches) < len(objects.missed):
+    if objects is not None and objects.false and not objects.matches and objects.missed:
+        of_map, of_truth = ({o.label for o in group} for group in (objects.false, objects.missed))
+        if not of_map & of_truth:
+            warnings.append(
+                f"the map and the truth have no label in common: {_some(of_map)} in the map, {_some(of_truth)} in the truth"
+            )
+    elif objects is not None and kind == "none" and objects.false and 2 * len(objects.matches) < len(objects.missed):
         warnings.append("few objects match the truth: if the map has its own frame, use --align se2")
     if objects is not None and not 0.5 <= objects.transform.scale <= 2.0:
         warnings.append(

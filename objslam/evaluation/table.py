@@ -59,13 +59,13 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
 
     data = evaluation.to_dict()
     title = f"align {evaluation.align} ({evaluation.why}), radius {evaluation.radius:g} m"
-    scores = Table(title=title)
+    scores = Table()
     scores.add_column("against the ground truth" if evaluation.truth is None else f"against {evaluation.truth}")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
     for key, name, unit in (*rows, *(_BODY_ROWS if data["bodies"] else ()), *(_TAG_ROWS if data["tags"] else ())):
         scores.add_row(name, _cell(data[key], unit))
-    parts: list[RenderableType] = [scores]
+    parts: list[RenderableType] = [title, scores]
     if evaluation.objects is not None:
         listing = Table(title="objects, the worst first")
         for column in ("object", "truth", "label", "error (m)"):

@@ -178,7 +178,7 @@ def _add(found: FleetResult, place: LogPlace, record: Record, *, new: bool) -> b
 
 
 def _day(stamp: float) -> str:
-    from objslam.output.plot.style import is_date
+    from objslam.core.validity import is_date
 
     return datetime.fromtimestamp(stamp, UTC).strftime("%Y-%m-%d") if is_date(stamp) else UNDATED
 

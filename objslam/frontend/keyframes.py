@@ -27,7 +27,9 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
 
     found = [(index, c.detections) for index, c in enumerate(log.cameras) if c.detections is not None]
     if not any(len(detections.frame_stamps) for _, detections in found):
-        raise LogError("there are no detection frames", where=log.name, hint="give detections.jsonl or a detector")
+        raise LogError(
+            "there are no detection frames", where=log.name, hint="give detections.jsonl, or --detector MODEL.onnx"
+        )
     camera = np.concatenate([np.full(len(detections.frame_stamps), index) for index, detections in found])
     frame = np.concatenate([np.arange(len(detections.frame_stamps)) for _, detections in found])
     stamps = np.concatenate([detections.frame_stamps for _, detections in found])
@@ -58,11 +60,18 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
             base_T_camera[mine] = poses
             valid[mine] &= on_mount
     if not valid.any():
+        if on_path.any():
+            hint = "the odometry or camera_poses do not cover the frames on the path: check their stamps"
+        elif ((stamps >= path.stamps[0]) & (stamps <= path.stamps[-1])).any() and len(path) > 1:
+            every = float(np.median(np.diff(path.stamps)))
+            hint = f"its poses are {every:.3g} s apart: raise poses.max_gap to bridge longer gaps"
+        else:
+            hint = "check that both use the same clock"
         raise LogError(
             f"none of the {len(stamps)} detection frames lies on the robot's path "
             f"(frames {stamps[0]:.3f} to {stamps[-1]:.3f} s, path {path.stamps[0]:.3f} to {path.stamps[-1]:.3f} s)",
             where=log.name,
-            hint="check that both use the same clock, or raise poses.max_gap to bridge longer gaps",
+            hint=hint,
         )
     localized_every = 0.0
     if localized and log.localization is not None:

@@ -19,7 +19,13 @@ from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
-from objslam.graph.marginals import joint_covariances, largest_sigma, marginal_covariances, seen_covariances
+from objslam.graph.marginals import (
+    correlated_factor,
+    joint_covariances,
+    largest_sigma,
+    marginal_covariances,
+    seen_covariances,
+)
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
@@ -186,6 +192,10 @@ def solve_joint(
     inliers = used & (weight > 0)
     gaussian, _ = measured.whole(association.object, inliers, map_T_camera, positions, "gnc")
     covariance[landmarks] = marginal_covariances(gaussian, optimum.values, landmarks, ledger)
+    known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
+    drift = correlated_factor(gaussian, optimum.values, known, covariance[known])
+    correlated = np.zeros((association.count, 3, drift.shape[2]))
+    correlated[known] = drift
     seen_sigma = largest_sigma(covariance)
     witness = _witnesses(rays, association, used & (weight > 0))
     reach = np.linalg.norm(positions - map_T_camera[witness, :3, 3], axis=1)
@@ -199,6 +209,7 @@ def solve_joint(
         by_error = calibrated.sensitivity
         covariance += by_error @ calibrated.calibration.covariance @ np.swapaxes(by_error, 1, 2)
         covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
+        correlated = np.concatenate([correlated, np.nan_to_num(by_error) @ calibrated.calibration.root], axis=2)
     estimate = Estimate(
         map_T_base=measured.map_T_base(map_T_camera),
         positions=positions,
@@ -211,6 +222,7 @@ def solve_joint(
         iterations=found.iterations,
         calibration=calibration if calibration is not None and calibration.names else None,
         noise=None if errors is None else errors.noise,
+        correlated=correlated if tags is None else tags.of_objects(correlated),
     )
     if tags is None:
         return estimate

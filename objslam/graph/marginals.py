@@ -1,6 +1,8 @@
 """Compute marginal covariances of landmarks, even if the graph does not determine all of them."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import gtsam
 import numpy as np
@@ -23,6 +25,12 @@ the landmarks less. With too large a value, the system stays indeterminate."""
 _LEAST_PIVOT = 1e-11
 """The least pivot of the information matrix, scaled to 1 on its diagonal, of a system with one solution. Rounding leaves
 about 1e-15 if a system has none. A larger value refuses more systems of variables that are tied tightly and placed badly."""
+
+_DIRECTIONS = 20
+"""The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven.
+With a larger number, the bends of a long path count too, and the search takes longer."""
+_ITERATIONS = 3
+"""The number of steps of this search. More steps find the directions more exactly, and take longer."""
 
 
 def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:
@@ -136,28 +144,94 @@ def of_normal_equations(
     system: gtsam.GaussianFactorGraph, values: gtsam.Values, groups: Sequence[Sequence[int]]
 ) -> list[Floats] | None:
     """Return the covariances of the groups from the sparse normal equations, None if the system is indeterminate."""
-    keys, zero = sorted(values.keys()), values.zeroVectors()
-    size = np.array([len(zero.at(key)) for key in keys])
-    begin, end = np.cumsum(size) - size, np.cumsum(size)
-    row, column, value = system.sparseJacobian_()
-    entries = (value, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))
-    jacobian = sparse.csr_matrix(entries, shape=(int(row.max()), int(end[-1]) + 1))[:, :-1]  # The last column is the error.
-    scale = np.sqrt(np.asarray(jacobian.power(2).sum(axis=0)).ravel())
-    if not (np.isfinite(scale) & (scale > 0)).all():
+    inverse = _Inverse.of(system, values)
+    if inverse is None:
         return None
-    scaled = sparse.csr_matrix(jacobian @ sparse.diags_array(1 / scale))
-    try:
-        normal = NormalEquations.of(scaled, elimination_order(scaled, np.repeat(np.arange(len(keys)), size)))
-    except SolveError:
-        return None
-    if not normal.least_pivot > _LEAST_PIVOT:
-        return None
-    place = {key: i for i, key in enumerate(keys)}
     found = []
     for group in groups:
-        at = np.concatenate([np.arange(begin[place[key]], end[place[key]]) for key in group])
-        right = np.zeros((len(scale), len(at)))
-        right[at, np.arange(len(at))] = 1 / scale[at]
-        part = normal.solve(right)[at] / scale[at, None]
+        at = inverse.columns(group)
+        part = inverse.times(at, np.eye(len(at)))
         found.append((part + part.T) / 2)
     return found
+
+
+def correlated_factor(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, covariance: Floats
+) -> Floats:
+    """Return the correlated errors of landmarks (n,) at `values`, as a factor (n, 3, m), m, of their joint covariance.
+
+    covariance: (n, 3, 3) m^2 of the landmarks. A few products with the joint covariance find its strongest directions
+    (subspace iteration), so the time grows with the number of landmarks, not with its square. The factor comes from the
+    Nystroem approximation, which is nowhere above the joint covariance. m is 0 if the linear system is indeterminate.
+    """
+    none = np.zeros((len(landmarks), 3, 0))
+    inverse = _Inverse.of(graph.linearize(values), values)
+    if inverse is None or not len(landmarks):
+        return none
+    at = inverse.columns([L0 + j for j in landmarks.tolist()])
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.inv(root)
+
+    def product(vectors: Floats) -> Floats:
+        """Return the product of the whitened joint covariance and vectors (3 n, m)."""
+        blocks = np.swapaxes(white, 1, 2) @ vectors.reshape(len(white), 3, -1)
+        wide = inverse.times(at, blocks.reshape(len(at), -1)).reshape(blocks.shape)
+        return np.asarray(white @ wide).reshape(vectors.shape)
+
+    number = min(_DIRECTIONS, len(at))
+    basis = np.random.default_rng(0).normal(size=(len(at), number))
+    for _ in range(_ITERATIONS):
+        basis = np.linalg.qr(product(basis))[0]
+    wide = product(basis)
+    inner = basis.T @ wide
+    size, axes = np.linalg.eigh((inner + inner.T) / 2)
+    good = size > _LEAST_PIVOT * size[-1]
+    factor = wide @ axes[:, good] / np.sqrt(size[good])
+    return np.asarray(root @ factor.reshape(len(white), 3, -1))
+
+
+@dataclass(frozen=True)
+class _Inverse:
+    """The inverse of the normal equations of a graph, with a part for each variable.
+
+    normal: the normal equations, with columns of length 1. scale: (D,) the lengths of the columns before. begin, end: the
+    columns of each variable, by its key.
+    """
+
+    normal: NormalEquations
+    scale: Floats
+    begin: dict[int, int]
+    end: dict[int, int]
+
+    @classmethod
+    def of(cls, system: gtsam.GaussianFactorGraph, values: gtsam.Values) -> Self | None:
+        """Factor the normal equations. None if the system is indeterminate."""
+        keys, zero = sorted(values.keys()), values.zeroVectors()
+        size = np.array([len(zero.at(key)) for key in keys])
+        begin, end = np.cumsum(size) - size, np.cumsum(size)
+        row, column, value = system.sparseJacobian_()
+        entries = (value, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))
+        shape = int(row.max()), int(end[-1]) + 1
+        jacobian = sparse.csr_matrix(entries, shape=shape)[:, :-1]  # The last column is the error.
+        scale = np.sqrt(np.asarray(jacobian.power(2).sum(axis=0)).ravel())
+        if not (np.isfinite(scale) & (scale > 0)).all():
+            return None
+        scaled = sparse.csr_matrix(jacobian @ sparse.diags_array(1 / scale))
+        try:
+            normal = NormalEquations.of(scaled, elimination_order(scaled, np.repeat(np.arange(len(keys)), size)))
+        except SolveError:
+            return None
+        if not normal.least_pivot > _LEAST_PIVOT:
+            return None
+        first, last = begin.tolist(), end.tolist()
+        return cls(normal, scale, dict(zip(keys, first, strict=True)), dict(zip(keys, last, strict=True)))
+
+    def columns(self, keys: Sequence[int]) -> Ints:
+        """Return the columns of variables, in the order of the keys."""
+        return np.concatenate([np.arange(self.begin[key], self.end[key]) for key in keys])
+
+    def times(self, at: Ints, right: Floats) -> Floats:
+        """Return the part of the inverse at some columns (d,), times vectors (d, m)."""
+        whole = np.zeros((len(self.scale), right.shape[1]))
+        whole[at] = right / self.scale[at, None]
+        return np.asarray(self.normal.solve(whole)[at] / self.scale[at, None])

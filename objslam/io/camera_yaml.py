@@ -21,6 +21,13 @@ from objslam.errors import LogError
 from objslam.io.text import read_bytes
 
 _CAMERAS = "cameras"
+_AHEAD = "rotation_xyzw: [-0.5, 0.5, -0.5, 0.5]"
+_FORMS = {
+    "camera_matrix": "camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1]",
+    "base_T_camera": f"base_T_camera: {{translation: [x, y, z], {_AHEAD}}} for a camera that looks straight ahead",
+    "rotation_xyzw": f"{_AHEAD} for a camera that looks straight ahead",
+}
+"""How to write the keys that people write in another way."""
 _Mapping = dict[str, yaml.Node]
 
 
@@ -199,8 +206,9 @@ def _mapping(path: Path, node: yaml.Node, what: str) -> _Mapping:
 def _get(path: Path, mapping: _Mapping, key: str, inside: str = "", at: yaml.Node | None = None) -> yaml.Node:
     if key not in mapping:
         where = f"{path}:{at.start_mark.line + 1}" if at else str(path)
-        here = ", ".join(mapping) or "nothing"
-        raise LogError(f"{inside}{key} is missing", where=where, hint=f"found: {here}"[:200])
+        found = f"found: {', '.join(mapping) or 'nothing'}"[:200]
+        hint = f"write {_FORMS[key]}; {found}" if key in _FORMS else found
+        raise LogError(f"{inside}{key} is missing", where=where, hint=hint)
     return mapping[key]
 
 

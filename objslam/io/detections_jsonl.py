@@ -13,7 +13,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import MAX_BOXES, Detections
 from objslam.errors import LogError
 from objslam.io.box_collector import BoxCollector
-from objslam.io.text import read_lines
+from objslam.io.text import in_order, read_lines, require_order
 
 _EXAMPLE = 'a line is {"stamp": 12.5, "boxes": [[x1, y1, x2, y2]], "labels": ["cup"], "scores": [0.9]}'
 
@@ -44,6 +44,7 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
         why = f": {reasons.most_common(1)[0][0]}" if reasons else ""
         hint = "the file is one JSON list: write one frame a line" if lines[0][1].startswith("[") else _EXAMPLE
         raise LogError(f"none of its {len(lines)} lines is a detection frame{why}", where=str(path), hint=hint)
+    require_order(in_order(np.array(collector.stamps, dtype=np.float64)), path)
     return replace(collector.checked(ledger), whole=whole)
 
 

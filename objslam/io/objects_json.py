@@ -12,13 +12,14 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.bodies.body_entry import body_entry, body_of_entry, size_of
 from objslam.core.bodies.tag_pose import TagPose, tag_entry
+from objslam.core.maps.shared_covariance import NUMBERS
 from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
 from objslam.core.types import TruthObject
 from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
 
 FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
-_READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 has no seen_from, life and gone.
+_READ = ("objslam.objects/1", FORMAT)  # The formats that can be read. Format 1 lacks what came later.
 _UNIT = 1e-3  # The largest difference between the length of a direction and 1. A larger value accepts worse directions.
 _T = TypeVar("_T")
 
@@ -30,12 +31,14 @@ class _Malformed(OutputError):
 def dump_objects(objects: ObjectMap) -> str:
     """Return the text of objects.json for a map. `read_objects` restores every finite number exactly. Other numbers become
     null."""
-    return _dump([_entry(o) for o in objects.objects], objects.frame, [_entry(o) for o in objects.gone])
+    shared = objects.shared_covariance
+    more = {} if shared is None else {"shared_covariance": shared.tolist()}
+    return _dump([_entry(o) for o in objects.objects], objects.frame, [_entry(o) for o in objects.gone], more)
 
 
 def dump_truth_objects(objects: tuple[TruthObject, ...]) -> str:
     """Return the text of a ground truth file. `read_truth_objects` restores the same objects."""
-    return _dump([_truth_entry(o) for o in objects], "map", [])
+    return _dump([_truth_entry(o) for o in objects], "map", [], {})
 
 
 def _truth_entry(o: TruthObject) -> dict[str, Any]:
@@ -64,10 +67,12 @@ def parse_objects(data: dict[str, Any]) -> ObjectMap:
     gone = data.get("gone", [])
     if not isinstance(gone, list):
         raise _Malformed("gone must be a list of objects")
+    name = "shared_covariance"
     return ObjectMap(
         _each(data["objects"], _map_object, "objects"),
         _text(data.get("frame", "map"), "frame"),
         _each(gone, _map_object, "gone"),
+        None if data.get(name) is None else _covariance(data[name], name, NUMBERS),
     )
 
 
@@ -85,9 +90,10 @@ def read_truth_objects(file: Path, error: type[ObjslamError] = LogError) -> tupl
         raise error(str(malformed), where=str(file)) from malformed
 
 
-def _dump(entries: list[dict[str, Any]], frame: str, gone: list[dict[str, Any]]) -> str:
+def _dump(entries: list[dict[str, Any]], frame: str, gone: list[dict[str, Any]], more: dict[str, Any]) -> str:
     """Return the text of the file. Each object is on its own line, so that two files can be compared line by line."""
-    head = f'{{"format": {json.dumps(FORMAT)}, "frame": {json.dumps(frame)}, "objects": '
+    first = {"format": FORMAT, "frame": frame, **more}
+    head = json.dumps(first, allow_nan=False)[:-1] + ', "objects": '
     return head + _lines(entries) + (f', "gone": {_lines(gone)}' if gone else "") + "}\n"
 
 
@@ -195,8 +201,6 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
     covariance, extent, ray, labels = (entry.get(name) for name in ("covariance", "extent", "ray", "labels"))
     if covariance is not None:
         covariance = _covariance(covariance, "covariance")
-        if not (np.diagonal(covariance) < MAX_POSITION**2).all():
-            raise _Malformed(f"covariance has a standard deviation beyond {MAX_POSITION:g} m")
     if extent is not None:
         extent = tuple(_vector(extent, "extent", 2).tolist())
         if not all(0 <= side < MAX_POSITION for side in extent):
@@ -273,12 +277,14 @@ def _tag(value: Any) -> TagPose:
     return TagPose(rotation, covariance, size, sigma, other, probability)
 
 
-def _covariance(value: Any, name: str) -> Floats:
-    if not isinstance(value, list) or len(value) != 3:
-        raise _Malformed(f"{name} must be 3 rows of 3 numbers")
-    covariance = np.stack([_vector(row, f"a row of {name}") for row in value])
+def _covariance(value: Any, name: str, size: int = 3) -> Floats:
+    if not isinstance(value, list) or len(value) != size:
+        raise _Malformed(f"{name} must be {size} rows of {size} numbers")
+    covariance = np.stack([_vector(row, f"a row of {name}", size) for row in value])
     if (fault := covariance_fault(covariance)) is not None:
         raise _Malformed(f"{name} {fault}")
+    if not (np.diagonal(covariance) < MAX_POSITION**2).all():
+        raise _Malformed(f"{name} has a standard deviation beyond {MAX_POSITION:g}")
     return covariance
 
 

@@ -16,6 +16,9 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
+_IN_ORDER = 0.5
+"""The least share of the rows of a file that are in the order of time. A larger share also rejects files of a robot whose
+clock was set back. A file in another order has far fewer."""
 _PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason.
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
@@ -157,6 +160,13 @@ def parse_numbers(fields: list[str]) -> list[float] | None:
         return None
     text = "".join(fields)
     return numbers if text.isascii() and "_" not in text else None
+
+
+def require_order(forward: Bools, path: Path) -> None:
+    """Raise LogError if most rows of a file are not `in_order`. forward: (N,) the mask of the rows that are."""
+    if forward.mean() < _IN_ORDER:
+        wrong = f"{int((~forward).sum())} of its {len(forward)} stamps repeat or go back"
+        raise LogError(wrong, where=str(path), hint="sort the lines by their stamps")
 
 
 def in_order(stamps: Floats, repeats: bool = False) -> Bools:

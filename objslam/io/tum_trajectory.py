@@ -13,7 +13,7 @@ from objslam.core.geometry import pose_from_quaternion, quaternion
 from objslam.core.types import Trajectory
 from objslam.core.validity import valid_pose_rows, valid_positions, valid_stamps
 from objslam.errors import LogError
-from objslam.io.text import Table, in_order, parse_numbers, read_lines, select, to_table
+from objslam.io.text import Table, in_order, parse_numbers, read_lines, require_order, select, to_table
 
 _COLUMNS, _PLANAR = "stamp tx ty tz qx qy qz qw", "stamp x y yaw"
 _HEADER = f"# {_COLUMNS}\n"
@@ -24,7 +24,7 @@ def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
     yaw is in rad. Commas may separate the numbers, and the first line may name the columns.
 
     Malformed lines, invalid poses and poses out of time order are dropped and counted. Raises LogError if none is left,
-    or if the names of the columns are in another order.
+    if most are out of time order, or if the names of the columns are in another order.
     """
     return to_trajectory(read_pose_table(path, ledger))
 
@@ -39,6 +39,8 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
     turns = valid_pose_rows(table.values[:, 1:])
     table = select(table, turns, "pose line with a quaternion that is zero or too long", path, ledger)
     forward = in_order(table.values[:, 0])
+    if len(forward):
+        require_order(forward, path)
     table = select(table, forward, "pose line with a stamp that repeats or goes back", path, ledger)
     if not len(table.lines):
         raise LogError("no usable pose: every stamp, position or quaternion is invalid", where=str(path))

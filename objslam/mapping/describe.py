@@ -14,7 +14,9 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
+from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off, is_planar, widest_angle
+from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
@@ -22,13 +24,14 @@ from objslam.core.types import Association
 from objslam.frontend.up import up_axis
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
+from objslam.mapping.doubts.find import with_doubts
 from objslam.mapping.solution import Solution
 
 
 def make_result(
     solution: Solution, objects: ObjectMap, residual: Floats, summary: dict[str, Any], settings: Settings, **more: Any
 ) -> RunResult:
-    """Return the result of a run, and add the assessment of its quality to the summary.
+    """Return the result of a run with its doubts, and add the assessment of its quality to the summary.
 
     objects, residual: from `describe`. more: the fields of `RunResult` that the solution does not have.
     """
@@ -37,7 +40,7 @@ def make_result(
     judged: dict[str, Any] = {"residual_times": None if np.isnan(missed) else round(missed, 3)}
     judged["assessment"] = assess(evidence_of(summary, missed)).to_dict()
     origins, directions = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
-    return RunResult(
+    result = RunResult(
         map=objects,
         keyframes=keyframes,
         map_T_base=estimate.map_T_base,
@@ -53,6 +56,7 @@ def make_result(
         settings=settings,
         **more,
     )
+    return with_doubts(result)
 
 
 def describe(
@@ -115,7 +119,16 @@ def describe(
                 tag=estimate.tags.get(j) if known else None,
             )
         )
-    return ObjectMap(tuple(objects)), residual
+    return ObjectMap(tuple(objects), shared_covariance=_shared(objects, estimate)), residual
+
+
+def _shared(objects: list[MapObject], estimate: Estimate) -> Floats | None:
+    """Return the covariance (7, 7) of the error that the resolved objects share, None if it is not known."""
+    known = [j for j, o in enumerate(objects) if o.covariance is not None]
+    if estimate.correlated is None or not known:
+        return None
+    some = ObjectMap(tuple(objects[j] for j in known))
+    return shared_covariance(some.positions, some.covariances, estimate.correlated[known])
 
 
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:

@@ -191,7 +191,8 @@ def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
     told = found.calibration
     covariance = estimate.covariance + found.sensitivity @ told.covariance @ np.swapaxes(found.sensitivity, 1, 2)
     covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
-    return replace(estimate, covariance=covariance, seen_sigma=largest_sigma(covariance), calibration=told)
+    sigma, correlated = largest_sigma(covariance), np.nan_to_num(found.sensitivity @ told.root)
+    return replace(estimate, covariance=covariance, seen_sigma=sigma, calibration=told, correlated=correlated)
 
 
 def _parameters(calibration: Calibration) -> Parameters:

@@ -16,7 +16,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.core.noise import NoiseFactors
 from objslam.core.trace import Trace, Why
-from objslam.core.trajectory import correct_poses
+from objslam.core.trajectory import correct_poses, turned_since
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.duplicates import merge_unseen_together
@@ -132,22 +132,34 @@ class JointState:
     def alternated(self, map_T_base: Floats, guess: Guess | None, *, drifting: bool = False) -> Self:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
-        The rounds also end if an earlier association returns, because a few rays could change for ever. drifting: whether to
-        allow for the drift of keyframes without an assigned ray.
+        The rounds also end if an earlier association returns, because a few rays could change for ever. Then the state since
+        the earlier one counts whose rays are best `explained`. drifting: whether to allow for the drift of keyframes without
+        an assigned ray.
         """
-        state, earlier = self, set[bytes]()
+        state, earlier = self, dict[bytes, Self]()
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"association, round {number + 1}", 0, 0)
             found = state._associate(map_T_base, guess, drifting)
             state = state.counted(found)
-            if state.rounds[-1]["rays_changed"] == 0 or found.object.tobytes() in earlier:
+            if state.rounds[-1]["rays_changed"] == 0:
                 return replace(state, settled=True)
-            earlier.add(found.object.tobytes())
+            if found.object.tobytes() in earlier:
+                returned = list(earlier).index(found.object.tobytes())
+                return state.continued_from(max(list(earlier.values())[returned:], key=lambda one: one.explained))
             state = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera).merged()
+            earlier[found.object.tobytes()] = state
             assert state.association is not None
             assert state.estimate is not None
             map_T_base, guess = state.estimate.map_T_base, (state.association, state.estimate.positions)
         return replace(state, settled=False)
+
+    def continued_from(self, chosen: Self) -> Self:
+        """Return a state of an earlier round, settled, with the rounds until now."""
+        if self.trace is not None and chosen.estimate is not self.estimate:
+            assert chosen.association is not None
+            assert chosen.estimate is not None
+            self.trace.end_round("association", chosen.association, chosen.estimate)
+        return replace(chosen, rounds=self.rounds, settled=True)
 
     def drift_followed(self) -> Self:
         """Return the state after rounds that allow for the drift of keyframes without an assigned ray, if it is `better`.
@@ -157,7 +169,7 @@ class JointState:
         """
         assert self.association is not None
         assert self.estimate is not None
-        drift = _turned_since(self.keyframes, self.rays.keyframe[self.association.object >= 0])[self.rays.keyframe]
+        drift = turned_since(self.keyframes, self.rays.keyframe[self.association.object >= 0])[self.rays.keyframe]
         if not (drift > self.rays.sigma).any():
             return self
         guess = self.association, self.estimate.positions
@@ -208,7 +220,7 @@ class JointState:
         scale = 1.0 if self.rounds else _FIRST
         sigma = np.hypot(rays.sigma, scale * _SOLVED_YAW)
         if drifting and guess is not None:
-            since = _turned_since(mine, self.rays.keyframe[guess[0].object >= 0])
+            since = turned_since(mine, self.rays.keyframe[guess[0].object >= 0])
             sigma = np.hypot(sigma, since[self.rays.keyframe])
         return associate_globally(
             rays,
@@ -317,25 +329,6 @@ def _with_loose_odometry(state: JointState) -> JointState | None:
     keyframes, rays, _ = errors.at(errors.mean if values is None else values)
     unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
     return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
-
-
-def _turned_since(keyframes: Keyframes, assigned: Ints) -> Floats:
-    """Return the standard deviations (K,), rad, of the heading's drift between a keyframe and the nearest assigned one.
-
-    assigned: indices of keyframes with an assigned ray. The result is 0 with a localisation, and if no odometry connects the
-    keyframe with an assigned one.
-    """
-    since = np.full(len(keyframes.stamps), np.inf)
-    if keyframes.drift is None or keyframes.localized_every or len(assigned) == 0:
-        return np.zeros(len(since))
-    heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
-    stretch = np.zeros(len(since), dtype=np.int64) if keyframes.stretch is None else keyframes.stretch
-    known = np.unique(assigned)
-    after = np.minimum(np.searchsorted(known, np.arange(len(since))), len(known) - 1)
-    for end in (known[after], known[np.maximum(after - 1, 0)]):
-        linked = (stretch == stretch[end]) & (stretch >= 0)
-        since = np.minimum(since, np.where(linked, np.abs(heading - heading[end]), np.inf))
-    return np.sqrt(np.where(np.isfinite(since), since, 0.0))
 
 
 def rays_moved(before: Ints, after: Ints) -> int:

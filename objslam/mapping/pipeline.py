@@ -66,7 +66,7 @@ def run(
     diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
         if settings.checks.use:
-            diagnosis = diagnose(expected, settings)
+            diagnosis = diagnose(expected, settings, ledger)
             if not diagnosis.refutable:
                 say(diagnosis, ledger)
         if diagnosis.certain and settings.mode == "joint":

@@ -28,7 +28,7 @@ from objslam.io.views_parquet import Views, dump_views
 from objslam.mapping.measured_motions import motions_of
 from objslam.output.export.formats import FORMATS
 from objslam.results import files
-from objslam.results.files import dump_json
+from objslam.results.files import dump_doubts, dump_json
 from objslam.results.read import load_map
 from objslam.sources.log_folder import resembles_log
 
@@ -115,6 +115,7 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
         files.PATH: partial(write_trajectory, result.path_after),
         files.RAYS: lambda file: file.write_bytes(dump_rays(rays_table(result))),
         files.CONFIG: lambda file: file.write_bytes(encode(dump_settings(result.settings))),
+        files.DOUBTS: lambda file: file.write_bytes(encode(dump_doubts(result.doubts))),
         files.SUMMARY: lambda file: file.write_bytes(encode(dump_json(result.summary))),
     }
     motions = motions_of(result)

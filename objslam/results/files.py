@@ -2,10 +2,13 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from objslam.core.result import Doubt
 
 OBJECTS = "objects.json"  # The map of objects.
 TRAJECTORY = "trajectory.txt"  # The pose map_T_base of each keyframe.
@@ -14,6 +17,7 @@ RAYS = "rays.parquet"  # Each ray with its object.
 MOTIONS = "motions.parquet"  # The odometry between the poses of a joint run.
 VIEWS = "views.parquet"  # The pose of each camera frame. It shows which objects the camera could have seen.
 CONFIG = "config.yaml"  # All settings of the run.
+DOUBTS = "doubts.json"  # Objects that may be one or two, and boxes that became no object.
 SUMMARY = "summary.json"  # Counts, times and warnings. It is written last, so it marks a complete result.
 DETECTIONS = "detections.jsonl"  # The boxes from the detector of the run.
 SURFACE = "reconstruction.ply"  # The mesh of the room.
@@ -30,7 +34,7 @@ GROUNDTRUTH = "groundtruth"  # The folder in a log that has the ground truth, in
 
 PARTS = (
     *(OBJECTS, TRAJECTORY, PATH, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
-    *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, VIEWS, EVALUATION, REPORT),
+    *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, VIEWS, DOUBTS, EVALUATION, REPORT),
 )
 """The files of a result, including the files of later commands. SUMMARY and exported files are not included."""
 
@@ -42,6 +46,12 @@ def hint_below(folder: Path) -> str | None:
         return None
     more = f" and {len(below) - 5} more" if len(below) > 5 else ""
     return f"its subfolders have results: {', '.join(below[:5])}{more}"
+
+
+def dump_doubts(doubts: Sequence[Doubt]) -> str:
+    """Return the content of doubts.json, with one doubt a line."""
+    lines = (json.dumps(one.to_dict(), ensure_ascii=False, allow_nan=False) for one in doubts)
+    return '{"format": "objslam.doubts/1", "doubts": [' + ",".join(f"\n  {line}" for line in lines) + "\n]}\n"
 
 
 def dump_json(data: Any) -> str:

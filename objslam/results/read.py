@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
+from objslam.core.result import Doubt
 from objslam.core.types import Trajectory, Truth
 from objslam.errors import LogError, OutputError
 from objslam.io.atomic_files import has_staging
@@ -17,7 +18,7 @@ from objslam.io.rays_parquet import RaysTable, read_rays
 from objslam.io.tum_trajectory import read_trajectory
 from objslam.io.views_parquet import Views, read_views
 from objslam.results import files
-from objslam.results.shapes import EvaluationFile, Summary, fault_of
+from objslam.results.shapes import DoubtsFile, EvaluationFile, Summary, fault_of
 
 
 def load_map(out: Path) -> ObjectMap:
@@ -34,6 +35,14 @@ def load_evaluation(out: Path) -> dict[str, Any] | None:
     """Read evaluation.json of the result folder `out`, None if there is none. OutputError if its content is invalid."""
     file = out / files.EVALUATION
     return _load_json(file, EvaluationFile) if file.is_file() else None
+
+
+def load_doubts(out: Path) -> tuple[Doubt, ...] | None:
+    """Read the doubts of the result folder `out`. None if it has no such file, as from an older
+    version. OutputError if the file is invalid or there is no result."""
+    _existing(out, files.OBJECTS)
+    file = out / files.DOUBTS
+    return tuple(Doubt.from_dict(entry) for entry in _load_json(file, DoubtsFile)["doubts"]) if file.is_file() else None
 
 
 def _load_json(file: Path, shape: type[BaseModel]) -> dict[str, Any]:

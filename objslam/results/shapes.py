@@ -1,4 +1,4 @@
-"""The shapes of summary.json and evaluation.json: which keys a command reads, and what type each has.
+"""The shapes of summary.json, evaluation.json and doubts.json: which keys a command reads, and what type each has.
 
 A folder may come from somebody else, so a value of a wrong type must give an error of one clear line. A key that no command
 reads may have any value.
@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from objslam.core.result import DoubtKind
 from objslam.core.types import Up
 
 _Integer = Annotated[int, Field(ge=-(2**63), lt=2**63)]
@@ -41,6 +42,20 @@ class _Localisation(_Shape):
     line: str
 
 
+class _Place(_Shape):
+    x: _Number
+    y: _Number
+    z: _Number
+    yaw_deg: _Number
+
+
+class _SiteSession(_Place):
+    name: str
+    sigma: _Place
+    log_odds: _Number | None = None
+    common_objects: _Integer = 0
+
+
 class Summary(_Shape):
     """The content of summary.json. Each key may be missing, as in the summary of an older run."""
 
@@ -62,6 +77,8 @@ class Summary(_Shape):
     warnings: list[str] = []
     assessment: _Assessment | None = None
     localisation: _Localisation | None = None
+    doubts: dict[str, _Integer] = {}
+    sessions: list[_SiteSession] = []
 
 
 class _Match(_Shape):
@@ -106,6 +123,23 @@ class EvaluationFile(_Shape):
         if self.position_rmse is not None and None in (self.matched, self.missed, self.false):
             raise ValueError("position_rmse needs the counts matched, missed and false")
         return self
+
+
+class _Doubt(_Shape):
+    kind: DoubtKind
+    reason: str
+    label: str
+    text: str
+    objects: list[_Integer]
+    position: Annotated[list[_Number], Field(min_length=3, max_length=3)] | None
+    numbers: dict[str, _Number | None]
+    rays: list[Annotated[int, Field(ge=0, lt=2**63)]]
+
+
+class DoubtsFile(_Shape):
+    """The content of doubts.json."""
+
+    doubts: list[_Doubt]
 
 
 def fault_of(data: dict[str, Any], shape: type[BaseModel]) -> str | None:

@@ -29,11 +29,14 @@ DETECTOR = Option("--detector", "ONNX model that finds boxes in the rgb images. 
 """The option that chooses the detector, in `objslam run` and in live sessions."""
 
 
+_KINDS = "Kind of the recording: log, ros, mrclam, tum, tum_numbered, journal. [default: found from its content]"
+
+
 @dataclass(frozen=True)
 class AnyOptions:
     """The options of every source. format: the name of the source. None chooses the source by the recording's content."""
 
-    format: Annotated[str | None, Option("--format", "Kind of the recording. [default: found from its content]")] = None
+    format: Annotated[str | None, Option("--format", _KINDS)] = None
 
 
 def names(*kinds: type[Any] | None) -> frozenset[str]:

@@ -97,7 +97,9 @@ def test_a_log_of_arrays_gives_the_same_map_in_every_form_of_a_pose(log: Log, re
         ({"stamps": [0.0, 0.0]}, "stamp 1 is not later than the one before it"),
         ({"stamps": [0.0, np.nan]}, "stamp 1 is not a finite number of seconds"),
         ({"stamps": [0.0]}, "boxes needs one list for each stamp, got 2 for 1"),
-        ({"labels": [["cup"], []]}, "labels needs one list for each frame"),
+        ({"labels": [["cup"], []]}, "frame 1: labels needs one list with one name for each of its 1 boxes, got 0"),
+        ({"labels": [["cup"], "c"]}, "frame 1: labels needs one list with one name for each of its 1 boxes, got 'c'"),
+        ({"labels": [["cup"]]}, "labels needs one list for each frame, got 1 for 2"),
         ({"boxes": [[[0, 0, 5, 5]], [[5, 5, 4, 9]]]}, "frame 1: box without area"),
         ({"boxes": [[[0, 0, 5, 5]], [[1, 1, 6]]]}, "frame 1: boxes are .B, 4. x1, y1, x2, y2, got the shape .1, 3."),
         ({"boxes": [[[0, 0, 5, 5]], [1, 1, 6, 6]]}, "frame 1: boxes are .B, 4. x1, y1, x2, y2, got the shape .4,."),
@@ -119,6 +121,7 @@ def test_wrong_frames_are_named(changes: dict[str, Any], message: str) -> None:
     [
         ([[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]], "pose 1 is not finite"),
         ([[0.0, 0.0], [1.0, 0.0]], "poses are .N, 3. x, y, yaw"),
+        ([[0.0, 0.0, 0.0]], "one pose for each stamp, got 1 for 2"),
         ([np.eye(4), 2 * np.eye(4)], "pose 1 is not finite, too far away or not rigid"),
         ([[0.0, 0, 0, 0, 0, 0, 0], [0.0, 0, 0, 0, 0, 0, 1]], "pose 0 is not finite, too far away or not rigid"),
     ],

@@ -1,10 +1,13 @@
 """Frames of many maps: exact without noise, as repeated measurements say with it, and steady against a moved object."""
 
+from dataclasses import replace
+
 import numpy as np
 from association.registration_scenes import SIGMA
 
 from objslam.association.registration.joint_frames import Measured, solve_frames
-from objslam.core.geometry import lift_se2
+from objslam.core.geometry import align, lift_se2
+from objslam.core.maps.shared_covariance import jacobian
 
 
 def scene(rng, maps=4, count=15, sigma=SIGMA):
@@ -88,3 +91,62 @@ def test_a_map_that_is_worse_than_it_says_counts_less():
         even += np.linalg.norm(best.positions - points, axis=1).tolist()
     assert (np.mean(factors, axis=0)[2] > 3 * np.mean(factors, axis=0)[[0, 1, 3]]).all()
     assert np.mean(worse) < 1.15 * np.mean(even)
+
+
+SHARED = np.diag([0.2, 0.2, 0.05, 0.01, 0.01, 0.03, 0.02]) ** 2
+
+
+def grown(measured, maps, sizes, rng=None):
+    """The measurements of maps with shared errors: of these sizes, or also shifted and turned if there is an rng."""
+    roots = np.tile(np.linalg.cholesky(SHARED), (maps, 1, 1))
+    errors = np.zeros((maps, 7))
+    if rng is not None:
+        errors = (roots @ rng.normal(size=(maps, 7, 1)))[..., 0]
+    errors[:, 6] += sizes
+    off = (jacobian(measured.position) @ errors[measured.map][..., None])[..., 0]
+    return replace(measured, position=measured.position + off, roots=roots)
+
+
+def test_a_map_of_uncertain_size_takes_the_size_of_a_map_that_knows_it():
+    """The second of two maps has its own size exactly, and the first is 4 % too large, as it says it may be."""
+    rng = np.random.default_rng(5)
+    for _ in range(5):
+        points, frames, measured = scene(rng, maps=2, count=30, sigma=0.01)
+        measured = replace(measured, covariance=1e-4 * np.tile(np.eye(3), (len(measured.map), 1, 1)))
+        given = grown(measured, 2, np.array([0.04, 0.0]))
+        given.roots[1] = 0.0
+        found = solve_frames(given, nearby(rng, frames), len(points))
+        blind = solve_frames(replace(given, roots=None), nearby(rng, frames), len(points))
+        assert abs(align(found.positions, points, "sim2")[1] - 1) < 0.006
+        assert abs(align(blind.positions, points, "sim2")[1] - 1) > 0.012
+
+
+def test_the_covariances_hold_the_truth_where_maps_share_errors():
+    """All seven shared errors of each map are drawn from their covariance. The frame of the result is the first map's."""
+    rng, squared, own, sizes = np.random.default_rng(6), [], [], []
+    for _ in range(60):
+        points, frames, measured = scene(rng, maps=3, count=20)
+        found = solve_frames(grown(measured, 3, np.zeros(3), rng), nearby(rng, frames), len(points))
+        off = found.positions - points
+        squared += [e @ np.linalg.solve(c, e) for e, c in zip(off, found.covariance, strict=True)]
+        own.append(np.trace(found.own, axis1=1, axis2=2).mean() / np.trace(found.covariance, axis1=1, axis2=2).mean())
+        sizes.append(1 / align(found.positions, points, "sim2")[1] - 1)
+        factor = found.correlated
+        np.testing.assert_allclose(found.own + factor @ np.swapaxes(factor, 1, 2), found.covariance, atol=1e-12)
+    assert 2.3 < np.mean(squared) < 3.6
+    assert np.mean(np.array(squared) < 7.815) > 0.93
+    assert np.mean(own) < 0.2  # Most of an object's error is shared, so it is no small thing that the rest is told apart.
+    assert abs(np.mean(sizes)) < 3 * np.std(sizes) / np.sqrt(len(sizes))
+
+
+def test_noise_makes_no_map_smaller():
+    """Two maps of one size, with noise of a tenth of their extent. Only their sizes are uncertain."""
+    rng, sizes = np.random.default_rng(7), []
+    for _ in range(60):
+        points, frames, measured = scene(rng, maps=2, count=20, sigma=0.3)
+        roots = np.zeros((2, 7, 7))
+        roots[:, 6, 6] = 0.2
+        given = replace(measured, covariance=0.09 * np.tile(np.eye(3), (len(measured.map), 1, 1)), roots=roots)
+        found = solve_frames(given, nearby(rng, frames), len(points))
+        sizes.append(np.log(align(points, found.positions, "sim2")[1]))
+    assert abs(np.mean(sizes)) < 3 * np.std(sizes) / np.sqrt(len(sizes))

@@ -118,13 +118,14 @@ def test_the_console_script_runs_evaluates_and_leaves_a_whole_result(log_folder,
     run = in_process_of_its_own("run", log_folder, "-o", out, "--set", "calibration.use=false")
     assert run.code == 0, run.err
     assert "tall chair" in run.out
-    assert "4 objects (0 unresolved)" in run.out
+    assert "4 objects from" in run.out
     names = {
         "objects.json",
         "trajectory.txt",
         "path.txt",
         "rays.parquet",
         "views.parquet",
+        "doubts.json",
         "summary.json",
         "config.yaml",
         "map.png",
@@ -265,7 +266,19 @@ def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_pat
 
 
 @pytest.mark.parametrize(
-    "command", [(), ("run",), ("eval",), ("demo",), ("convert",), ("info",), ("export",), ("config",), ("config", "dump")]
+    "command",
+    [
+        (),
+        ("run",),
+        ("eval",),
+        ("demo",),
+        ("convert",),
+        ("info",),
+        ("export",),
+        ("explain",),
+        ("config",),
+        ("config", "dump"),
+    ],
 )
 def test_help(objslam, command):
     help_ = objslam(*command, "--help")
@@ -302,7 +315,7 @@ def imported_by(*arguments: str) -> set[str]:
     "arguments",
     [
         ("--help",),
-        *((name, "--help") for name in ("run", "convert", "info", "live", "export")),
+        *((name, "--help") for name in ("run", "convert", "info", "live", "export", "explain")),
         ("config", "dump"),
         ("--version",),
     ],

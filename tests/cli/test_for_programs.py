@@ -121,6 +121,20 @@ def test_info_sees_boxes_that_are_fractions(log: Path, tmp_path: Path) -> None:
     assert "they are probably shares of the image, not px" in call("info", tmp_path / "log").stderr
 
 
+@pytest.mark.parametrize("factor", [1e3, 1e9])
+def test_info_describes_a_log_whose_stamps_are_not_in_seconds(tmp_path: Path, factor: float) -> None:
+    poses = "".join(f"{factor * (1.7e9 + 0.1 * i):.0f} {0.05 * i} 0 0\n" for i in range(30))
+    write_log_folder(small_log(), tmp_path / "log")
+    (tmp_path / "log" / "odometry.txt").unlink()
+    (tmp_path / "log" / "localization.txt").write_text(poses)
+    frames = "".join(
+        json.dumps({"stamp": factor * (1.7e9 + 0.1 * i), "boxes": [[9, 9, 50, 50]], "labels": ["a"], "scores": [1]}) + "\n"
+        for i in range(30)
+    )
+    (tmp_path / "log" / "detections.jsonl").write_text(frames)
+    assert "all stamps are probably in" in call("info", tmp_path / "log").stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "meant"),
     [

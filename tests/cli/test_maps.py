@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sys
 
 import numpy as np
@@ -72,10 +73,10 @@ def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeyp
     assert [len(site), len(site.gone)] == [14, 1]
     assert {o.life.state for o in site} == {"confirmed", "moved", "new"}
     assert (tmp_path / "site" / "map.png").is_file()
-    for command, missing in (("report", "rays.parquet"), ("view", "recording.rrd")):
-        code, _, error = call(monkeypatch, capsys, command, tmp_path / "site")
-        assert code == 1
-        assert f"this is the map of a site, which has no {missing} (look at map.png" in error
+    code, _, error = call(monkeypatch, capsys, "view", tmp_path / "site")
+    assert code == 1
+    assert "this is the map of a site, which has no recording.rrd (look at map.png" in error
+    reported(call, monkeypatch, capsys, tmp_path / "site", site)
     exported(call, monkeypatch, capsys, tmp_path / "site", site)
     again = objslam.merge([tmp_path / "site", out / "b"])
     assert len(again) == 1
@@ -83,6 +84,23 @@ def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeyp
     assert all(o.life.sessions_seen >= 2 for o in again[0].objects)
     found = objslam.diff(objslam.Result.load(out / "a"), tmp_path / "site")
     assert found.registration.accepted
+
+
+def reported(call, monkeypatch, capsys, folder, site):
+    """The page has a line for each object and each session. A summary of a wrong shape is one clear line."""
+    assert call(monkeypatch, capsys, "report", folder)[0] == 0
+    page = (folder / "report.html").read_text()
+    lines = [re.sub(r"<[^>]+>", " ", line).split() for line in page.splitlines() if line.startswith("<tr")]
+    states = {o.id: o.life.state for o in (*site, *site.gone)}
+    assert {int(line[0]): line[3] for line in lines if line[0].isdigit()} == states
+    assert sum(str(folder.parent) in line[0] or "days" in line[0] for line in lines) == 2
+    summary = folder / "summary.json"
+    text = summary.read_text()
+    summary.write_text(re.sub(r'"yaw_deg": [^,\n]+', '"yaw_deg": "east"', text))
+    code, _, error = call(monkeypatch, capsys, "report", folder)
+    assert code == 1
+    assert "not what objslam writes" in error
+    summary.write_text(text)
 
 
 def exported(call, monkeypatch, capsys, folder, site):

@@ -198,6 +198,12 @@ def test_one_match_aligned_by_itself_is_no_measure_and_says_so() -> None:
     assert evaluate(a_map([[0, 0, 0.1]], ["cup"]), truth).warnings == ()
 
 
+def test_labels_that_the_truth_does_not_have_are_named() -> None:
+    found, truth = a_map([[0, 0, 0], [1, 0, 0]], ["0", "1"]), a_truth([[0, 0, 0], [1, 0, 0]], ["cup", "mug"])
+    (warning,) = evaluate(found, truth).warnings
+    assert warning == "the map and the truth have no label in common: 0, 1 in the map, cup, mug in the truth"
+
+
 def test_a_map_scaled_out_of_reason_is_warned_of() -> None:
     truth, labels, _, _ = scene(1, 12)
     evaluation = evaluate(a_map(truth * 4, labels), a_truth(truth, labels), align="sim2")

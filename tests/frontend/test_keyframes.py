@@ -129,6 +129,21 @@ def test_nothing_is_extrapolated(stamps):
     assert sum(ledger.dropped.values()) == 4
 
 
+@pytest.mark.parametrize(
+    ("frames", "path", "hint"),
+    [
+        ([8.0, 9.0], [0, 1, 6, 7], "same clock"),
+        ([3.0, 4.0], [0, 1, 6, 7], "1 s apart: raise poses.max_gap"),
+        ([3.0, 4.0], [0, 5, 10], "5 s apart: raise poses.max_gap"),
+    ],
+)
+def test_the_hint_says_whether_frames_lie_outside_the_path_or_in_its_gaps(frames, path, hint):
+    log = Log("the log", (camera_log("front", frames),), localization=line(path))
+    with pytest.raises(LogError) as caught:
+        build_keyframes(log, FIXED, Ledger())
+    assert hint in caught.value.hint
+
+
 def test_no_path_and_no_detections_are_log_errors():
     with pytest.raises(LogError, match="neither odometry nor localisation"):
         build_keyframes(Log("log", (camera_log("front", [1.0]),)), FIXED, Ledger())

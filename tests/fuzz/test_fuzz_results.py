@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from synthetic_result import clusters, synthetic_result
 
 from objslam.api.result import Result
 from objslam.config import Output, Settings
+from objslam.core.result import Doubt
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
 from objslam.io.odometry_parquet import Motions, dump_motions
 from objslam.output.export import write_export
@@ -35,7 +37,9 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     positions, labels = clusters()
     plain = Settings(mode="joint", output=Output(recording=False, picture=False))
     run, truth = synthetic_result(positions[:3], labels[:3], keyframes=12, unresolved=(2,), settings=plain)
-    write_result(run, out, truth)
+    rays = np.arange(5)
+    doubt = Doubt("boxes", "apart", "cup", "5 cup boxes.", (1,), np.ones(3), rays, {"miss_m": 0.1, "size_m": np.nan})
+    write_result(replace(run, doubts=(doubt,)), out, truth)
     write_evaluation(evaluate_folder(out), out)
     summary = json.loads((out / files.SUMMARY).read_text())
     error = {"value": 0.1, "sigma": 0.01, "prior_sigma": 0.1, "unit": "share", "observable": True}
@@ -73,7 +77,7 @@ def with_file(result: Path, name: str, data: bytes) -> Path:
     return out
 
 
-JSON_FILES = (files.SUMMARY, files.EVALUATION, files.OBJECTS, files.TRUTH_OBJECTS)
+JSON_FILES = (files.SUMMARY, files.EVALUATION, files.OBJECTS, files.TRUTH_OBJECTS, files.DOUBTS)
 
 
 @pytest.mark.parametrize("name", JSON_FILES)

@@ -10,6 +10,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.graph.factors.bearing import bearings
 from objslam.graph.marginals import (
+    correlated_factor,
     joint_covariances,
     largest_sigma,
     marginal_covariances,
@@ -71,6 +72,41 @@ def test_where_gtsam_gives_up_the_normal_equations_give_the_same():
     np.testing.assert_allclose(found[0], dense(graph, values, 1), rtol=1e-6, atol=1e-12)
     floating = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]))  # Nothing holds the frame.
     assert of_normal_equations(floating.linearize(values), values, groups) is None
+
+
+def test_the_correlated_factor_is_the_joint_covariance():
+    """Three landmarks have fewer coordinates than the factor has columns, so it is exact. Without a frame there is none."""
+    pairs = [(k, j) for k in range(3) for j in range(3)]
+    graph, values = build_graph(sightings(pairs), anchors(range(3), 0.05)), make_values(CAMERAS, POINTS, np.arange(3))
+    (joint,) = joint_covariances(graph, values, [[L0 + 2, L0, L0 + 1]])
+    blocks = np.array([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(3)])
+    factor = correlated_factor(graph, values, np.array([2, 0, 1]), blocks).reshape(9, -1)
+    np.testing.assert_allclose(factor @ factor.T, joint, rtol=1e-6, atol=1e-12)
+    assert not correlated_factor(build_graph(sightings(pairs)), values, np.array([2, 0, 1]), blocks).size
+
+
+def test_the_correlated_factor_of_many_landmarks_keeps_their_correlations():
+    """Forty landmarks seen from one camera whose pose is loose: six columns explain nearly all correlations."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(2, 9, 40), rng.uniform(-4, 4, 40), rng.uniform(0, 2, 40)])
+    cameras = np.tile(np.eye(4), (4, 1, 1))
+    cameras[:, :2, 3] = [[0.0, 0], [1, 1], [2, -1], [1, 0]]
+    camera, point = (a.ravel() for a in np.meshgrid(np.arange(4), np.arange(40)))
+    to = points[point] - cameras[camera, :3, 3]
+    noise = [gtsam.noiseModel.Isotropic.Sigma(2, 0.003)] * len(to)
+    held = [
+        gtsam.PriorFactorPose3(X0 + k, gtsam.Pose3(cameras[k]), gtsam.noiseModel.Isotropic.Sigma(6, 0.03)) for k in range(4)
+    ]
+    graph = build_graph(bearings(camera, to / np.linalg.norm(to, axis=1, keepdims=True), point, noise), held)
+    values = make_values(cameras, points, np.arange(40))
+    (joint,) = joint_covariances(graph, values, [[L0 + j for j in range(40)]])
+    blocks = np.array([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(40)])
+    factor = correlated_factor(graph, values, np.arange(40), blocks)
+    left = joint - factor.reshape(120, -1) @ factor.reshape(120, -1).T
+    assert factor.shape[2] < 40
+    assert np.linalg.eigvalsh(left).min() > -1e-9 * np.linalg.eigvalsh(joint).max()  # Nowhere above the joint covariance.
+    between = np.kron(np.eye(40), np.ones((3, 3))) == 0
+    assert np.linalg.norm(left[between]) < 0.05 * np.linalg.norm(joint[between])
 
 
 def test_a_landmark_that_one_ray_holds_is_left_out_and_the_others_are_not():

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import yaml
@@ -152,6 +154,21 @@ def test_a_missing_key_is_named(tmp_path, key):
         _read(tmp_path, yaml.safe_dump(data))
     assert caught.value.where == str(tmp_path / "camera.yaml")
     assert "image" in caught.value.hint or "camera_matrix" in caught.value.hint  # what was found instead
+
+
+@pytest.mark.parametrize("key", ["camera_matrix", "base_T_camera"])
+def test_the_form_of_a_missing_key_is_valid(tmp_path, key):
+    data = yaml.safe_load(_TEXT)
+    del data[key]
+    with pytest.raises(LogError) as caught:
+        _read(tmp_path, yaml.safe_dump(data))
+    form = caught.value.hint.removeprefix("write ").partition(" for a camera")[0].partition(";")[0]
+    for name, value in {"fx": 500, "fy": 501, "cx": 320, "cy": 240, "x": 0.1, "y": 0.2, "z": 0.3}.items():
+        form = re.sub(rf"\b{name}\b", str(value), form)
+    camera = _read(tmp_path, yaml.safe_dump(data) + form)[0]
+    assert camera.matrix[1:].tolist() == [[0, 501, 240], [0, 0, 1]]
+    if key == "base_T_camera":
+        assert camera.base_T_camera[:3].tolist() == [[0, 0, 1, 0.1], [-1, 0, 0, 0.2], [0, -1, 0, 0.3]]
 
 
 @pytest.mark.parametrize(

@@ -221,6 +221,11 @@ def test_stamps_that_repeat_or_go_back_drop_the_frame_with_its_boxes_uncounted(t
     assert next(iter(ledger.examples.values())) == [f"{file}:4", f"{file}:5"]
 
 
+def test_frames_from_the_last_to_the_first_are_refused(tmp_path):
+    with pytest.raises(LogError, match="3 of its 4 stamps repeat or go back"):
+        _read(tmp_path, *(_GOOD | {"stamp": stamp} for stamp in (4, 3, 2, 1)))
+
+
 @pytest.mark.parametrize("content", [b"", b"\n\n", b"{}\n[]\n", b"\xff\xfe{\x00", b"\x00" * 1000])
 def test_no_usable_frame_is_an_error_that_names_the_file(tmp_path, content):
     file = tmp_path / "detections.jsonl"

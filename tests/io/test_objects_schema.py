@@ -32,7 +32,8 @@ FULL = replace(
 LOST = replace(
     PLAIN, id=2, status="unresolved", covariance=None, position=np.full(3, np.nan), ray=(np.zeros(3), np.eye(3)[0])
 )
-MAP = ObjectMap((PLAIN, FULL, LOST), "site", (replace(FULL, id=3, life=replace(LIFE, state="gone", moved_from=None)),))
+GONE = replace(FULL, id=3, life=replace(LIFE, state="gone", moved_from=None))
+MAP = ObjectMap((PLAIN, FULL, LOST), "site", (GONE,), np.diag([0.1, 0.1, 0.0, 1e-3, 1e-3, 1 / 3, 1e-4]))
 
 
 def test_the_schema_is_one():
@@ -45,6 +46,7 @@ def test_what_is_written_fits_the_schema_and_is_read_back(objects):
     jsonschema.validate(json.loads(text), SCHEMA)
     back = parse_objects(json.loads(text))
     assert dump_objects(back) == text
+    np.testing.assert_array_equal(back.shared_covariance, objects.shared_covariance)
     for one, other in zip((*objects, *objects.gone), (*back, *back.gone), strict=True):
         assert (one.seen_from is None) == (other.seen_from is None)
         assert (one.life is None) == (other.life is None)
@@ -66,6 +68,8 @@ def test_format_1_is_read():
 WRONG = [
     (("format",), "objslam.objects/3"),
     (("gone",), {}),
+    (("shared_covariance",), [[1.0] * 6] * 7),
+    (("shared_covariance",), [[None] * 7] * 7),
     (("objects", 1, "position"), [1.0, 2.0]),
     (("objects", 1, "status"), "gone"),
     (("objects", 1, "label"), ""),

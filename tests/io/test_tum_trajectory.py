@@ -122,6 +122,15 @@ def test_every_bad_line_is_dropped_and_named(tmp_path):
     assert all(place.startswith(f"{file}:") for found in ledger.examples.values() for place in found)
 
 
+def test_a_file_from_the_last_pose_to_the_first_is_refused(tmp_path):
+    file = tmp_path / "odometry.txt"
+    file.write_text("".join(f"{stamp} 0 0 0\n" for stamp in range(9, 0, -1)))
+    with pytest.raises(LogError, match="8 of its 9 stamps repeat or go back") as caught:
+        read_trajectory(file, Ledger())
+    assert caught.value.where == str(file)
+    assert caught.value.hint == "sort the lines by their stamps"
+
+
 @pytest.mark.parametrize("line", ["1e21 0 0 0 0 0 0 1", "1 0 1e7 0 0 0 0 1", "1 0 0 0 0 0 0 1e4"])
 def test_a_number_that_is_too_large_is_dropped(tmp_path, line):
     file = tmp_path / "odometry.txt"

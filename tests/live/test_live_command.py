@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from waiting import LIMIT, wait_for
 
 from objslam.config import Odometry, load_settings
@@ -151,6 +152,34 @@ def test_a_live_recording_is_not_where_the_result_puts_its_own(log, tmp_path):
     assert "this file is the recording of the result" in failed.stderr
     assert len(failed.stderr.strip().splitlines()) == 1
     assert not out.exists()
+
+
+def as_messages(log):
+    """The lines for `live stdin` that say what a log folder has."""
+    camera = yaml.safe_load((log / "camera.yaml").read_text())
+    camera["name"] = camera.pop("camera_name")
+    timed = []
+    for row in np.loadtxt(log / "odometry.txt").tolist():
+        timed.append({"type": "odometry", "stamp": row[0], "translation": row[1:4], "rotation_xyzw": row[4:]})
+    for line in (log / "detections.jsonl").read_text().splitlines():
+        timed.append({"type": "detections", "camera": camera["name"], **json.loads(line)})
+    return [{"type": "camera", **camera}, *sorted(timed, key=lambda one: (one["stamp"], one["type"] == "detections"))]
+
+
+@pytest.mark.parametrize("piped", [False, True])
+def test_no_frame_of_recorded_lines_is_too_old(log, tmp_path, piped):
+    """All lines are there at once, and the map takes longer than live.max_lag for them."""
+    lines = "".join(json.dumps(message) + "\n" for message in as_messages(log))
+    (tmp_path / "lines.jsonl").write_text(lines)
+    start = command("stdin", tmp_path / "out", "--set", "live.max_lag=0.01", *(["--speed", "0"] if piped else []))
+    with (tmp_path / "lines.jsonl").open() as file:
+        given = {"input": lines} if piped else {"stdin": file}
+        done = subprocess.run(start, capture_output=True, text=True, timeout=LIMIT, **given)
+    assert done.returncode == 0, done.stderr
+    assert "has no meaning" not in done.stderr
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert told["counts"]["frames_on_path"] == 150
+    assert not any("waited too long" in reason for reason in told["dropped"])
 
 
 def test_nothing_to_go_on_with(log, tmp_path):

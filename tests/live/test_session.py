@@ -391,6 +391,8 @@ def test_a_clock_that_jumps_and_odometry_that_starts_anew(log, jump):
     accepted = session.counters.accepted()
     assert accepted["restarts of the odometry"] == 1
     assert accepted["clock set back" if jump < 0 else "gaps of the odometry"] == 1
+    warned = [line for line in session.counters.ledger.warnings if line.startswith("the clock was set back by about 9.")]
+    assert len(warned) == (jump < 0)
     off = errors(session.stop().map, log)
     assert len(off) >= 10
     assert max(off.values()) < 0.15
@@ -470,6 +472,26 @@ def test_the_same_messages_make_the_same_map_and_a_killed_session_goes_on(log, t
     for one, other in zip(again.objects, unbroken.objects, strict=True):
         np.testing.assert_allclose(one.position, other.position, atol=1e-6)
     session.abort()
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_messages_that_come_again_change_nothing(log, tmp_path, killed):
+    """A program that starts anew may send the last seconds again. They are no clock that was set back."""
+    pushes = list(events(log))
+    whole = drive(log, pushes=pushes)
+    unbroken = whole.snapshot().map
+    whole.abort()
+    session = drive(log, journal=tmp_path / "journal", pushes=pushes[:500])
+    if killed:
+        session.abort()
+        session = Session(SETTINGS, tmp_path / "journal", resume=True, patient=True).start()
+    again = feed(session, log, pushes=pushes[200:])
+    assert again.counters.dropped()["odometry that came before"] > 250
+    assert "clock set back" not in again.counters.accepted()
+    assert "restarts of the odometry" not in again.counters.accepted()
+    for one, other in zip(again.snapshot().map.objects, unbroken.objects, strict=True):
+        np.testing.assert_allclose(one.position, other.position, atol=1e-6)
+    again.abort()
 
 
 def test_poses_that_are_rarer_than_frames_may_wait_are_named_as_the_cause(log):

@@ -13,9 +13,12 @@ from objslam.core.types import Log, Trajectory
 from objslam.errors import LogError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.diagnosis import diagnose
+from objslam.mapping.checks.stamps import check_stamps
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.wrong_inputs import MISTAKES, join, with_cameras, with_frame_stamps, with_poses
+from objslam.sources import read
+from objslam.sources.log_folder import write_log_folder
 
 AMBIGUOUS = ("mirrored", "upside down")
 NAMED = {
@@ -73,7 +76,7 @@ def drive(mode: str, seed: int = 0, depth: bool = False) -> Log:
 
 
 def findings(log: Log, mode: str, *more: str):
-    return diagnose(log, load_settings(None, (f"mode={mode}", *more))).findings
+    return diagnose(log, load_settings(None, (f"mode={mode}", *more)), Ledger()).findings
 
 
 UNTOLD = pytest.mark.xfail(reason="an odometry that is 10 % too short would look the same", strict=True)
@@ -119,6 +122,49 @@ def test_stamps_of_another_clock_that_begins_at_zero_have_their_unit_too():
     start = log.localization.stamps[0]
     with pytest.raises(LogError, match="in ms"):
         findings(with_frame_stamps(log, lambda stamps: 1e3 * (stamps - start)), "fixed")
+
+
+def retimed(log: Log, factor: float, begin: float) -> Log:
+    """The log with its first pose at the stamp `begin`, s, and all stamps multiplied by `factor`."""
+    start = log.robot_path.stamps[0]
+    paths = {"localization": log.localization, "odometry": log.odometry}
+    changed = {n: p and replace(p, stamps=factor * (p.stamps - start + begin)) for n, p in paths.items()}
+    return with_frame_stamps(replace(log, **changed), lambda stamps: factor * (stamps - start + begin))
+
+
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+@pytest.mark.parametrize("begin", [0.0, 1.7e9])
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "ms"), (1e6, "us"), (1e9, "ns")])
+def test_stamps_that_are_all_in_another_unit_are_refused_by_name(mode, factor, unit, begin):
+    with pytest.raises(LogError, match=f"all stamps are probably in {unit} instead of s"):
+        findings(retimed(drive(mode), factor, begin), mode)
+
+
+@pytest.mark.parametrize("factor", [1.0, 10.0])
+def test_a_slow_robot_has_stamps_in_seconds(factor):
+    """Ten times slower, the robot drives 0.05 m/s and takes an image every second or so."""
+    assert check_stamps(retimed(drive("fixed"), factor, 0.0)) is None
+
+
+def test_a_survey_that_stops_for_each_picture_has_stamps_in_seconds():
+    """A pose and a picture every 30 s, and 1 m from one to the next."""
+    log = drive("fixed")
+    stamps = 30.0 * np.arange(20)
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = np.arange(20)
+    boxes = log.cameras[0].detections
+    camera = replace(log.cameras[0], detections=replace(boxes.take(boxes.frame < 20), frame_stamps=stamps))
+    assert check_stamps(replace(log, localization=Trajectory(stamps, poses), odometry=None, cameras=(camera,))) is None
+
+
+@pytest.mark.parametrize("name", ["boxes xywh", "boxes cxcywh"])
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+def test_boxes_that_a_reader_drops_for_their_form_are_wrong_input(tmp_path, name, mode):
+    write_log_folder(MISTAKES[name](drive(mode)), tmp_path / "log")
+    ledger = Ledger()
+    found = diagnose(read(tmp_path / "log", ledger), load_settings(None, (f"mode={mode}",)), ledger)
+    assert found.spoilt
+    assert "probably x y width height, or centre and size" in " ".join(finding.message for finding in found.findings)
 
 
 @pytest.mark.parametrize("mode", ["fixed", "joint"])
@@ -268,6 +314,6 @@ def test_what_a_run_corrects_itself_is_no_reason_to_warn():
     """A short lap around the things. Another clock fits a little better, and with it a camera that is 1.7 m aside."""
     truth = simulate(preset("demo", objects=12), 50).truth
     things = tuple((o.label, tuple(o.position)) for o in truth.objects)
-    found = diagnose(small_log(0, placed=things, frames=120), load_settings(None, ("mode=fixed",)))
+    found = diagnose(small_log(0, placed=things, frames=120), load_settings(None, ("mode=fixed",)), Ledger())
     assert not found.findings
     assert found.errors is None

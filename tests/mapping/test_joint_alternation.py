@@ -4,15 +4,17 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
+from objslam.core.trajectory import turned_since
 from objslam.core.types import Association, Keyframes, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.mapping.joint_alternation import JointState, _turned_since
+from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import seen_something
 from objslam.simulation import DepthNoise, preset, simulate
@@ -30,17 +32,17 @@ def keyframes_with_drift(heading):
 
 def test_drift_counts_from_the_nearest_keyframe_with_an_assigned_ray():
     frames = keyframes_with_drift(np.array([0.0, 1.0, 2.0, 6.0, 7.0, 20.0]))
-    np.testing.assert_allclose(_turned_since(frames, np.array([1, 4, 4])) ** 2, [1, 0, 1, 1, 0, 13])
+    np.testing.assert_allclose(turned_since(frames, np.array([1, 4, 4])) ** 2, [1, 0, 1, 1, 0, 13])
 
 
 def test_no_drift_is_allowed_where_no_odometry_leads_to_an_assigned_ray():
     frames = keyframes_with_drift(np.arange(4.0))
     some = np.array([0])
-    assert not _turned_since(frames, some[:0]).any()
-    assert not _turned_since(replace(frames, drift=None), some).any()
-    assert not _turned_since(replace(frames, localized_every=1.0), some).any()
+    assert not turned_since(frames, some[:0]).any()
+    assert not turned_since(replace(frames, drift=None), some).any()
+    assert not turned_since(replace(frames, localized_every=1.0), some).any()
     parts = replace(frames, stretch=np.array([0, 0, 1, -1]))
-    np.testing.assert_allclose(_turned_since(parts, some), [0, 1, 0, 0])
+    np.testing.assert_allclose(turned_since(parts, some), [0, 1, 0, 0])
 
 
 def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry():
@@ -87,6 +89,32 @@ def test_more_rays_that_are_noisier_are_no_better_map():
     assert quiet.better(more).agree.sum() == 95
     assert more.better(quiet) is more
     assert state(80, 100.0).explained == 0  # 0.5 rad, more than a view
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_associations_that_take_turns_the_one_that_explains_more_rays_counts(monkeypatch, first):
+    """One of them has an object more. Which one returns first is chance."""
+    shared = np.zeros(20, dtype=np.int64)
+    found = [Association(np.append(shared, np.full(10, more)), shared[: 1 + (more > 0)]) for more in (-1, 1)]
+    turns = [found[first], found[1 - first], found[first]]
+    rays = SimpleNamespace(sigma=np.full(30, 0.01))
+    keyframes = SimpleNamespace(base_T_camera=np.eye(4)[None])
+    settings = load_settings(None, ("mode=joint", "output.recording=false"))
+    begin = JointState(keyframes, rays, keyframes, rays, (), settings, Ledger(), lambda *_: None, None, None)
+    begin = replace(begin, association=Association(np.full(30, -1), shared[:0]))
+    monkeypatch.setattr(JointState, "_associate", lambda state, *_: turns[len(state.rounds)])
+    monkeypatch.setattr(JointState, "merged", lambda state: state)
+
+    def solve(state, why, association, start):
+        weight = (association.object >= 0).astype(float)
+        estimate = SimpleNamespace(weight=weight, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
+        return replace(state, association=association, estimate=estimate)
+
+    monkeypatch.setattr(JointState, "solve", solve)
+    chosen = begin.alternated(np.eye(4)[None], None)
+    assert chosen.settled
+    assert chosen.association is found[1]
+    assert [one["rays_changed"] for one in chosen.rounds[1:]] == [10, 10]
 
 
 def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():

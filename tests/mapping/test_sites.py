@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mapping.site_days import DAY, Day, Place, session
 
-from objslam.core.geometry import inverse
+from objslam.core.geometry import align, inverse
+from objslam.core.maps.shared_covariance import jacobian
 from objslam.core.object_map import ObjectMap
 from objslam.mapping.sites.compare import compare
 from objslam.mapping.sites.merge import merge_sessions
@@ -169,3 +170,37 @@ def test_a_covariance_is_never_below_that_of_the_best_session(sigma):
         days.append(Day(seen.name, ObjectMap(tuple(replace(o, covariance=cov) for o in seen.objects))))
     for o in merge_sessions(days)[0].objects:
         assert o.sigma >= 0.999 * sigma
+
+
+def as_large_as(day, size, sigma):
+    """A session whose map is too large by this share, and says that its size has this standard deviation."""
+    shared = np.diag([0.05, 0.05, 0.02, 1e-3, 1e-3, 0.01, sigma]) ** 2
+    moves = jacobian(day.objects.positions * (1 + size))
+    spread = day.objects.covariances + moves @ shared @ np.swapaxes(moves, 1, 2)
+    found = zip(day.objects, day.objects.positions * (1 + size), spread, strict=True)
+    objects = tuple(replace(o, position=at, covariance=cov) for o, at, cov in found)
+    return Day(day.name, replace(day.objects, objects=objects, shared_covariance=shared))
+
+
+def test_a_site_takes_the_size_of_the_session_that_knows_it():
+    """Two sessions are 3 % and 1 % too large, as they say they may be. A third knows its size, and joins their site."""
+    place = Place(np.random.default_rng(9), count=25)
+    days = [quiet(place, day)[0] for day in range(3)]
+    first = [as_large_as(days[0], 0.03, 0.02), as_large_as(days[1], 0.01, 0.02)]
+    last = as_large_as(days[2], 0.0, 0.001)
+
+    def size(objects):
+        found = [there(objects, at, 0.6).position for _, at in place.truth.values()]
+        return align(np.array([at for _, at in place.truth.values()]), np.array(found), "sim2")[1]
+
+    (site,) = merge_sessions(first)
+    assert size(site.objects) == pytest.approx(1.02, abs=0.004)
+    sigma = np.sqrt(site.objects.shared_covariance[6, 6])
+    assert 0.0195 < sigma < 0.022  # One robot may repeat its error, so two sessions are not surer than one.
+    for sessions in ([Day("site", site.objects), last], [*first, last]):
+        (island,) = merge_sessions(sessions)
+        assert size(island.objects) == pytest.approx(1.0, abs=0.004)
+        assert np.sqrt(island.objects.shared_covariance[6, 6]) < 0.005
+        for o in island.objects:
+            part = jacobian(o.position) @ island.objects.shared_covariance @ jacobian(o.position).T
+            assert np.linalg.eigvalsh(o.covariance - part).min() > -1e-9

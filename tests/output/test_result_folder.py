@@ -35,7 +35,7 @@ from objslam.simulation import make_camera
 from objslam.sources.log_folder import write_log_folder
 
 PLAIN = Settings(output=Output(recording=False, picture=False))
-PLAIN_FILES = {"objects.json", "trajectory.txt", "path.txt", "rays.parquet", "config.yaml", "summary.json"}
+PLAIN_FILES = {"objects.json", "trajectory.txt", "path.txt", "rays.parquet", "config.yaml", "doubts.json", "summary.json"}
 
 
 def small(seed: int = 0, settings: Settings = PLAIN, keyframes: int = 12) -> RunResult:

@@ -69,7 +69,7 @@ def test_a_start_with_cameras_that_are_turned_and_late_is_no_wrong_input(data_di
     """A quick look takes it for mirrored images, or for halves that differ. The solve explains 9 of 10 boxes."""
     log = read_lost_in_the_woods(data_dir / "lost_in_the_woods", seconds=seconds)
     settings = load_settings(None, ("mode=joint", "output.recording=false"))
-    assert diagnose(log, settings).spoilt
+    assert diagnose(log, settings, Ledger()).spoilt
     result = pipeline.run(log, settings, Ledger())
     assert result.summary["wrong_input"] == []
     assert len(result.map.resolved()) >= 7

@@ -1,20 +1,25 @@
-"""Solve the frames of many maps and the positions of their objects together.
+"""Solve the frames of many maps, the positions of their objects, and the errors that the objects of each map share.
 
 Each map measures its objects in a frame of its own. A frame has x, y, z and yaw, because z is up in all maps. The first
-frame is the frame of the result. Each Gauss-Newton step eliminates the objects first (Schur complement). So its time grows
-with the number of measurements, and with the cube of the small number of frames. Cauchy's weights limit what moved objects
-do.
+frame is the frame of the result. All objects of a map share an error: a shift, a turn and a wrong size
+(`core.maps.shared_covariance`). It is a variable too, with its covariance as the prior. So a map whose size is uncertain
+takes the size of a map whose size is known. Each Gauss-Newton step eliminates the objects first (Schur complement). So its
+time grows with the number of measurements, and with the cube of the small number of maps. Cauchy's weights limit what moved
+objects do.
 
-A map may have larger errors than its covariances say. With at least three maps, the residuals show this. The variance of
-each map is estimated against that of all others (variance components; Helmert 1907, Foerstner 1979).
+The errors that are not shared may be larger than the covariances say: objects are nudged, and their boxes differ from day to
+day. The residuals show this. With at least three maps, the variance of each map is estimated against all others (variance
+components; Helmert 1907, Foerstner 1979). Two maps have one common variance.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import lift_se2, split_se2
+from objslam.core.maps.shared_covariance import NUMBERS, jacobian
 from objslam.core.statistics import HALF_RAY
 
 _STEPS = 30
@@ -24,22 +29,37 @@ _ROUNDS = 10
 _SAME_NOISE = 0.02
 """The noise is not estimated again if its relative change is smaller than this. A larger value ends sooner."""
 _FEWEST_MAPS = 3
-"""The least number of maps for which the noise is estimated. The residuals of two maps do not tell which is worse."""
+"""The least number of maps that have a noise each. With fewer, all have one noise, because the residuals of two maps do not
+tell which is worse. A larger number gives more maps one noise."""
 _POOLED = 10.0
 """The covariances that a map comes with count as this number of coordinates of residuals. A larger number trusts them
 longer. At 10, a map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
+_AGAIN = 0.01
+"""The standard deviation (m) that each map adds to the errors that are not shared. A larger value trusts small distances in
+maps less. Without it, one pair of nearly exact objects would decide about the shared errors."""
+_SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
+"""Squared lengths of normal residuals (chi-squared, 3 degrees of freedom) at equal steps of probability. The mean over them
+gives the expectation of a weighted squared residual. More steps give it more exactly."""
+_RIDGE = 1e-12
+"""The share of the trace of the linear system that is added to its diagonal. Frames that no object determines then stay
+where they are. A larger share slows the solve down."""
 _STILL = 1e-9
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """R measurements: map (R,) has object (R,) at position (R, 3) m in its own frame, with covariance (R, 3, 3) m^2."""
+    """R measurements: map (R,) has object (R,) at position (R, 3) m in its own frame.
+
+    covariance: (R, 3, 3) m^2, without the shared errors. roots: (S, 7, 7) `root_of` the covariances of the shared errors of
+    the S maps, None if no map has any.
+    """
 
     map: Ints
     object: Ints
     position: Floats
     covariance: Floats
+    roots: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -47,41 +67,61 @@ class JointFrames:
     """S frames and N objects in the frame of the first map.
 
     site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
-    (N, 3) m. covariance: (N, 3, 3) m^2. weight: (R,) the weight of each measurement, in [0, 1]. noise: (S,) the factor on
-    the covariances of each map, relative to the mean of all maps. 1 for fewer than three maps.
+    (N, 3) m. covariance: (N, 3, 3) m^2. own: (N, 3, 3) m^2, the part of it that an object has alone. correlated: (N, 3, m)
+    m, the other part, as a factor of the joint covariance. weight: (R,) the weight of each measurement, in [0, 1]. noise:
+    (S,) the factor, at least 1, on the covariances of the errors that are not shared. 1 for one map alone.
     """
 
     site_T_map: Floats
     frame_covariance: Floats
     positions: Floats
     covariance: Floats
+    own: Floats
+    correlated: Floats
     weight: Floats
     noise: Floats
 
 
-def solve_frames(measured: Measured, site_T_map: Floats, count: int) -> JointFrames:
+@dataclass(frozen=True)
+class _State:
+    """A solve of S maps.
+
+    errors: (S, 7) the shared errors, in units of their roots. taken: (S,) how many coordinates of the residuals the frame
+    and the shared error of each map take.
+    """
+
+    found: JointFrames
+    errors: Floats
+    taken: Floats
+
+
+def solve_frames(measured: Measured, site_T_map: Floats, count: int, *, judged: bool = True) -> JointFrames:
     """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object has a
     measurement.
 
     Each frame must share at least two objects with the first, directly or through other frames. If one does not, the
-    covariances of all frames after the first are NaN.
+    covariances of all frames after the first are NaN. judged: whether the noise of the maps is estimated.
     """
+    roots = measured.roots
+    if roots is None or not roots.any():
+        roots = np.zeros((len(site_T_map), NUMBERS, 0))
+    measured = replace(measured, roots=roots)
+    if len(site_T_map) > 1:
+        measured = replace(measured, covariance=measured.covariance + _AGAIN**2 * np.eye(3))
     noise = np.ones(len(site_T_map))
-    found = _solve(measured, site_T_map, count, noise)
-    if len(site_T_map) < _FEWEST_MAPS:
-        return found
-    for _ in range(_ROUNDS):
-        noise = _noise(measured, found)
-        if np.abs(noise / found.noise - 1).max() < _SAME_NOISE:
+    at = _solve(measured, site_T_map, count, noise, np.zeros((len(site_T_map), roots.shape[2])))
+    for _ in range(_ROUNDS if judged and len(site_T_map) > 1 else 0):
+        noise = _noise(measured, at)
+        if np.abs(noise / at.found.noise - 1).max() < _SAME_NOISE:
             break
-        found = _solve(measured, found.site_T_map, count, noise)
-    return found
+        at = _solve(measured, at.found.site_T_map, count, noise, at.errors)
+    return at.found
 
 
-def _noise(measured: Measured, found: JointFrames) -> Floats:
+def _noise(measured: Measured, at: _State) -> Floats:
     """Return the factor (S,) on the covariances of each map: its squared residuals over their expectation."""
-    rotation = found.site_T_map[measured.map, :3, :3]
-    moved = (rotation @ measured.position[..., None])[..., 0] + found.site_T_map[measured.map, :3, 3]
+    found = at.found
+    moved, _, rotation = _moved(measured, _frames(found.site_T_map), at.errors, found.positions)
     claimed = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2))
     counted = claimed * (found.weight / found.noise[measured.map])[:, None, None]
     total = _sums(counted, measured.object, len(found.positions))
@@ -89,77 +129,124 @@ def _noise(measured: Measured, found: JointFrames) -> Floats:
     miss = found.positions[measured.object] - moved
     squares = found.weight * np.einsum("ri,rij,rj->r", miss, claimed, miss)
     maps = len(found.noise)
-    free, own = np.bincount(measured.map, 3 - share, maps), np.bincount(measured.map, squares, maps)
-    level = max(own.sum() / max(free.sum(), 1e-9), 1e-9)  # The mean factor over all maps.
-    return np.asarray((own / level + _POOLED) / (free + _POOLED))
+    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES
+    expected = np.bincount(measured.map, (left / (1 + left / HALF_RAY)).mean(axis=1), maps)
+    coordinates = np.bincount(measured.map, 3 - share, maps)
+    free = expected * np.maximum(1 - at.taken / np.maximum(coordinates, 1e-9), 0.0)
+    own = np.bincount(measured.map, squares, maps)
+    if maps < _FEWEST_MAPS:
+        free, own = np.full(maps, free.sum()), np.full(maps, own.sum())
+    return np.maximum((own + _POOLED) / (free + _POOLED), 1.0)
 
 
-def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats) -> JointFrames:
+def _frames(poses: Floats) -> Floats:
+    """Return x, y, z and yaw (S, 4) of poses (S, 4, 4)."""
+    return np.column_stack([poses[:, :3, 3], split_se2(poses)[0][:, 2]])
+
+
+def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, errors: Floats) -> _State:
     measured = replace(measured, covariance=measured.covariance * noise[measured.map, None, None])
-    frames = len(site_T_map)
-    x = np.column_stack([site_T_map[:, :3, 3], split_se2(site_T_map)[0][:, 2]])
+    maps, width = len(site_T_map), 4 + errors.shape[1]
+    x = _frames(site_T_map)
+    free = np.arange(4, maps * width)  # The first frame stays. Its shared errors do not.
     weight = np.ones(len(measured.object))
+    alone = np.bincount(measured.object, minlength=count)[measured.object] < 2
+    positions: Floats | None = None
     for _ in range(_STEPS):
-        moved, lever, rotation = _moved(measured, x)
-        information = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2)) * weight[:, None, None]
-        total = _sums(information, measured.object, count)
-        positions = np.linalg.solve(
-            total, _sums((information @ moved[..., None])[..., 0], measured.object, count)[..., None]
-        )
-        positions = positions[..., 0]
-        miss = positions[measured.object] - moved
-        system, gradient, half = _reduced(measured, lever, information, total, miss, frames)
-        step = np.zeros((frames, 4))
-        if frames > 1:
-            step[1:] = np.linalg.lstsq(system, gradient, rcond=None)[0].reshape(-1, 4)
-        x = x + step
-        if np.abs(step).max() < _STILL:
-            break
+        moved, lever, rotation = _moved(measured, x, errors, positions)
         plain = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2))
-        alone = np.bincount(measured.object, minlength=count)[measured.object] < 2
+        information = plain * weight[:, None, None]
+        total = _sums(information, measured.object, count)
+        pulls = _sums((information @ moved[..., None])[..., 0], measured.object, count)
+        positions = np.asarray(np.linalg.solve(total, pulls[..., None])[..., 0], dtype=np.float64)
+        miss = positions[measured.object] - moved
+        system, gradient, half = _reduced(measured, lever, information, total, miss, errors)
+        step = np.zeros(maps * width)
+        if len(free):
+            inner = system[np.ix_(free, free)]
+            step[free] = np.linalg.solve(inner + _RIDGE * np.trace(inner) * np.eye(len(free)), gradient[free])
+        by_map = step.reshape(maps, width)
+        x, errors = x + by_map[:, :4], errors + by_map[:, 4:]
+        if np.abs(step).max(initial=0.0) < _STILL:
+            break
         weight = np.where(alone, 1.0, 1 / (1 + np.einsum("ri,rij,rj->r", miss, plain, miss) / HALF_RAY))
-    spread = np.zeros((4 * frames, 4 * frames))
-    if frames > 1:
+    # Normal residuals have weights below 1 too. Without their mean, the covariances of normal errors would be too large.
+    information = information / _mean_weight(information, total, measured.object)[:, None, None]
+    total = _sums(information, measured.object, count)
+    system, _, half = _reduced(measured, lever, information, total, miss, errors)
+    system = system[np.ix_(free, free)]
+    assert positions is not None
+    spread = np.zeros((maps * width, maps * width))
+    if len(free):
         held = np.linalg.cond(system) < 1e14
-        spread[4:, 4:] = np.linalg.inv(system) if held else np.nan
-    covariance = np.linalg.inv(total)
-    gain = covariance[:, None] @ half  # (N, S, 3, 4): the derivative of each object by each frame.
-    flat = np.swapaxes(gain, 1, 2).reshape(count, 3, 4 * frames)
-    covariance = covariance + flat @ np.nan_to_num(spread) @ np.swapaxes(flat, 1, 2)
+        spread[np.ix_(free, free)] = np.linalg.inv(system) if held else np.nan
+    own = np.asarray(np.linalg.inv(total), dtype=np.float64)
+    gain = np.swapaxes(own[:, None] @ half, 1, 2).reshape(count, 3, maps * width)  # The derivatives of the objects.
+    size, axes = np.linalg.eigh(np.nan_to_num((spread + spread.T) / 2))
+    correlated: Floats = np.asarray(gain @ (axes * np.sqrt(np.maximum(size, 0.0))), dtype=np.float64)
+    own = np.asarray((own + np.swapaxes(own, 1, 2)) / 2, dtype=np.float64)
     poses = lift_se2(x[:, [0, 1, 3]])
     poses[:, 2, 3] = x[:, 2]
-    blocks = np.array([spread[4 * s : 4 * s + 4, 4 * s : 4 * s + 4] for s in range(frames)])
-    symmetric = np.asarray((covariance + np.swapaxes(covariance, 1, 2)) / 2)
-    return JointFrames(poses, blocks, np.asarray(positions), symmetric, weight, noise)
+    blocks = np.array([spread[width * s : width * s + 4, width * s : width * s + 4] for s in range(maps)])
+    covariance = own + correlated @ np.swapaxes(correlated, 1, 2)
+    known = width - np.diagonal(spread).reshape(maps, width)[:, 4:].sum(axis=1)
+    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 * (np.arange(maps) == 0)
+    found = JointFrames(poses, blocks, positions, covariance, own, correlated, weight, noise)
+    return _State(found, errors, taken)
 
 
-def _moved(measured: Measured, x: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the measurements (R, 3) in the frame of the result, their Jacobians (R, 3, 4) by their frame, and rotations."""
+def _mean_weight(information: Floats, total: Floats, object_: Ints) -> Floats:
+    """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3). total: (N, 3, 3), its sums."""
+    share = np.trace(information @ np.linalg.inv(total)[object_], axis1=1, axis2=2)
+    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The position of an object takes its share.
+    return np.asarray((1 / (1 + left / HALF_RAY)).mean(axis=1))
+
+
+def _moved(measured: Measured, x: Floats, errors: Floats, positions: Floats | None) -> tuple[Floats, Floats, Floats]:
+    """Return the measurements (R, 3) without shared errors (S, r), in the frame of the result, and rotations (R, 3, 3).
+
+    Also return their Jacobians (R, 3, 4 + r) by the frame x (S, 4) and the shared errors of their map. positions: (N, 3) m,
+    the objects so far, None before the first step.
+    """
+    assert measured.roots is not None
     poses = lift_se2(x[:, [0, 1, 3]])[measured.map]
     rotation = poses[:, :3, :3]
-    turned = (rotation @ measured.position[..., None])[..., 0]
-    lever = np.zeros((len(turned), 3, 4))
+    at = measured.position
+    if positions is not None:
+        # At the measured positions, a smaller world would have smaller residuals, and all maps would shrink.
+        at = (np.swapaxes(rotation, 1, 2) @ (positions[measured.object] - x[measured.map, :3])[..., None])[..., 0]
+    shared = jacobian(at) @ measured.roots[measured.map]
+    local = measured.position - (shared @ errors[measured.map][..., None])[..., 0]
+    turned = (rotation @ local[..., None])[..., 0]
+    lever = np.zeros((len(turned), 3, 4 + errors.shape[1]))
     lever[:, :, :3] = np.eye(3)
     lever[:, 0, 3], lever[:, 1, 3] = -turned[:, 1], turned[:, 0]
+    lever[:, :, 4:] = -rotation @ shared
     return turned + x[measured.map, :3], lever, rotation
 
 
 def _reduced(
-    measured: Measured, lever: Floats, information: Floats, total: Floats, miss: Floats, frames: int
+    measured: Measured, lever: Floats, information: Floats, total: Floats, miss: Floats, errors: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the matrix and the right side of the linear system of the frames after the first. Also the information
-    (N, S, 3, 4) between each object and each frame."""
-    count = len(total)
+    """Return the matrix (m, m) and the right side (m,) of the linear system of the frames and shared errors of all maps.
+
+    Also return the information (N, S, 3, 4 + r) between each object and each map.
+    """
+    count, (maps, shared) = len(total), errors.shape
+    width = 4 + shared
     pull = information @ lever
-    half = np.zeros((count, frames, 3, 4))
+    half = np.zeros((count, maps, 3, width))
     np.add.at(half, (measured.object, measured.map), pull)
-    own = _sums(np.swapaxes(lever, 1, 2) @ pull, measured.map, frames)
-    flat = np.swapaxes(half, 1, 2).reshape(count, 3, 4 * frames)
-    system = -np.einsum("nia,nij,njb->ab", flat, np.linalg.inv(total), flat, optimize=True)
-    for s in range(frames):
-        system[4 * s : 4 * s + 4, 4 * s : 4 * s + 4] += own[s]
-    gradient = _sums((np.swapaxes(pull, 1, 2) @ miss[..., None])[..., 0], measured.map, frames).reshape(-1)
-    return system[4:, 4:], gradient[4:], half
+    own = _sums(np.swapaxes(lever, 1, 2) @ pull, measured.map, maps)
+    own[:, 4:, 4:] += np.eye(shared)  # The prior of the shared errors.
+    flat = np.swapaxes(half, 1, 2).reshape(3 * count, maps * width)
+    carried = np.swapaxes(np.linalg.inv(total)[:, None] @ half, 1, 2).reshape(3 * count, maps * width)
+    system = -flat.T @ carried
+    for s in range(maps):
+        system[width * s : width * (s + 1), width * s : width * (s + 1)] += own[s]
+    gradient = _sums((np.swapaxes(pull, 1, 2) @ miss[..., None])[..., 0], measured.map, maps)
+    gradient[:, 4:] -= errors
+    return system, gradient.reshape(-1), half
 
 
 def _sums(values: Floats, group: Ints, count: int) -> Floats:

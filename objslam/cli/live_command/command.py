@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from objslam.live.session.session import Session
 
 
-Speed = Annotated[float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0: as fast as possible.")]
+Speed = Annotated[
+    float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0, also for stdin: as fast as the map follows.")
+]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a killed session from its journal.")]
 Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]
 Publish = Annotated[
@@ -88,13 +90,13 @@ def live(
     with output_folder(out), ExitStack() as stack:
         if journal:
             _look_for_journal(out / NAME, resume, stack)
-        patient = recording is not None and speed == 0
+        patient = speed == 0 if recording is not None else _is_recorded(source, speed)
         kept = out / NAME if journal else None
         session = Session(settings, kept, resume, name=Path(source).name, patient=patient, known=known)
         stack.callback(session.abort)
         truth = None
         if recording is None:
-            feed = ADAPTERS[source].opens(session, settings, options)
+            feed = ADAPTERS[source].opens(session, settings, options, session.wait if patient else None)
         else:
             (log, ledger), newest = recording, lambda: session.newest
             adapter = ReplayAdapter(session, log, speed or None, session.wait, newest, ledger=ledger, settings=settings)
@@ -148,8 +150,15 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
     taken = names(adapter.options if adapter else SourceOptions, NetworkOptions if publish else None)
     if adapter is None:
         taken |= {"detector"}
-    for flag in unused(options, LiveOptions, taken) + (["--speed"] if adapter and speed != 1.0 else []):
+    paced = speed == 0 if adapter and adapter.recorded else adapter is None
+    for flag in unused(options, LiveOptions, taken) + (["--speed"] if speed != 1.0 and not paced else []):
         say(f"warning: {flag} has no meaning for {source if adapter else 'a recording'}", stderr=True)
+
+
+def _is_recorded(source: str, speed: float) -> bool:
+    """Return whether the messages of an adapter are a recording, of which no frame may be dropped for its age."""
+    recorded = ADAPTERS[source].recorded
+    return recorded is not None and (speed == 0 or recorded())
 
 
 def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Ledger]:

@@ -25,9 +25,13 @@ from objslam.graph.calibration.variance_components import estimate_noise, shrink
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers
 
 _ROUNDS = 8
-"""The most outer steps. The MRCLAM robots, whose clocks are 0.2 s off, take 4 to 6. A larger number is slower."""
+"""The most outer steps of a search. The MRCLAM robots, whose clocks are 0.2 s off, take 1 or 2 steps before the noise is
+known, and 1 or 2 after. A larger number is slower."""
 _CONVERGED = 0.2
 """A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
+_NEARLY = 2.0
+"""The same before the noise is known. The search goes on with the new noise, so its first part may end near the optimum. A
+larger number ends it sooner, but then the residuals from which the noise is estimated contain more of the shared errors."""
 _HALVINGS = 3
 """The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
@@ -91,17 +95,19 @@ def calibrate(
     """
     fit = _Fit(errors, measure, trace)
     state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used).ordered()
-    at = fit.shared_errors(state, theta)
+    nearly = bool(errors.unknown_noise) and len(theta) > 0
+    at = fit.shared_errors(state, theta, _NEARLY if nearly else _CONVERGED)
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
         noise = estimate_noise(state, at.system, fit.errors, theta, fit.prior_residuals)
         before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
         fit = replace(fit, errors=fit.errors.with_noise(noise))
         state = fit.remeasured(state, theta).settled()
+        if nearly or not same:
+            at = fit.shared_errors(state, theta, _CONVERGED, at.noisy if noise.like(before, _SAME_SHARES) else None)
+            state, theta, steps, nearly = at.state, at.theta, steps + at.steps, False
         if same:
             break
-        at = fit.shared_errors(state, theta, at.noisy if noise.like(before, _SAME_SHARES) else None)
-        state, theta, steps = at.state, at.theta, steps + at.steps
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used).ordered()
@@ -144,8 +150,12 @@ class _Fit:
         """The weight of the nominal noise: it counts like this number of residuals."""
         return self.errors.settings.noise.prior
 
-    def shared_errors(self, state: InnerSolve, theta: Floats, noisy: Floats | None = None) -> _Found:
-        """Return the parameters that fit best. The search starts at theta (P,). noisy: from `noise_shares`, if known."""
+    def shared_errors(self, state: InnerSolve, theta: Floats, converged: float, noisy: Floats | None = None) -> _Found:
+        """Return the parameters that fit best. The search starts at theta (P,).
+
+        converged: the number of posterior standard deviations below which a step ends the search. noisy: from
+        `noise_shares`, if known.
+        """
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
         sigma = np.sqrt(np.diagonal(errors.prior))
@@ -168,7 +178,7 @@ class _Fit:
             step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ (theta - errors.mean)), dtype=np.float64)
             pull = system.gradient - system.descent
             deviations = np.sqrt(np.diagonal(covariance))
-            if (np.abs(step) < _CONVERGED * deviations).all():
+            if (np.abs(step) < converged * deviations).all():
                 break
             history = [*history[-MEMORY:], (theta, step)]
             target = accelerated(history, sigma)
@@ -180,7 +190,7 @@ class _Fit:
                     better = trial
                     break
                 target, history = theta + (target - theta) / 2, []
-                if (np.abs(target - theta) < _CONVERGED * deviations).all():
+                if (np.abs(target - theta) < converged * deviations).all():
                     break
             if better is None:
                 break

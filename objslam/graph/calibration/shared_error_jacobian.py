@@ -12,7 +12,7 @@ from scipy import sparse
 
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.calibration import CalibratedMeasurements
+from objslam.core.calibration import CalibratedMeasurements, kind
 from objslam.core.geometry import adjoint, inverse, log_se3
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
@@ -21,6 +21,9 @@ from objslam.graph.least_squares.normal_equations import NormalEquations, elimin
 
 _ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
 """Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
+_SHORT = 1e-3
+"""The step of a derivative, as a share of `errors.steps`. With a larger share, the derivative contains more of the
+curvature. With a share below 1e-6, it contains rounding errors."""
 _ALIKE = 10.0
 """The neighbours of a motion predict its covariance if the prediction and the motion's own covariance differ at most by this
 factor. The noise of a motion changes its covariance by far less. With 3 or 5, one of twelve clean drives was pulled by 7
@@ -140,24 +143,29 @@ def linearise(
 
 
 def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Floats, which: Sequence[int]) -> Floats:
-    """Return derivatives (M, p) of the whitened residuals by some parameters, as central differences.
+    """Return derivatives (M, p) of the whitened residuals by some parameters. The robust weights are kept fixed.
 
-    The robust weights are kept fixed.
+    A derivative by a clock is a central difference, because velocities change abruptly. The measurements are smooth
+    functions of the other parameters. So a difference over a short step (`_SHORT`) is exact enough there.
     """
-    parts = _parts(of)
+    parts, joined = _parts(of), of.measured.multiframes
     result = np.zeros((len(of.rows.residual), len(which)))
+
+    def measured(theta: Floats) -> tuple[Keyframes, Rays, Settings]:
+        images, rays, settings = errors.at(theta, drift=False)
+        return joined.keyframes(images), joined.rays(images, rays.take(of.which)), settings
+
+    here = measured(theta)
     for column, k in enumerate(which):
-        step = errors.steps[k] * np.eye(len(theta))[k]
-        sides = []
-        for moved in (theta + step, theta - step):
-            images, rays, settings = errors.at(moved, drift=False)
-            joined = of.measured.multiframes
-            sides.append((joined.keyframes(images), joined.rays(images, rays.take(of.which)), settings))
+        clock = kind(errors.names[k]) == "clock"
+        step = errors.steps[k] * (1.0 if clock else _SHORT)
+        moved = step * np.eye(len(theta))[k]
+        sides, apart = (measured(theta + moved), measured(theta - moved) if clock else here), step * (2 if clock else 1)
         for part in parts:
             ahead, behind = (part.measured(*side) for side in sides)
             if any(not np.array_equal(one, other) for one, other in zip(ahead, behind, strict=True)):
                 change = (part.residuals(*ahead) - part.residuals(*behind)).ravel()
-                result[part.first : part.first + len(change), column] = change / (2 * errors.steps[k])
+                result[part.first : part.first + len(change), column] = change / apart
     return result
 
 

@@ -82,16 +82,18 @@ def estimate_noise(
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(residual), _PROBES))
     begin = errors.noise
     noise, history = begin, list[tuple[Floats, Floats]]()
+    left = _left(jacobian, system.normal, system.sides, root, np.column_stack([probes, residual]))
     for _ in range(_ITERATIONS):
-        rescale = _rescaling(system, rows, begin, noise, len(system.residual))
-        told = np.column_stack([probes, np.append(rescale @ system.residual, residual[len(system.residual) :])])
-        left = _left(rescale @ jacobian, system.normal.order, rescale @ system.sides, root, told)
         other = _updated(system, rows, noise, kinds, probes, left, prior_residuals)
         if other.like(noise, _CONVERGED):
             noise = other
             break
         history = [*history[-MEMORY:], (_logarithms(noise), _logarithms(other) - _logarithms(noise))]
         noise = _from_logarithms(accelerated(history, 1.0), other)
+        rescale = _rescaling(system, rows, begin, noise, len(system.residual))
+        told = np.column_stack([probes, np.append(rescale @ system.residual, residual[len(system.residual) :])])
+        scaled = rescale @ jacobian
+        left = _left(scaled, NormalEquations.of(scaled, system.normal.order), rescale @ system.sides, root, told)
     force, curvature = shrinking_force(of)
     return replace(noise, shrinkage=min(force / curvature, _MOST_SHRINKAGE))
 
@@ -139,15 +141,15 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     )
 
 
-def _left(jacobian: sparse.csr_matrix, order: Ints, sides: Floats, prior: Floats, told: Floats) -> Floats:
+def _left(jacobian: sparse.csr_matrix, normal: NormalEquations, sides: Floats, prior: Floats, told: Floats) -> Floats:
     """Return the residuals of `told` (M + P, n) after a least-squares solution.
 
-    jacobian: (M, D) by poses and landmarks. order: (D,) of their elimination. sides: (M, P) by the shared errors. prior: (P,
-    P) the last P rows by the shared errors. The sides are dense, so a Schur complement eliminates them last. As columns of
+    jacobian: (M, D) by poses and landmarks. normal: its normal equations. sides: (M, P) by the shared errors. prior: (P, P)
+    the last P rows by the shared errors. The sides are dense, so a Schur complement eliminates them last. As columns of
     the sparse matrix, they would slow its factorisation down by a factor of four.
     """
     both = np.hstack([sides, told[: len(sides)]])
-    both = both - jacobian @ NormalEquations.of(jacobian, order).solve(jacobian.T @ both)
+    both = both - jacobian @ normal.solve(jacobian.T @ both)
     reduced = np.vstack([both[:, : sides.shape[1]], prior])
     rest = np.vstack([both[:, sides.shape[1] :], told[len(sides) :]])
     return np.asarray(rest - reduced @ np.linalg.solve(reduced.T @ reduced, reduced.T @ rest))

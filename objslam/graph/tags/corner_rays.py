@@ -109,6 +109,13 @@ class TagCorners:
         """Return the fiducials (t,) all of whose corners are among the landmarks (m,)."""
         return np.flatnonzero(np.isin(self.landmarks, landmarks).all(axis=1))
 
+    def of_objects(self, values: Floats) -> Floats:
+        """Return values of the objects (N, ...) for values of the landmarks (M, ...): the mean over the corners of each
+        fiducial."""
+        found = values[: self.count].copy()
+        found[self.object] = values[self.landmarks].mean(axis=1)
+        return found
+
     def is_corner(self) -> Bools:
         """Return which landmarks (M,) are corners of fiducials."""
         return np.isin(np.arange(self.association.count), self.landmarks)

@@ -32,6 +32,10 @@ ODOM = "odom"  # The name of the odometry's frame where messages do not name it 
 _INTERFACE = "DDS: a network interface, by name or address, or auto for any. [default: from CYCLONEDDS_URI, else loopback]"
 
 
+Wait = Callable[[], object]
+"""Returns once the map contains all messages that were pushed."""
+
+
 class Adapter(Protocol):
     """Brings messages to a `Sink`."""
 
@@ -90,30 +94,41 @@ class LiveSource:
     """A named source of `objslam live`.
 
     says: its description in `--help`. opens: the function that makes its `Feed`. options: the class of its options, which
-    `LiveOptions` inherits. None if it has no options.
+    `LiveOptions` inherits. None if it has no options. recorded: returns whether its messages are a recording now, which may
+    be read as fast as they are mapped (--speed 0). None if they never are.
     """
 
     says: str
-    opens: Callable[[Sink, Settings, LiveOptions], Feed]
+    opens: Callable[[Sink, Settings, LiveOptions, Wait | None], Feed]
     options: type[Any] | None = None
+    recorded: Callable[[], bool] | None = None
 
 
-def _stdin(sink: Sink, settings: Settings, options: object) -> Feed:
+def _stdin(sink: Sink, settings: Settings, options: object, wait: Wait | None) -> Feed:
     import sys
 
     from objslam.live.adapters.stdin import StdinAdapter
 
-    return Feed(StdinAdapter(sink, sys.stdin.buffer))
+    return Feed(StdinAdapter(sink, sys.stdin.buffer, wait=wait))
 
 
-def _dds(sink: Sink, settings: Settings, options: DdsOptions) -> Feed:
+def _is_file() -> bool:
+    """Return whether standard input is a file, which no running robot writes."""
+    import os
+    import stat
+    import sys
+
+    return stat.S_ISREG(os.fstat(sys.stdin.fileno()).st_mode)
+
+
+def _dds(sink: Sink, settings: Settings, options: DdsOptions, wait: Wait | None) -> Feed:
     from objslam.live.adapters.dds import DdsAdapter
     from objslam.live.dds.network import open_network
 
     return _ros(sink, settings, options, partial(DdsAdapter, open_network(options.domain, options.interface)))
 
 
-def _rclpy(sink: Sink, settings: Settings, options: LiveRosOptions) -> Feed:
+def _rclpy(sink: Sink, settings: Settings, options: LiveRosOptions, wait: Wait | None) -> Feed:
     from objslam.live.adapters.rclpy import RclpyAdapter
 
     return _ros(sink, settings, options, RclpyAdapter)
@@ -145,6 +160,6 @@ def _ros(
 ADAPTERS = {
     "dds": LiveSource("a ROS 2 robot", _dds, DdsOptions),
     "rclpy": LiveSource("a ROS 2 robot, through a ROS node", _rclpy, LiveRosOptions),
-    "stdin": LiveSource("JSON lines", _stdin),
+    "stdin": LiveSource("JSON lines", _stdin, recorded=_is_file),
 }
 """The sources of `objslam live` by name."""

@@ -14,6 +14,7 @@ import json
 import os
 import select
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
@@ -36,11 +37,16 @@ _WAIT = 0.1  # The longest time until a stop is noticed, s.
 
 @dataclass
 class StdinAdapter:
-    """Pushes the messages of a stream. Malformed lines are counted with their line numbers."""
+    """Pushes the messages of a stream. Malformed lines are counted with their line numbers.
+
+    wait: the function that is called after each frame of a recorded stream. It returns once the map contains the frame. None
+    if a running robot writes the stream, which never waits for the map.
+    """
 
     sink: Sink
     stream: BinaryIO
     name: str = "stdin"
+    wait: Callable[[], object] | None = None
     ledger: Ledger = field(default_factory=Ledger)
 
     def run(self, stop: threading.Event) -> None:
@@ -102,6 +108,8 @@ class StdinAdapter:
         scores, depths = np.array(collector.scores, dtype=np.float64), np.array(collector.depths, dtype=np.float64)
         camera, tracks = _name(message, _CAMERA), collector.track_ids
         self.sink.push_detections(collector.stamps[0], camera, boxes, collector.labels, scores, depths, tracks, whole)
+        if self.wait is not None:
+            self.wait()
 
 
 def _name(message: dict[str, Any], key: str) -> str:

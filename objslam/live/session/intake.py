@@ -38,6 +38,10 @@ _FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or r
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
+_POSES = 10_000
+"""The newest poses of each path that are kept to recognise poses that come again, as from a program that starts anew with
+messages that it sent already. A larger number recognises a longer repetition and costs memory, 0.3 kB a pose."""
+_SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. A larger value only costs care.
 _WAIT = 2.0
 """A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
 larger value misses more of these stamps."""
@@ -76,6 +80,7 @@ class Intake:
         self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
         self._start_T_odom = np.eye(4)  # From the odometry's frame since its last restart to its first frame.
         self._last: dict[PathKind, PoseMessage] = {}
+        self._heard: dict[PathKind, dict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
         self._lead = Lead(self._clock, settings.poses.max_gap)
         self._leaps = StampLeaps[_Checked]()
 
@@ -156,6 +161,7 @@ class Intake:
                 self._cameras[message.camera.name] = message.camera
             elif isinstance(message, PoseMessage):
                 self._last[message.path] = message
+                self._keep(message)
                 self._lead.choose(message.path, message.stamp)
                 if message.path == self._lead.path:
                     self._clock.newest = message.stamp
@@ -204,12 +210,17 @@ class Intake:
         """Deliver a pose, unless it is late. given: its stamp, s."""
         where, last = f"stamp {given:.3f}", self._last.get(path)
         self._lead.choose(path, given + self._clock.shift)
+        if self._is_known(path, given + self._clock.shift, pose):
+            return self._refuse(f"{path} that came before", where)
         if path == self._lead.path:
+            before = self.newest - self._clock.shift
             at, back = self._clock.step(given)
             if at is None:
                 again = last is not None and last.stamp == given + self._clock.shift
                 return self._refuse(f"{path} {'with a repeated stamp' if again else 'that is late'}", where)
             if back:
+                if "clock set back" not in self.counters.accepted():
+                    self.counters.ledger.warn(f"the clock was set back by about {before - given:.1f} s at {where}")
                 self.counters.accept("clock set back")
                 self._note()
                 self._refute(self._leaps.clear())
@@ -226,6 +237,7 @@ class Intake:
         if not self._hand_on(message):
             return False
         self._last[path] = message
+        self._keep(message)
         self._lead.heard(path, at)
         return True
 
@@ -252,6 +264,20 @@ class Intake:
 
     def _take_mount(self, stamp: float, camera: str, pose: Floats) -> bool:
         return self._hand_on(MountMessage(self._place(stamp), camera, pose))
+
+    def _is_known(self, path: PathKind, at: float, pose: Floats) -> bool:
+        """Return whether this pose was accepted before at this stamp, in session time, s, and newer ones after it."""
+        known = self._heard.get(path, {}).get(at)
+        if known is None or at >= self._last[path].stamp:
+            return False
+        pose = self._start_T_odom @ pose if path == "odometry" else pose
+        return bool(np.abs(known - pose).max() < _SAME_POSE)
+
+    def _keep(self, message: PoseMessage) -> None:
+        heard = self._heard.setdefault(message.path, {})
+        heard[message.stamp] = message.pose
+        if len(heard) > _POSES:
+            del heard[next(iter(heard))]
 
     def _place(self, stamp: float) -> float:
         """Return the session time of a mount, of a frame, or of a pose on the path that does not set the clock."""

@@ -1,17 +1,15 @@
-"""Tests of the stamps and the boxes of a log: do they fit the times of the poses and the images of the calibration?"""
+"""Tests of the boxes of a log: do they fit the images of the calibration?"""
 
 from collections.abc import Iterator
 
 import numpy as np
 
 from objslam.core.camera import Camera, spoken_name
+from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, Log
+from objslam.core.validity import NO_AREA
 from objslam.mapping.checks.finding import Finding
 
-_OVERLAP = 0.5
-"""The least share of frames within the time of the poses. A larger share also reports logs that begin late."""
-_UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
-"""The name of each unit of time, by the number of units in a second."""
 _FEWEST = 20
 """The fewest boxes that are judged. The test for boxes between 0 and 1 needs fewer. A few boxes may lie anywhere."""
 _PART = 0.9
@@ -27,38 +25,22 @@ _LONG = 200
 """The number of boxes from which on a log is long, so that its boxes should cover most of the image."""
 
 
-def check_stamps(log: Log) -> Finding | None:
-    """Return a finding if the frames of a log were taken at other times than its poses."""
-    path = log.localization or log.odometry
-    stamps = [c.detections.frame_stamps for c in log.cameras if c.detections is not None]
-    if path is None or not stamps or not sum(map(len, stamps)):
-        return None
-    frames = np.concatenate(stamps)
+def check_boxes(log: Log, ledger: Ledger) -> list[Finding]:
+    """Return the findings about the boxes of a log, from their corners alone.
 
-    def share(factor: float) -> float:
-        inside = (frames / factor >= path.stamps[0] - 1) & (frames / factor <= path.stamps[-1] + 1)
-        return float(inside.mean())
-
-    here = share(1.0)
-    if here >= _OVERLAP:
-        return None
-    span = f"frames {frames.min():.3f} to {frames.max():.3f}, poses {path.stamps[0]:.3f} to {path.stamps[-1]:.3f}"
-    for factor, unit in _UNITS.items():
-        for by, who in ((factor, "frames"), (1 / factor, "poses")):
-            if share(by) > max(_OVERLAP, 2 * here):
-                return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
-    length, whole = float(np.ptp(frames)), float(np.ptp(path.stamps))
-    for factor, unit in _UNITS.items():
-        for ratio, who in ((length / max(whole, 1e-9), "frames"), (whole / max(length, 1e-9), "poses")):
-            if 0.5 < ratio / factor < 2:
-                return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
-    what = f"only {100 * here:.0f} % of the frames lie in the time of the poses ({span})"
-    return Finding("stamps apart", f"{what}: the camera and the poses have different clocks", spoils=False)
-
-
-def check_boxes(log: Log) -> list[Finding]:
-    """Return the findings about the boxes of a log, from their corners alone."""
+    ledger: of the reading of the log, because a reader drops the boxes that have no area.
+    """
     found: list[Finding] = []
+    flat = ledger.dropped.get(NO_AREA, 0)
+    boxes = flat + sum(len(c.detections) for c in log.cameras if c.detections is not None)
+    if boxes >= _FEWEST and flat > _WITHOUT_AREA * boxes:
+        found.append(
+            Finding(
+                "boxes without area",
+                f"{100 * flat / boxes:.0f} % of the boxes have x2 <= x1 or y2 <= y1: they are not x1 y1 x2 y2 but probably "
+                "x y width height, or centre and size",
+            )
+        )
     for one in log.cameras:
         if one.detections is not None and len(one.detections):
             first = next(_judge(one.detections, one.camera), None)
@@ -74,13 +56,6 @@ def _judge(found: Detections, camera: Camera) -> Iterator[Finding]:
         yield Finding("boxes 0..1", f"the {name} lie between 0 and 1: they are probably shares of the image, not px")
     if len(boxes) < _FEWEST:
         return
-    flat = float(((boxes[:, 2] <= boxes[:, 0]) | (boxes[:, 3] <= boxes[:, 1])).mean())
-    if flat > _WITHOUT_AREA:
-        yield Finding(
-            "boxes without area",
-            f"{100 * flat:.0f} % of the {name} have x2 <= x1 or y2 <= y1: "
-            "they are not x1 y1 x2 y2 but probably x y width height",
-        )
     centre = (boxes[:, :2] + boxes[:, 2:]) / 2
     outside = float(((centre < 0) | (centre > camera.size)).any(axis=1).mean())
     if outside > _OUTSIDE:

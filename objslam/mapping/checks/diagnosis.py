@@ -8,11 +8,12 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Ints
+from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part, pose_noise
-from objslam.mapping.checks.boxes import check_boxes, check_stamps
+from objslam.mapping.checks.boxes import check_boxes
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.halves import check_halves
 from objslam.mapping.checks.hypotheses import later
@@ -20,6 +21,7 @@ from objslam.mapping.checks.mixture import check_mixture
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.ranges import check_ranges
 from objslam.mapping.checks.small_errors import SmallErrors, find_small_errors, with_clock
+from objslam.mapping.checks.stamps import check_stamps
 from objslam.mapping.checks.trials import Trial, crooked, try_hypotheses, verdict
 from objslam.mapping.progress import Progress
 
@@ -88,18 +90,23 @@ class Diagnosis:
 
 
 def diagnose(
-    log: Log, settings: Settings, progress: Progress = lambda stage, done, total: None, *, thorough: bool = False
+    log: Log,
+    settings: Settings,
+    ledger: Ledger,
+    progress: Progress = lambda stage, done, total: None,
+    *,
+    thorough: bool = False,
 ) -> Diagnosis:
     """Return the diagnosis of a log. thorough: whether to try hypotheses even if all looks right.
 
-    LogError if the stamps of the frames and those of the poses have different units.
+    ledger: of the reading of the log. LogError if stamps are not in s.
     """
     if log.localization is None and log.odometry is None:
         return Diagnosis()
     stamps = check_stamps(log)
     if stamps is not None and stamps.spoils:
         raise LogError(stamps.message, where=log.name, hint="write all stamps in s")
-    findings = [*([stamps] if stamps else []), *check_path(log), *check_boxes(log)]
+    findings = [*([stamps] if stamps else []), *check_path(log), *check_boxes(log, ledger)]
     if not any(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None):
         return Diagnosis(tuple(findings))
     part = bounded_part(log, settings)

@@ -12,7 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
-from objslam.association.registration.joint_frames import JointFrames, Measured, solve_frames
+from objslam.association.registration.joint_frames import JointFrames, solve_frames
 from objslam.association.registration.map_registration import Registration
 from objslam.association.registration.object_maps import register
 from objslam.association.visibility import thinned
@@ -20,14 +20,13 @@ from objslam.core.arrays import Floats
 from objslam.core.bodies.body import Body, surer_body, turned
 from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.geometry import inverse
+from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
+from objslam.mapping.sites.covariances import Row, measured_objects, site_covariances
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
 from objslam.mapping.sites.matching import same_objects
 from objslam.mapping.sites.session import Session
 
-_REMEMBERED = 5
-"""In a solve, an object of a site weighs as much as its number of sessions, up to this number. With a larger number, its
-position averages more sessions, and follows a nudged object more slowly."""
 _YOUNG = 2
 """An object that at most this number of sessions saw may have moved to its place. A larger number finds more moves, and
 takes more added objects for moved ones."""
@@ -99,8 +98,9 @@ def _tree(
 
 def _island(sessions: Sequence[Session], order: list[int], starts: list[tuple[int, Floats]], odds: list[float]) -> Island:
     tracks: list[Track] = []
-    rows: list[tuple[int, int, MapObject]] = []  # Each measurement: its session, its track, its object.
+    rows: list[Row] = []  # Each measurement: its session, its track, its object.
     frames = np.zeros((0, 4, 4))
+    shared = [sessions[s].objects.shared_covariance for s in order]
     solved: JointFrames | None = None
     for number, (s, (parent, pose)) in enumerate(zip(order, starts, strict=True)):
         start = pose if solved is None else frames[order.index(parent)] @ pose
@@ -111,16 +111,18 @@ def _island(sessions: Sequence[Session], order: list[int], starts: list[tuple[in
             if at == len(tracks):
                 tracks.append(Track(item))
             rows.append((number, at, item))
-        solved = solve_frames(_measured(rows), np.concatenate([frames, start[None]]), len(tracks))
+        measured = measured_objects(rows, shared[: number + 1])
+        solved = solve_frames(measured, np.concatenate([frames, start[None]]), len(tracks), judged=False)
         frames = solved.site_T_map
-    assert solved is not None
+    solved = solve_frames(measured_objects(rows, shared), frames, len(tracks))
+    frames = solved.site_T_map
     for row, (_, at, _) in enumerate(rows):
         tracks[at].places.append(row)
     alive = _live(sessions, order, tracks, rows, solved)
-    objects, track_of = _objects(tracks, alive, rows, solved)
+    objects, track_of = _objects(tracks, alive, rows, solved, shared)
     seen_by = {number: tuple(order[rows[row][0]] for row in tracks[at].places) for number, at in track_of.items()}
-    shared = {at for at, track in enumerate(tracks) if len(track.places) > 1}
-    common = tuple(sum(n == number and at in shared for n, at, _ in rows) for number in range(len(order)))
+    again = {at for at, track in enumerate(tracks) if len(track.places) > 1}
+    common = tuple(sum(n == number and at in again for n, at, _ in rows) for number in range(len(order)))
     by_time = sorted(range(len(order)), key=order.__getitem__)
     return Island(
         objects,
@@ -147,19 +149,11 @@ def _matched(tracks: list[Track], solved: JointFrames, items: list[MapObject], s
     return [(k, i) for i, k in same_objects(old, items, solved.positions, solved.covariance, positions, turned).tolist()]
 
 
-def _measured(rows: list[tuple[int, int, MapObject]]) -> Measured:
-    maps, objects = (np.array([row[n] for row in rows], dtype=np.int64) for n in (0, 1))
-    positions = np.array([o.position for _, _, o in rows]).reshape(-1, 3)
-    often = np.array([1 if o.life is None else min(max(o.life.sessions_seen, 1), _REMEMBERED) for _, _, o in rows])
-    covariance = np.array([o.covariance for _, _, o in rows]).reshape(-1, 3, 3)
-    return Measured(maps, objects, positions, covariance / often[:, None, None])
-
-
 def _live(
     sessions: Sequence[Session],
     order: list[int],
     tracks: list[Track],
-    rows: list[tuple[int, int, MapObject]],
+    rows: list[Row],
     solved: JointFrames,
 ) -> list[int]:
     """Update the lives of the tracks, session by session in the order of time. Return the tracks left after `_follow`."""
@@ -256,15 +250,16 @@ def _later(young: Track, old: Track) -> bool:
 
 
 def _objects(
-    tracks: list[Track], alive: list[int], rows: list[tuple[int, int, MapObject]], solved: JointFrames
+    tracks: list[Track], alive: list[int], rows: list[Row], solved: JointFrames, shared: Sequence[Floats | None]
 ) -> tuple[ObjectMap, dict[int, int]]:
     """Return the map of the tracks `alive`, and the track of each id.
 
-    Objects with a probability below `FORGOTTEN` are left out.
+    Objects with a probability below `FORGOTTEN` are left out. shared: as for `measured_objects`.
     """
     free = max((t.number for t in tracks if t.number is not None), default=-1) + 1
     there, gone = [], []
     used: dict[int, int] = {}
+    covariance, correlated = site_covariances(solved, rows, shared)
     for at in alive:
         track = tracks[at]
         number = track.number if track.number is not None and track.number not in used else free
@@ -276,7 +271,7 @@ def _objects(
             track.item,
             id=number,
             position=solved.positions[at],
-            covariance=_at_least_the_best(solved, at, of),
+            covariance=covariance[at],
             labels=_labels([o for _, _, o in of]),
             body=_surest_body(solved, of),
             ray_point=None,
@@ -290,20 +285,12 @@ def _objects(
             there.append(item)
         elif track.life.probability >= FORGOTTEN:
             gone.append(item)
-    return ObjectMap(tuple(there), "site", tuple(gone)), used
+    kept = list(used.values())
+    together = shared_covariance(solved.positions[kept], covariance[kept], correlated[kept])
+    return ObjectMap(tuple(there), "site", tuple(gone), together), used
 
 
-def _at_least_the_best(solved: JointFrames, at: int, of: list[tuple[int, int, MapObject]]) -> Floats:
-    """Return the covariance (3, 3) m^2 of an object: that of the solve, or that of the best session if it is larger.
-
-    The errors of an object's boxes repeat from session to session, so many sessions do not average them out.
-    """
-    best = min((np.trace(o.covariance), n, o.covariance) for n, _, o in of if o.covariance is not None)
-    rotation = solved.site_T_map[best[1], :3, :3]
-    return solved.covariance[at] if np.trace(solved.covariance[at]) >= best[0] else rotation @ best[2] @ rotation.T
-
-
-def _surest_body(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> Body | None:
+def _surest_body(solved: JointFrames, of: list[Row]) -> Body | None:
     """Return the body whose size has the smallest noise, with its yaw in the frame of the site. None without any body."""
     best: Body | None = None
     for n, _, o in of:
@@ -312,7 +299,7 @@ def _surest_body(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> B
     return best
 
 
-def _best_tag(solved: JointFrames, of: list[tuple[int, int, MapObject]]) -> TagPose | None:
+def _best_tag(solved: JointFrames, of: list[Row]) -> TagPose | None:
     """Return the rotation and size of a fiducial from the session with the surest rotation. None for other objects."""
     best = min(((o.tag.sigma_deg, n, o.tag) for n, _, o in of if o.tag is not None), key=lambda one: one[:2], default=None)
     return None if best is None else best[2].turned(solved.site_T_map[best[1], :3, :3])

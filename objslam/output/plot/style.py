@@ -32,15 +32,6 @@ median distance of the objects, this share of the diagonal of the path's boundin
 more far objects and shrink the rest of the map."""
 
 
-_LAST_DATE = 9e9
-"""The Unix time, s, up to which a stamp counts as a date. A larger bound overflows the 64 bits of a time in ns."""
-
-
-def is_date(stamp: float) -> bool:
-    """Return whether a stamp, s, is Unix time. Other clocks start at 0 and stay below the limit of about three years."""
-    return 1e8 < stamp < _LAST_DATE
-
-
 def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:
     """Return, for each kind, a mask (R,) of the rays of this kind."""
     explained = result.association.object >= 0

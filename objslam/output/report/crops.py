@@ -99,11 +99,15 @@ def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
 
 
 def choose_unexplained(rays: RaysTable, label: str, count: int) -> dict[int, Kind]:
-    """Return the indices of up to `count` rays of a label that belong to no object.
+    """Return the indices of up to `count` rays of a label that belong to no object, spread over the time."""
+    return spread_over_time(rays, np.flatnonzero((rays.object < 0) & (rays.label == label)), count)
+
+
+def spread_over_time(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
+    """Return up to `count` of the rays `mine` (M,), as for boxes of no object.
 
     The rays are split into `count` parts in the order of time. Each part gives its ray with the highest score.
     """
-    mine = np.flatnonzero((rays.object < 0) & (rays.label == label))
     most = min(count, len(mine))
     parts = np.array_split(mine[np.argsort(rays.stamp[mine], kind="stable")], most) if most else []
     return {int(part[np.argmax(rays.score[part])]): "unexplained" for part in parts}

@@ -1,12 +1,10 @@
 """The HTML page of a result folder: this module collects the data, and a template lays them out."""
 
-import base64
 import json
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +13,30 @@ import numpy as np
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.bodies.body import UNKNOWN_YAW
 from objslam.core.types import Images
-from objslam.errors import ConfigError, OutputError, printable
+from objslam.core.validity import is_date
+from objslam.errors import ConfigError, OutputError
 from objslam.evaluation.alignment import lay_truth
 from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
-from objslam.output.plot.style import is_date
 from objslam.output.report.cards import make_cards
 from objslam.output.report.charts import histogram
-from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of
+from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of, spread_over_time
+from objslam.output.report.render import render
 from objslam.output.report.scene import scene_data
+from objslam.output.report.site_page import write_site_report
 from objslam.output.report.trends import trends
 from objslam.results.files import CONFIG, PICTURE, REPORT
-from objslam.results.read import load_evaluation, load_map, load_path, load_rays, load_summary, load_truth
+from objslam.results.read import (
+    is_site,
+    load_doubts,
+    load_evaluation,
+    load_map,
+    load_path,
+    load_rays,
+    load_summary,
+    load_truth,
+)
 
 _BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
 _LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
@@ -54,7 +63,7 @@ def write_report(
     crops: int = 4,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Path:
-    """Write report.html into the result folder `out` and return its path.
+    """Write report.html into the result folder `out` and return its path. The map of a site gets a page of its own kind.
 
     Args:
         log: the path of the run's log, which has the images for the pictures; by default the path in summary.json.
@@ -65,8 +74,8 @@ def write_report(
         OutputError: the result cannot be read, or the page cannot be written.
         LogError: the ground truth cannot be read.
     """
-    import jinja2
-
+    if is_site(out):
+        return write_site_report(out)
     progress("reading the result", 0, 0)
     objects, rays, summary = load_map(out), load_rays(out), load_summary(out)
     try:
@@ -80,11 +89,13 @@ def write_report(
     up = summary.get("up", "z")
     chosen = {o.id: choose_rays(rays, np.flatnonzero(rays.object == o.id), crops) for o in objects}
     unexplained = _unexplained(rays, crops)
+    doubts = load_doubts(out) or ()
+    of_doubt = [spread_over_time(rays, one.rays[one.rays < len(rays)], crops) for one in doubts]
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
     images = _on_one_clock(images, summary.get("calibration"))
     wanted: dict[int, Kind] = {}
-    for some in (*chosen.values(), *unexplained.values()):
+    for some in (*chosen.values(), *unexplained.values(), *of_doubt):
         wanted |= some
     pictures = cut_crops(rays, wanted, images, lambda done, total: progress("pictures", done, total))
     if images and wanted and not pictures:
@@ -92,20 +103,9 @@ def write_report(
     crops_of = {number: [pictures[i] for i in index if i in pictures] for number, index in chosen.items()}
     begin = float(rays.stamp.min()) if len(rays) else 0.0
     cards = make_cards(objects, rays, crops_of, errors, path.poses[:, :3, 3], up)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("objslam.output.report", ""),
-        autoescape=True,  # Texts of the result may contain HTML.
-        finalize=lambda value: printable(value) if type(value) is str else value,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["base64"] = lambda data: base64.b64encode(data).decode()
     picture, examples = out / PICTURE, summary.get("dropped_examples", {})
-    source = resources.files("objslam.output.report")
-    page = environment.get_template("page.html.jinja").render(
-        style=(source / "page.css").read_text(encoding="utf-8"),
-        script="\n".join((source / name).read_text(encoding="utf-8") for name in ("page.js", "scene.js")),
+    page = render(
+        "page.html.jinja",
         scene=scene_data(objects, rays, path, laid, up) if len(objects) else None,
         name=str(summary.get("log", out.resolve().name)),
         folder=out.resolve().name,
@@ -115,6 +115,7 @@ def write_report(
         duration=float(rays.stamp.max()) - begin if len(rays) else 0.0,
         picture=picture.read_bytes() if picture.is_file() else None,
         cards=cards,
+        ids={o.id for o in objects},
         with_errors=any(card.error is not None for card in cards),
         with_size=any(o.body is not None or o.tag is not None for o in objects),
         unknown_yaw=_KNOWN_YAW,
@@ -132,6 +133,7 @@ def write_report(
             label: (int(((rays.object < 0) & (rays.label == label)).sum()), [pictures[i] for i in index if i in pictures])
             for label, index in unexplained.items()
         },
+        doubts=[(one, [pictures[i] for i in index if i in pictures]) for one, index in zip(doubts, of_doubt, strict=True)],
         dropped=[(why, n, "; ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
         **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},

@@ -22,17 +22,20 @@ def upright(up: Up) -> Floats:
     return np.stack([*np.eye(3)[from_above(up)], up_vector(up)])
 
 
-def scene_data(objects: ObjectMap, rays: RaysTable, path: Trajectory, truth: Truth | None, up: Up) -> dict[str, Any]:
+def scene_data(
+    objects: ObjectMap, rays: RaysTable | None, path: Trajectory | None, truth: Truth | None, up: Up
+) -> dict[str, Any]:
     """Return the data as JSON values. Positions are in the frame of the view, m.
 
-    The rays, the path and the true path are float32 arrays in base64. "axes" are the map's axes in the frame of the view.
-    truth: the ground truth in the frame of the map. up: the axis of the map that points up.
+    The rays, the path and the true path are float32 arrays in base64. A site has neither rays nor a path. "axes" are the
+    map's axes in the frame of the view. truth: the ground truth in the frame of the map. up: the axis of the map that points
+    up.
     """
     turn = upright(up)
     names, colours = captions(objects), label_colours(objects)
     shown = [i for i, o in enumerate(objects) if np.isfinite(o.position).all()]
     positions = objects.positions @ turn.T
-    way = path.poses[:, :3, 3] @ turn.T
+    way = np.zeros((0, 3)) if path is None else path.poses[:, :3, 3] @ turn.T
     _, low, high = frame_objects(positions, way)
     return {
         "axes": [[name, turn[:, i].round(3).tolist()] for i, name in enumerate("xyz")],
@@ -54,7 +57,7 @@ def scene_data(objects: ObjectMap, rays: RaysTable, path: Trajectory, truth: Tru
         "path": _packed(way[evenly(len(way), _MAX_PATH)]),
         "truth": [] if truth is None else [(turn @ t.position).round(3).tolist() for t in truth.objects],
         "true_path": _packed(_thinned(truth, turn)),
-        **_rays(objects, rays, turn),
+        **({"rays": "", "of": [], "used": 0} if rays is None else _rays(objects, rays, turn)),
     }
 
 

@@ -10,8 +10,8 @@ from objslam.output.viewer.times import ITERATION, STAMP
 from objslam.output.viewer.view_point import ViewPoint
 
 _ITERATIONS = 4.0  # The number of iterations of the solver that playback shows per second.
-_HIDDEN = ("map/rays/rejected", "map/rays/unexplained", "map/reconstruction/before")
-"""The entities that are hidden until the user clicks on them. They are opaque and would hide the map."""
+_HIDDEN = ("map/rays/rejected", "map/rays/unexplained", "map/reconstruction/before", "map/doubts")
+"""The entities that are hidden until the user clicks on them. They would hide the map."""
 
 
 def blueprint(

@@ -7,10 +7,11 @@ from typing import Literal
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.trace import Round
 from objslam.errors import one_line
+from objslam.mapping.doubts.words import why_unresolved
 from objslam.output.plot.style import captions, ray_kinds
 
 Level = Literal["INFO", "WARN"]
@@ -64,7 +65,7 @@ def drive_events(result: RunResult) -> list[Event]:
     for j, (o, name) in enumerate(zip(result.map.objects, captions(result.map), strict=True)):
         add(o.first_seen, "INFO", f"{name}: first seen")
         if o.status != "ok":
-            add(o.last_seen, "WARN", f"{name}: unresolved, {_why_unresolved(o, result)}")
+            add(o.last_seen, "WARN", f"{name}: unresolved, {why_unresolved(o, result.settings.triangulation)}")
             continue
         if np.isfinite(enough[j]):
             limit = result.settings.triangulation.min_parallax_deg
@@ -74,18 +75,6 @@ def drive_events(result: RunResult) -> list[Event]:
         text = f"{name}: {o.rays} rays{out}, parallax {o.parallax_deg:.0f} deg, rms {o.rms_deg:.2f} deg{sigma}"
         add(o.last_seen, "INFO", text)
     return events + sorted(later, key=lambda event: event.at)
-
-
-def _why_unresolved(o: MapObject, result: RunResult) -> str:
-    """Return a text that tells why an object is unresolved, with the limit from the settings."""
-    limits = result.settings.triangulation
-    if o.rays < 2:
-        return "a single ray gives a direction and no distance"
-    if o.parallax_deg < limits.min_parallax_deg:
-        least = f"triangulation.min_parallax_deg {limits.min_parallax_deg:g}"
-        return f"its {o.rays} rays span {o.parallax_deg:.1f} deg ({least})"
-    most = f"{limits.max_rel_sigma:g} of its distance (triangulation.max_rel_sigma)"
-    return f"its {o.rays} rays disagree, or its sigma exceeds {most}"
 
 
 def _enough_parallax(result: RunResult) -> Floats:

@@ -14,6 +14,7 @@ from objslam.errors import one_line
 from objslam.frontend.up import up_axis
 from objslam.output.viewer.blueprint import blueprint
 from objslam.output.viewer.cameras import camera_path, log_cameras
+from objslam.output.viewer.doubts import log_doubts
 from objslam.output.viewer.event_log import Event, drive_events, round_events, summary_text
 from objslam.output.viewer.objects import log_objects, log_truth
 from objslam.output.viewer.paths import log_base, log_paths, log_steps, thinned
@@ -50,6 +51,7 @@ def write_recording(result: RunResult, file: Path, truth: Truth | None = None) -
     log_paths(recording, result, truth)
     log_surfaces(recording, result)
     log_objects(recording, result.map, view_point, thinned(result.path_after, _AVOIDED))
+    log_doubts(recording, result)
     if truth is not None and truth.objects:
         log_truth(recording, truth)
     if len(result.keyframes):

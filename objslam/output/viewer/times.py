@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.output.plot.style import is_date
+from objslam.core.validity import is_date
 
 STAMP, ITERATION = "stamp", "iteration"  # The timelines of the drive and of the solver.
 

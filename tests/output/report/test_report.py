@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import json
 import re
+import shutil
 from collections import Counter
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -23,6 +24,7 @@ from objslam.config import Settings
 from objslam.core.bodies.body import UNKNOWN_YAW, Body
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
+from objslam.core.result import Doubt
 from objslam.errors import OutputError
 from objslam.evaluation.evaluate import evaluate
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
@@ -31,6 +33,7 @@ from objslam.output.report import write_report
 from objslam.output.report.charts import HEIGHT, axis_end, histogram
 from objslam.output.report.crops import best_rays
 from objslam.output.result_folder import write_result
+from objslam.results.files import dump_doubts
 from objslam.results.read import load_map, load_rays, load_trajectory, load_truth
 from objslam.simulation import make_camera
 from objslam.sources import SourceOptions, read
@@ -317,6 +320,25 @@ def pictures(page: Page) -> list[tuple[str, Any]]:
     return found
 
 
+def test_doubts_are_said_with_pictures_of_their_boxes(mapped: Path) -> None:
+    rays = load_rays(mapped / "out")
+    plants = np.flatnonzero(rays.label == "plant")
+    text = "2 plant boxes near (1.00, 2.00, 3.00): <b>their rays</b> pass 6 cm apart, 3 sigma are 2 cm."
+    doubt = Doubt("boxes", "apart", "plant", text, (0, 99), np.array([1.0, 2.0, 3.0]), plants[:2], {})
+    beyond = dataclasses.replace(doubt, kind="pair", rays=np.array([len(rays) + 5]))  # A ray that is not in the file.
+    before = Page(write_report(mapped / "out", crops=3))
+    out = mapped / "doubtful"
+    shutil.copytree(mapped / "out", out)
+    (out / "doubts.json").write_text(dump_doubts([doubt, beyond]))
+    page = Page(write_report(out, log=mapped / "log", crops=3))
+    assert page.all_text.count(text) == 2
+    assert {"href": "#object-0"} in page.of("a")
+    assert {"href": "#object-99"} not in page.of("a")
+    more = Counter(label for label, _ in pictures(page)) - Counter(label for label, _ in pictures(before))
+    assert more == {"plant": 2}
+    assert "Doubts" not in before.all_text
+
+
 def test_the_pictures_show_the_objects(mapped: Path) -> None:
     page = Page(write_report(mapped / "out", crops=3))
     found = pictures(page)
@@ -376,7 +398,7 @@ def test_the_best_boxes_are_spread_over_time(mapped: Path) -> None:
     assert best_rays(rays, mine[:2], 4).tolist() == mine[:1].tolist()
 
 
-@pytest.mark.parametrize("name", ["rays.parquet", "summary.json", "config.yaml", "objects.json"])
+@pytest.mark.parametrize("name", ["rays.parquet", "summary.json", "config.yaml", "objects.json", "doubts.json"])
 def test_what_is_damaged_is_named(tmp_path: Path, name: str) -> None:
     result, _ = synthetic_result(*clusters(), keyframes=20, settings=QUICK)
     write_result(result, tmp_path)
@@ -385,6 +407,8 @@ def test_what_is_damaged_is_named(tmp_path: Path, name: str) -> None:
         write_report(tmp_path)
     assert "\n" not in str(caught.value)
     (tmp_path / name).unlink()
+    if name == "doubts.json":  # Older results have none.
+        return
     with pytest.raises(OutputError):
         write_report(tmp_path)
     assert not (tmp_path / "report.html").exists()

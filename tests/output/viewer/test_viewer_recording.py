@@ -19,7 +19,7 @@ from waiting import LIMIT
 from objslam.config import Settings
 from objslam.core.calibration import Calibration
 from objslam.core.geometry import inverse
-from objslam.core.result import RunResult
+from objslam.core.result import Doubt, RunResult
 from objslam.core.trace import Iteration, Parameters, Round
 from objslam.core.types import Association, Images, Surface, Truth
 from objslam.output.plot.style import object_colours, ray_kinds
@@ -319,6 +319,22 @@ def test_a_surface_is_drawn_coarser_than_it_is(record: Any) -> None:
     assert (few.colours[left] == [255, 0, 0]).all()
     assert coarser(fine, len(fine.vertices)) is fine
     assert coarser(dataclasses.replace(fine, colours=None), 2000).colours is None
+
+
+def test_doubts_are_points_and_lines_between_pairs(record: Any) -> None:
+    positions, labels = clusters()
+    result, _ = synthetic_result(positions, labels)
+    a, b = result.map.objects[0], result.map.objects[2]
+    none = np.zeros(0, dtype=np.int64)
+    pair = Doubt("pair", "may be one", "cup", "", (a.id, b.id), (a.position + b.position) / 2, none, {})
+    boxes = Doubt("boxes", "apart", "mug", "", (), np.array([1.0, 2.0, 3.0]), np.arange(4), {})
+    nowhere = Doubt("boxes", "follow", "dog", "", (), None, np.arange(2), {})
+    r = record(dataclasses.replace(result, doubts=(pair, boxes, nowhere)))
+    np.testing.assert_allclose(r.get("/map/doubts", "Points3D:positions")[0], [pair.position, boxes.position], atol=1e-6)
+    assert r.get("/map/doubts", "Points3D:labels")[0] == ["cup: may be one", "4 mug: apart"]
+    (line,) = r.get("/map/doubts/pairs", "LineStrips3D:strips")[0]
+    np.testing.assert_allclose(line, [a.position, b.position], atol=1e-6)
+    assert "/map/doubts" not in record(result).paths()
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -24,7 +24,7 @@ from objslam.core.camera import undistort
 from objslam.core.geometry import quaternion
 from objslam.core.object_map import ObjectMap
 from objslam.core.snapshot import CameraFrame
-from objslam.output.plot.style import is_date
+from objslam.core.validity import is_date
 from objslam.output.viewer.blueprint import blueprint
 from objslam.output.viewer.cameras import camera_path, light_colours, log_pinhole
 from objslam.output.viewer.event_log import map_changes, table

@@ -1,0 +1,65 @@
+"""The command `objslam explain`, which says what is doubtful in a result."""
+
+from __future__ import annotations
+
+import json as json_text
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from objslam.cli.console import console, say
+from objslam.cli.options import Json
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.table import Table
+
+    from objslam.core.result import Doubt, DoubtKind
+
+_TITLES: dict[DoubtKind, str] = {
+    "pair": "objects that may be one",
+    "split": "objects that may be two",
+    "unresolved": "objects without a position",
+    "boxes": "boxes that became no object",
+}
+
+
+def explain(
+    out: Annotated[Path, typer.Argument(help="A result folder.")],
+    label: Annotated[str | None, typer.Option("--label", help="Only objects and boxes with this label.")] = None,
+    json: Json = False,
+) -> None:
+    """Say what is doubtful in a result, and why: objects that may be one or two, and boxes that became no object."""
+    from objslam.errors import OutputError
+    from objslam.results.files import DOUBTS
+    from objslam.results.read import load_doubts, load_summary
+
+    doubts = load_doubts(out)
+    if doubts is None:
+        raise OutputError(f"this result has no {DOUBTS}", where=str(out), hint="an older version wrote it: run it again")
+    chosen = [one for one in doubts if label is None or one.label == label]
+    if json:
+        say(json_text.dumps([one.to_dict() for one in chosen], indent=2, ensure_ascii=False))
+        return
+    if not chosen:
+        say("no doubts" if label is None else f"no doubts about {label}")
+    for kind, title in _TITLES.items():
+        if mine := [one for one in chosen if one.kind == kind]:
+            console().print(doubts_table(mine, title))
+    if label is None and (left := load_summary(out).get("counts", {}).get("rays_unexplained")):
+        grouped = sum(len(one.rays) for one in chosen if one.kind == "boxes")
+        say(f"{left} boxes became no object: {grouped} in these groups, and {left - grouped} scattered")
+
+
+def doubts_table(doubts: Sequence[Doubt], title: str) -> Table:
+    """Return a table of the doubts of one kind: the label, and the sentence."""
+    from rich.table import Table
+
+    table = Table(title=title, show_lines=len(doubts) > 1)
+    table.add_column("label", overflow="fold", min_width=8)
+    table.add_column("doubt", overflow="fold", ratio=1)
+    for one in doubts:
+        table.add_row(one.label, one.text)
+    return table

@@ -1,0 +1,68 @@
+"""Tests of the stamps of a log: are they in seconds, and do the frames fit the times of the poses?"""
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.types import Log, Trajectory
+from objslam.core.validity import MAX_LIVE_STAMP
+from objslam.mapping.checks.finding import Finding
+
+_OVERLAP = 0.5
+"""The least share of frames within the time of the poses. A larger share also reports logs that begin late."""
+_UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
+"""The name of each unit of time, by the number of units in a second."""
+_DATES = (1e8, 1e10)
+"""Stamps of dates between 1973 and 2286, s. A wider range leaves the unit of fewer stamps open."""
+_RARE = 10.0
+"""Poses and frames that come less often than this, s, in the median, are probably not in s. At 10 s, a robot hardly
+measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
+_CRAWL = 0.01
+"""A robot that is slower than this, m/s, all along its path probably has stamps that are not in s. Even a lawn mower is 30
+times as fast. A larger value accuses more robots that hardly drive."""
+
+
+def check_stamps(log: Log) -> Finding | None:
+    """Return a finding if the stamps of a log are not in s, or if its frames were taken at other times than its poses."""
+    path = log.localization or log.odometry
+    stamps = [c.detections.frame_stamps for c in log.cameras if c.detections is not None]
+    if path is None or not stamps or not sum(map(len, stamps)):
+        return None
+    frames = np.concatenate(stamps)
+    span = f"frames {frames.min():.3f} to {frames.max():.3f}, poses {path.stamps[0]:.3f} to {path.stamps[-1]:.3f}"
+
+    def share(factor: float) -> float:
+        inside = (frames / factor >= path.stamps[0] - 1) & (frames / factor <= path.stamps[-1] + 1)
+        return float(inside.mean())
+
+    here = share(1.0)
+    if here >= _OVERLAP:
+        common = _common_unit(path, stamps)
+        said = f"all stamps are probably in {common} instead of s ({span})"
+        return None if common is None else Finding("stamps unit", said)
+    for factor, unit in _UNITS.items():
+        for by, who in ((factor, "frames"), (1 / factor, "poses")):
+            if share(by) > max(_OVERLAP, 2 * here):
+                return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
+    length, whole = float(np.ptp(frames)), float(np.ptp(path.stamps))
+    for factor, unit in _UNITS.items():
+        for ratio, who in ((length / max(whole, 1e-9), "frames"), (whole / max(length, 1e-9), "poses")):
+            if 0.5 < ratio / factor < 2:
+                return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
+    what = f"only {100 * here:.0f} % of the frames lie in the time of the poses ({span})"
+    return Finding("stamps apart", f"{what}: the camera and the poses have different clocks", spoils=False)
+
+
+def _common_unit(path: Trajectory, frames: list[Floats]) -> str | None:
+    """Return the unit in which poses and frames (F,) of each camera are stamped, or None for seconds.
+
+    No date in s is as large as a date in ms. Stamps that begin at zero tell their unit by the time between two of them,
+    if the robot also crawls.
+    """
+    last = float(path.stamps[-1])
+    if last > MAX_LIVE_STAMP:
+        return next((unit for factor, unit in _UNITS.items() if _DATES[0] < last / factor < _DATES[1]), "another unit")
+    usual = min((float(np.median(np.diff(s))) for s in (path.stamps, *frames) if len(s) > 1), default=0.0)
+    way = float(np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0), axis=1).sum())
+    if usual < _RARE or not 0 < way < _CRAWL * float(np.ptp(path.stamps)):
+        return None
+    return next(unit for factor, unit in reversed(_UNITS.items()) if usual >= _RARE * factor / 1e3)

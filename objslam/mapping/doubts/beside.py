@@ -1,0 +1,38 @@
+"""Find boxes without an object that lie on an object, as with another label."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.association.gating import gated_edges
+from objslam.core.arrays import Ints
+from objslam.mapping.doubts.chance import LEAST_LOG_ODDS, crowded
+from objslam.mapping.doubts.evidence import Evidence
+
+_FEWEST = 5
+"""The fewest boxes of a group. A larger number finds fewer groups."""
+_AROUND = 9.0
+"""The surroundings of an object end at this multiple of its gate, a squared deviation. They show how many boxes lie on it by
+chance. A larger multiple gives a surer estimate, of a larger area."""
+
+
+def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
+    """Yield landmarks and the rays without an object that lie on them. left: (M,) the rays without an object."""
+    state, gate = evidence.state, evidence.gate
+    if not state.count or not len(left):
+        return
+    labels = len(state.unassigned)
+    every = replace(state.landmarks, accepts=np.ones((state.count, labels), dtype=bool))
+    edges = gated_edges(state.obs.take(left), every, _AROUND * gate)
+    order = np.lexsort((edges.deviation, edges.ray))
+    order = order[np.append(True, np.diff(edges.ray[order]) > 0)[: len(order)]]
+    ray, landmark, inside = left[edges.ray[order]], edges.landmark[order], edges.deviation[order] <= gate
+    key = landmark * labels + state.obs.label[ray]
+    pairs, group = np.unique(key, return_inverse=True)
+    around, number = np.bincount(group, minlength=len(pairs)), np.bincount(group[inside], minlength=len(pairs))
+    odds = crowded(number, around, 1 / _AROUND, max(len(pairs), 1))
+    for one in np.flatnonzero((number >= _FEWEST) & (odds > LEAST_LOG_ODDS)):
+        yield int(pairs[one] // labels), ray[(group == one) & inside]

@@ -1,0 +1,25 @@
+"""Whether rays or boxes lie closer together than by chance, judged by how many lie around them."""
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+
+LEAST_LOG_ODDS = np.log(1e3)
+"""The least log odds that a group is not there by chance, after all places that were tried. One log in a thousand then shows
+a group by chance. A larger value finds fewer groups."""
+
+
+def crowded(inside: Floats | Ints, around: Floats | Ints, share: float, tried: int) -> Floats:
+    """Return the log odds that so many lie inside a region by more than chance.
+
+    Without a group, those around it lie evenly, so the number inside is binomial (scan statistic with the surroundings as
+    the estimate of the density).
+
+    inside: how many lie inside, any shape. around: how many lie inside or in the surroundings. share: the share of the whole
+    region that is inside. tried: how many places were tried, which makes a crowd somewhere more likely.
+    """
+    from scipy.special import betainc
+
+    # The regularised incomplete beta function is the tail of a binomial distribution (NIST DLMF 8.17.24).
+    tail = betainc(np.maximum(inside, 1), np.maximum(around - inside, 0) + 1, share)
+    return np.where(inside > 0, -np.log(np.maximum(tail * tried, 1e-300)), 0.0)

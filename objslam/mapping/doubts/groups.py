@@ -1,0 +1,187 @@
+"""Group the boxes that became no object by place, and find the reason why each group is no object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from objslam.association.existence import chance_odds, detection_rates, prior_odds, rest_odds, size_odds
+from objslam.association.refinement import velocity_gain
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import widest_angle
+from objslam.core.statistics import grouped_median
+from objslam.mapping.doubts.beside import on_objects
+from objslam.mapping.doubts.crossings import crossings
+from objslam.mapping.doubts.evidence import Evidence
+from objslam.mapping.doubts.in_image import fixed_in_image
+from objslam.mapping.doubts.moving import moving_things
+from objslam.mapping.doubts.points import MISSED, Points, as_landmarks, fit_points
+
+Reason = Literal[
+    "fixed in the image",
+    "on an object",
+    "follow",
+    "few",
+    "no parallax",
+    "apart",
+    "range",
+    "rare",
+    "size",
+    "moves",
+    "chance",
+    "unclear",
+]
+REASONS: tuple[Reason, ...] = get_args(Reason)
+"""Why boxes are no object. In this order: they stay at one place of the image, they lie on an object, they follow one
+another and no place explains them, too few rays, no parallax, the rays do not meet, the ranges disagree, too few frames show
+the thing, its size is wrong, it moves a little, as many strays meet by chance, no reason alone. The first three belong to no
+place."""
+_OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
+_RANGE_SIGMAS = 3.0
+"""The median deviation of the ranges from the place, in standard deviations, that says there is no object. A larger number
+says so less often."""
+
+
+@dataclass(frozen=True)
+class BoxGroups:
+    """G groups of boxes that became no object, and the Q boxes in them.
+
+    ray, group: (Q,) the row of each box in the rays of the result, and its group. label: (G,) index into the label names.
+    reason: (G,) index into `REASONS`. position: (G, 3) m, where their rays meet best. miss, sigma: (G,) m, the median
+    distance between rays and place, and the median standard deviation of this distance along one axis. parallax: (G,) rad,
+    the widest angle between two of the rays. seen, expected: (G,) how many frames show the thing, and how many should. rate:
+    (G,) the share of such frames that show an object of the label. size, usual_size: (G,) m, of the thing, and of the
+    objects of its label, 0 if unknown. way: (G,) m, how far a moving point that explains the rays best moves. range,
+    distance: (G,) m, the median measured range, NaN without one, and the median distance to the place. odds: (G,) the log
+    odds that association gives to an object there. object: (G,) the index of the nearest object in the map, -1 for none.
+    away: (G,) m, its distance from the place. double: (G,) the number of these boxes in frames in which this object has a
+    box of its own.
+    """
+
+    ray: Ints
+    group: Ints
+    label: Ints
+    reason: Ints
+    position: Floats
+    miss: Floats
+    sigma: Floats
+    parallax: Floats
+    seen: Ints
+    expected: Ints
+    rate: Floats
+    size: Floats
+    usual_size: Floats
+    way: Floats
+    range: Floats
+    distance: Floats
+    odds: Floats
+    object: Ints
+    away: Floats
+    double: Ints
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
+    """Return the groups of boxes without an object, each with the reason why it is no object.
+
+    A box belongs to the first group that takes it. The reasons at a place are those of the association itself, in its order.
+    """
+    left = np.flatnonzero(evidence.left)
+    groups: list[Ints] = []
+    kinds: list[int] = []
+    owners: list[int] = []
+
+    def take(found: Iterable[tuple[int, Ints]], reason: Reason) -> None:
+        nonlocal left
+        for owner, rays in found:
+            groups.append(rays)
+            owners.append(owner)
+            kinds.append(REASONS.index(reason))
+        left = left[~np.isin(left, np.concatenate([*groups, left[:0]]))]
+
+    take(((-1, rays) for rays in fixed_in_image(evidence, left)), "fixed in the image")
+    take(on_objects(evidence, left), "on an object")
+    take(((-1, rays) for rays in moving_things(evidence, left)), "follow")
+    take(((-1, rays) for rays in crossings(evidence, left)), "unclear")
+    return _described(evidence, groups, np.array(kinds, dtype=np.int64), np.array(owners, dtype=np.int64), settings)
+
+
+def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints, settings: Settings) -> BoxGroups:
+    """Describe groups of rays. reason: (G,) index into `REASONS`, `_OPEN` if it is not known. owner: (G,) the landmark on
+    which the boxes lie, or -1."""
+    if not groups:
+        arrays: dict[str, Any] = {one.name: np.zeros((0, 3) if one.name == "position" else 0) for one in fields(BoxGroups)}
+        return BoxGroups(**arrays)
+    points, known, count = fit_points(evidence, groups), evidence.state.count, len(groups)
+    state = as_landmarks(evidence, points)
+    obs, label = state.obs, state.label[known:]
+    rates = detection_rates(state.history, state.label, len(state.unassigned))
+    odds: dict[Reason, Floats] = {
+        "rare": (rates.log_odds(state.history, state.label) + prior_odds(state))[known:],
+        "size": size_odds(state)[known:],
+        "moves": rest_odds(state)[known:],
+    }
+    thing, chance = np.sum(list(odds.values()), axis=0), chance_odds(state, evidence.gate)[known:]
+    worst = np.argmin(list(odds.values()), axis=0)
+    parallax = np.array([widest_angle(obs.direction[rays]) for rays in groups])
+    distance = np.linalg.norm(points.position[points.group] - obs.origin[points.ray], axis=1)
+    measured = obs.range[points.ray]
+    ranged = np.isfinite(measured)
+    off = np.abs(measured - distance)[ranged] / obs.range_sigma[points.ray][ranged]
+    cases: list[tuple[Bools, Reason]] = [
+        (reason != _OPEN, "unclear"),  # The reason of these groups is known, and stays.
+        (np.bincount(points.group, minlength=count) < settings.association.min_rays, "few"),
+        (points.deviation > MISSED, "apart"),
+        (np.degrees(parallax) < settings.triangulation.min_parallax_deg, "no parallax"),
+        (np.nan_to_num(grouped_median(off, points.group[ranged], count)) > _RANGE_SIGMAS, "range"),
+        *(((thing < 0) & (worst == i), name) for i, name in enumerate(odds)),
+        (chance < 0, "chance"),
+    ]
+    found = np.select([case for case, _ in cases], [REASONS.index(name) for _, name in cases], _OPEN)
+    nearest, away, double = _nearest(evidence, points, owner)
+    usual = grouped_median(evidence.state.size, evidence.state.label, len(state.unassigned))
+    stamps = state.view.stamps[obs.frame[points.ray]]
+    factor = state.landmarks.noise[known:]
+    return BoxGroups(
+        ray=evidence.ray[points.ray],
+        group=points.group,
+        label=label,
+        reason=np.where(reason != _OPEN, reason, found),
+        position=points.position,
+        miss=points.miss,
+        sigma=points.noise,
+        parallax=parallax,
+        seen=state.history.seen[known:],
+        expected=state.history.expected[known:],
+        rate=rates.mean[label],
+        size=state.size[known:],
+        usual_size=np.nan_to_num(usual)[label],
+        way=velocity_gain(obs, points.ray, points.group, points.position, factor, stamps)[1],
+        range=grouped_median(measured[ranged], points.group[ranged], count),
+        distance=grouped_median(distance, points.group, count),
+        odds=thing + np.minimum(chance, 0.0),
+        object=nearest,
+        away=away,
+        double=double,
+    )
+
+
+def _nearest(evidence: Evidence, points: Points, owner: Ints) -> tuple[Ints, Floats, Ints]:
+    """Return the nearest object (G,) in the map or -1, its distance (G,), m, and how many of the boxes (G,) are in frames in
+    which it has a box of its own. owner: (G,) the landmark on which the boxes lie, or -1 for the nearest to their place."""
+    state, count = evidence.state, len(owner)
+    if not state.count:
+        return owner, np.full(count, np.nan), np.zeros(count, dtype=np.int64)
+    to = points.position[:, None] - state.landmarks.position
+    landmark = np.where(owner >= 0, owner, np.linalg.norm(to, axis=2).argmin(axis=1))
+    away = np.linalg.norm(points.position - state.landmarks.position[landmark], axis=1)
+    frames = len(state.view.camera)
+    own = state.owner * frames + state.obs.frame[state.assigned]
+    double = np.isin(landmark[points.group] * frames + state.obs.frame[points.ray], own)
+    return evidence.object[landmark], away, np.bincount(points.group[double], minlength=count)

@@ -1,0 +1,118 @@
+"""Find pairs of objects that may be one: they lie close together, and no frame shows both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from objslam.association.duplicates import TOGETHER
+from objslam.association.merging import common_frames
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.statistics import SAME_POINT
+from objslam.mapping.doubts.evidence import Evidence
+
+_NEIGHBOURS = 8
+"""The number of nearest objects that each object is compared with. A larger number is slower, and matters in dense places
+only."""
+_PRIOR = 0.05
+"""The prior probability that two neighbours are one object. It is chosen, not measured: association has merged nearly all
+copies. A larger value reports more pairs."""
+_LEAST = 0.1
+"""The least probability that a reported pair is one object. A larger value reports fewer pairs."""
+_BOTH = 0.5
+"""The share of the frames with two independent objects that really show both. One thing hides another, and a detector
+suppresses boxes that overlap. It is chosen, not measured. With a larger share, frames without both say more for one
+object."""
+_BESIDES = 0.2
+"""The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
+number, few frames tell less."""
+_PAD = 1.0
+"""The margin (m) around the objects in which others of their label may lie. A larger margin makes close pairs rarer."""
+_SHARED = 0.35
+"""Two objects fill one space if they are closer than this share of the smaller size, as in association. A larger share
+reports more pairs."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """P pairs of objects that may be one, the likeliest first.
+
+    first, second: (P,) indices into the map. distance: (P,) m. sigmas: (P,) the distance in standard deviations of both
+    covariances. probability: (P,) that they are one object. together: (P,) the number of frames with boxes of both.
+    expected: (P,) the number of frames that would show both if they were two.
+    """
+
+    first: Ints
+    second: Ints
+    distance: Floats
+    sigmas: Floats
+    probability: Floats
+    together: Ints
+    expected: Floats
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def take(self, which: Ints | Bools) -> Self:
+        """Select pairs by a mask or by indices."""
+        return type(self)(**{name: values[which] for name, values in vars(self).items()})
+
+
+def find_pairs(evidence: Evidence) -> Pairs:
+    """Return the pairs of objects that may be one.
+
+    Two explanations are compared. If they are one object, the offset between them has the sum of their covariances, and
+    hardly any frame shows both (`TOGETHER`). If they are two, the second lies anywhere among the objects of its label, and
+    frames in view of both show both. Objects that fill one space are candidates too, because two things cannot do so.
+    """
+    from scipy.spatial import cKDTree
+    from scipy.special import expit
+
+    state, covariance = evidence.state, evidence.covariance
+    position = state.landmarks.position
+    if state.count < 2:
+        return _none()
+    near = min(_NEIGHBOURS + 1, state.count)
+    found = np.asarray(cKDTree(position).query(position, k=np.arange(1, near + 1))[1])
+    pairs = np.stack([np.repeat(np.arange(state.count), near), found.ravel()], axis=1)
+    pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+    a, b = pairs[:, 0], pairs[:, 1]
+    meets = evidence.accepts[a, state.label[b]] | evidence.accepts[b, state.label[a]]
+    offset = position[a] - position[b]
+    gap = np.linalg.norm(offset, axis=1)
+    both = covariance[a] + covariance[b] + 1e-12 * np.eye(3)
+    squared = np.einsum("pi,pi->p", offset, np.linalg.solve(both, offset[..., None])[..., 0])
+    shared = gap < _SHARED * np.minimum(state.size[a], state.size[b])
+    kept = meets & ((squared < SAME_POINT) | shared)
+    a, b, gap, both, squared, shared = (values[kept] for values in (a, b, gap, both, squared, shared))
+    frames, in_view = common_frames(state.history, a, b)[:2]
+    expected = _expected(state.history.seen, state.history.expected, in_view, a, b)
+    if_one, if_two = TOGETHER * expected + _BESIDES, _BOTH * expected + _BESIDES
+    by_frames = frames * np.log(if_one / if_two) + if_two - if_one
+    as_one = -0.5 * (np.where(shared, np.minimum(squared, 3.0), squared) + np.linalg.slogdet(2 * np.pi * both)[1])
+    as_two = np.log(_density(position, state.label, state.label[a], len(state.unassigned)))
+    probability = expit(as_one - as_two + by_frames + np.log(_PRIOR / (1 - _PRIOR)))
+    result = Pairs(evidence.object[a], evidence.object[b], gap, np.sqrt(squared), probability, frames, expected)
+    order = np.argsort(-probability, kind="stable")
+    return result.take(order[probability[order] >= _LEAST])
+
+
+def _none() -> Pairs:
+    none, number = np.zeros(0, dtype=np.int64), np.zeros(0)
+    return Pairs(none, none, number, number, number, none, number)
+
+
+def _expected(seen: Ints, expected: Ints, both: Ints, a: Ints, b: Ints) -> Floats:
+    """Return in how many frames (P,) both objects would be detected, if their detections are independent.
+
+    both: (P,) the number of frames in view of both."""
+    rate = seen / np.maximum(expected, 1)
+    return np.asarray(both * rate[a] * rate[b])
+
+
+def _density(position: Floats, label: Ints, wanted: Ints, labels: int) -> Floats:
+    """Return the number of objects per cubic metre (P,) of each wanted label (P,), in the space that all objects take."""
+    volume = float((np.ptp(position, axis=0) + 2 * _PAD).prod())
+    return np.asarray(np.bincount(label, minlength=labels)[wanted] / volume)

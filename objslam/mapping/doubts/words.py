@@ -1,0 +1,207 @@
+"""Say doubts in plain sentences with numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from objslam.config import Triangulation
+from objslam.core.arrays import Floats, Ints
+from objslam.core.object_map import MapObject
+from objslam.core.result import Doubt, RunResult
+from objslam.mapping.doubts.groups import REASONS, BoxGroups
+from objslam.mapping.doubts.pairs import Pairs
+from objslam.mapping.doubts.splits import Splits
+
+_BESIDE = 0.5
+"""The distance (m) up to which a sentence names the nearest object, if it has the label of the boxes. An object of another
+label is named within its own size. A larger distance names more."""
+
+
+def in_words(result: RunResult, pairs: Pairs, splits: Splits, groups: BoxGroups) -> tuple[Doubt, ...]:
+    """Return all doubts in words. Of each kind, the likeliest pairs and the groups with the most boxes come first."""
+    unresolved = (_unresolved(result, j) for j, o in enumerate(result.map.objects) if o.status != "ok")
+    return (*_pairs(result, pairs), *_splits(result, splits), *unresolved, *_groups(result, groups))
+
+
+def why_unresolved(o: MapObject, limits: Triangulation) -> str:
+    """Return why an object has no position, with the limit from the settings."""
+    if o.rays < 2:
+        return "a single ray gives a direction and no distance"
+    if o.parallax_deg < limits.min_parallax_deg:
+        least = f"triangulation.min_parallax_deg {limits.min_parallax_deg:g}"
+        return f"its {o.rays} rays span {o.parallax_deg:.1f} deg ({least})"
+    most = f"{limits.max_rel_sigma:g} of its distance (triangulation.max_rel_sigma)"
+    return f"its {o.rays} rays disagree, or its sigma exceeds {most}"
+
+
+def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:
+    for i, (j, k) in enumerate(zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)):
+        a, b = result.map.objects[j], result.map.objects[k]
+        apart, expected = float(pairs.distance[i]), float(pairs.expected[i])
+        if expected < 1:
+            frames = "no frame should show both"
+        else:
+            frames = f"{_frames(int(pairs.together[i]))} both, and two things would be together in about {expected:.0f}"
+        yield Doubt(
+            "pair",
+            "may be one",
+            a.label,
+            f"{_name(a)} and {_name(b)} may be one (probability {pairs.probability[i]:.2f}): they are {_length(apart)} "
+            f"apart, {pairs.sigmas[i]:.1f} sigma; {frames}.",
+            (a.id, b.id),
+            (a.position + b.position) / 2,
+            np.flatnonzero(np.isin(result.association.object, [j, k])),
+            {
+                **{"probability": pairs.probability[i], "distance_m": apart, "sigmas": pairs.sigmas[i]},
+                **{"frames_with_both": pairs.together[i], "frames_with_both_expected": expected},
+            },
+        )
+
+
+def _splits(result: RunResult, splits: Splits) -> Iterator[Doubt]:
+    for i in np.argsort(-splits.rays.min(axis=1, initial=0), kind="stable").tolist():
+        j = int(splits.object[i])
+        o, (one, two), (m, n) = result.map.objects[j], splits.centre[i], splits.rays[i].tolist()
+        both = f"; {_frames(int(splits.together[i]))} both" if splits.together[i] else ""
+        yield Doubt(
+            "split",
+            "may be two",
+            o.label,
+            f"{_name(o)} may be two: {m} of its rays meet near {_place(one)} and {n} near {_place(two)}, "
+            f"{_length(splits.gap[i])} apart as seen, where 3 sigma of a ray are {_length(3 * splits.noise[i])}{both}.",
+            (o.id,),
+            o.position,
+            np.flatnonzero(result.association.object == j),
+            {
+                **{"rays_first": m, "rays_second": n, "gap_m": splits.gap[i], "sigma_m": splits.noise[i]},
+                **{"frames_with_both": splits.together[i]},
+            },
+        )
+
+
+def _unresolved(result: RunResult, j: int) -> Doubt:
+    o = result.map.objects[j]
+    why = "no parallax" if o.parallax_deg < result.settings.triangulation.min_parallax_deg or o.rays < 2 else "unsure"
+    return Doubt(
+        "unresolved",
+        why,
+        o.label,
+        f"{_name(o)} has no position: {why_unresolved(o, result.settings.triangulation)}.",
+        (o.id,),
+        o.position if np.isfinite(o.position).all() else None,
+        np.flatnonzero(result.association.object == j),
+        {"rays": o.rays, "parallax_deg": o.parallax_deg},
+    )
+
+
+def _groups(result: RunResult, groups: BoxGroups) -> Iterator[Doubt]:
+    if not len(groups):
+        return
+    number = np.bincount(groups.group, minlength=len(groups))
+    order = np.argsort(groups.group, kind="stable")
+    rays = np.split(groups.ray[order], np.cumsum(number)[:-1])
+    for g in np.argsort(-number, kind="stable").tolist():
+        reason, label = REASONS[groups.reason[g]], result.rays.label_names[groups.label[g]]
+        near = None if groups.object[g] < 0 else result.map.objects[groups.object[g]]
+        about = (
+            (near.id,) if near is not None and (reason == "on an object" or _is_beside(near, label, groups.away[g])) else ()
+        )
+        placed = reason not in ("fixed in the image", "on an object", "follow")
+        where = f" near {_place(groups.position[g])}" if placed else ""
+        beside = f" It is {_length(groups.away[g])} from {_name(near)}." if placed and about and near is not None else ""
+        place = near.position if reason == "on an object" and near is not None else groups.position[g] if placed else None
+        yield Doubt(
+            "boxes",
+            reason,
+            label,
+            f"{number[g]} {label} boxes{where}{_reason(result, groups, g, np.sort(rays[g]))}.{beside}",
+            about,
+            place,
+            np.sort(rays[g]),
+            {
+                **{"boxes": number[g], "miss_m": groups.miss[g], "sigma_m": groups.sigma[g]},
+                **{"parallax_deg": np.degrees(groups.parallax[g]), "frames": groups.seen[g]},
+                **{"frames_expected": groups.expected[g], "size_m": groups.size[g], "log_odds": groups.odds[g]},
+            },
+        )
+
+
+def _is_beside(o: MapObject, label: str, away: float) -> bool:
+    """Return whether an object is so near to boxes of a label that it may explain them. away: m."""
+    return away <= (_BESIDE if o.label == label else max(o.extent or (0.0,)) / 2)
+
+
+def _reason(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> str:
+    """Return the end of the sentence about a group: why its boxes are no object. rays: its rows in the rays of the
+    result."""
+    label = result.rays.label_names[groups.label[g]]
+    miss, sigmas = _length(groups.miss[g]), _length(3 * groups.sigma[g])
+    match REASONS[groups.reason[g]]:
+        case "fixed in the image":
+            box = np.median(result.rays.box[rays], axis=0)
+            camera = result.cameras[result.keyframes.camera[result.rays.keyframe[rays[0]]]].name
+            middle = f"({(box[0] + box[2]) / 2:.0f}, {(box[1] + box[3]) / 2:.0f})"
+            return (
+                f" stay at pixel {middle} of camera {camera} while the camera turns: "
+                "a part of the robot, or a ghost of the detector"
+            )
+        case "on an object":
+            o = result.map.objects[groups.object[g]]
+            if o.label == label:
+                return f" lie on {_name(o)}; {groups.double[g]} of them are in frames in which it has another box"
+            return f" lie on {_name(o)}: an object of another label is there"
+        case "follow":
+            stamps = result.keyframes.stamps[result.rays.keyframe[rays]] - result.keyframes.stamps[0]
+            time = f"{stamps.min():.1f} to {stamps.max():.1f} s after the start"
+            return f", {time}, follow one another, and no thing at rest explains them: it moves, or its boxes wander over it"
+        case "few":
+            least = result.settings.association.min_rays
+            return f": too few rays for an object (association.min_rays {least})"
+        case "no parallax":
+            return f": their rays span {np.degrees(groups.parallax[g]):.1f} deg, too little to tell a distance"
+        case "apart":
+            return f": their rays pass {miss} apart, 3 sigma are {sigmas}"
+        case "range":
+            return f": their ranges are {groups.range[g]:.2f} m, and their rays meet at {groups.distance[g]:.2f} m"
+        case "rare":
+            share = f"{100 * groups.rate[g]:.0f} %"
+            expected = f"{groups.seen[g]} of {groups.expected[g]} frames that should show it do"
+            return f": their rays meet, but only {expected}; an object of this label is in about {share}"
+        case "size":
+            size, usual = _length(groups.size[g]), _length(groups.usual_size[g])
+            known = f", and objects of this label {usual}" if groups.usual_size[g] else ", unlike others of this label"
+            return f": the thing would be {size} large{known}"
+        case "moves":
+            way = _length(groups.way[g])
+            return (
+                f": a point that moves by {way} explains them better than one at rest: it moves, or its boxes wander over it"
+            )
+        case "chance":
+            return ": as many rays of other boxes of this label would meet there by chance"
+        case _:
+            odds = f"{np.exp(np.abs(groups.odds[g])):.1f} to 1 {'for' if groups.odds[g] > 0 else 'against'}"
+            return f": their rays meet within {miss}, and the odds of an object are close, {odds}"
+
+
+def _frames(count: int) -> str:
+    return "no frame shows" if count == 0 else "1 frame shows" if count == 1 else f"{count} frames show"
+
+
+def _name(o: MapObject) -> str:
+    return f"{o.label} #{o.id}"
+
+
+def _place(position: Floats) -> str:
+    return f"({position[0]:.2f}, {position[1]:.2f}, {position[2]:.2f})"
+
+
+def _length(metres: float) -> str:
+    """Return a length in words: mm, cm or m, with two digits."""
+    value = float(metres)
+    if value >= 0.995:
+        return f"{value:.1f} m" if value < 99.5 else f"{value:.0f} m"
+    if value >= 0.00995:
+        return f"{100 * value:.0f} cm" if value >= 0.0995 else f"{100 * value:.1f} cm".replace(".0 cm", " cm")
+    return f"{1000 * value:.1f} mm".replace(".0 mm", " mm")

@@ -1,0 +1,51 @@
+"""The HTML page of the map of a site: its sessions, its objects, and what became of each object."""
+
+from collections import Counter
+from datetime import UTC, datetime
+from pathlib import Path
+
+from objslam.core.object_map import Fate, Life, ObjectMap
+from objslam.core.validity import is_date
+from objslam.io.atomic_files import write_file
+from objslam.output.plot.style import captions, label_colours
+from objslam.output.report.render import render
+from objslam.output.report.scene import hexadecimal, scene_data
+from objslam.results.files import PICTURE, REPORT
+from objslam.results.read import load_map, load_summary
+
+_STATES: tuple[Fate, ...] = ("confirmed", "moved", "new", "gone")
+"""The states of objects, in the order of the page."""
+
+
+def write_site_report(out: Path) -> Path:
+    """Write report.html into the folder `out` of a site, and return its path. OutputError if the map cannot be read."""
+    objects, summary = load_map(out), load_summary(out)
+    every = ObjectMap((*objects, *objects.gone))
+    colours = label_colours(every)
+    number = Counter(o.life.state for o in every if o.life is not None)
+    picture = out / PICTURE
+    page = render(
+        "site.html.jinja",
+        scene=scene_data(objects, None, None, None, summary.get("up", "z")) if len(objects) else None,
+        folder=out.resolve().name,
+        frame=objects.frame,
+        picture=picture.read_bytes() if picture.is_file() else None,
+        states=[(state, number[state]) for state in _STATES if number[state]],
+        sessions=summary.get("sessions", []),
+        warnings=summary.get("warnings", []),
+        rows=[
+            {"object": o, "name": name, "colour": hexadecimal(colours[o.label]), "updated": _date(o.life)}
+            for o, name in zip(every, captions(every), strict=True)
+        ],
+    )
+    write_file(out / REPORT, page.encode("utf-8", errors="replace"))
+    return out / REPORT
+
+
+def _date(life: Life | None) -> str:
+    """Return when an object was last updated, as a date or as a stamp, s. Nothing without a history."""
+    if life is None:
+        return ""
+    return (
+        f"{datetime.fromtimestamp(life.updated, UTC):%Y-%m-%d %H:%M}" if is_date(life.updated) else f"{life.updated:.1f} s"
+    )

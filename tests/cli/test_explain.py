@@ -1,0 +1,97 @@
+"""What `objslam explain` prints of the doubts in a result."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from synthetic_result import clusters, synthetic_result
+
+from objslam.cli import main
+from objslam.cli.explain import doubts_table
+from objslam.config import Output, Settings
+from objslam.core.result import Doubt
+from objslam.output.result_folder import write_result
+from objslam.results.read import load_doubts
+
+TEXT = "191 cup boxes near (0.24, -0.07, 1.94): their rays pass 6 cm apart, 3 sigma are 2 cm."
+CUPS = Doubt("boxes", "apart", "cup", TEXT, (), np.array([0.24, -0.07, 1.94]), np.arange(191), {"miss_m": 0.0612345678})
+PAIR = Doubt("pair", "may be one", "mug", "mug #1 and mug #4 may be one.", (1, 4), None, np.arange(7), {"sigmas": np.nan})
+
+
+@pytest.fixture
+def explain(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
+    result, _ = synthetic_result(*clusters(), keyframes=20, settings=Settings(output=Output(recording=False, picture=False)))
+    write_result(replace(result, doubts=(PAIR, CUPS)), tmp_path / "out")
+    write_result(result, tmp_path / "sure")
+
+    def call(folder: str, *words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["objslam", "explain", str(tmp_path / folder), *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        told = capsys.readouterr()
+        return int(ended.value.code or 0), told.out, told.err
+
+    return call
+
+
+def test_the_doubts_of_a_result_are_said_in_sentences(explain: Any) -> None:
+    code, out, _ = explain("out")
+    assert code == 0
+    words = " ".join(out.split())
+    assert "objects that may be one" in words
+    assert "191 cup boxes near (0.24, -0.07, 1.94): their rays pass 6 cm apart, 3 sigma are 2 cm." in words
+    _, out, _ = explain("out", "--label", "mug")
+    assert "cup" not in out
+    assert "mug #1 and mug #4 may be one." in out
+
+
+def test_no_doubt_is_said_too(explain: Any) -> None:
+    assert explain("sure")[:2] == (0, "no doubts\n")
+    assert explain("out", "--label", "dog")[:2] == (0, "no doubts about dog\n")
+
+
+def test_json_is_what_the_file_has(explain: Any, tmp_path: Path) -> None:
+    _, out, _ = explain("out", "--json")
+    told = json.loads(out)
+    assert told == json.loads((tmp_path / "out" / "doubts.json").read_text())["doubts"]
+    assert told[1]["text"] == TEXT
+    assert told[1]["numbers"] == {"miss_m": 0.061235}
+    assert [len(json.loads(explain("out", "--json", "--label", label)[1])) for label in ("cup", "dog")] == [1, 0]
+
+
+def test_a_file_is_read_back(explain: Any, tmp_path: Path) -> None:
+    first, second = load_doubts(tmp_path / "out") or ()
+    assert (first.kind, first.objects, first.position) == ("pair", (1, 4), None)
+    assert np.isnan(first.numbers["sigmas"])
+    assert (second.text, second.numbers["miss_m"]) == (TEXT, 0.061235)
+    assert (second.rays == CUPS.rays).all()
+    assert (second.position == CUPS.position).all()
+
+
+def test_a_result_of_an_older_version_or_a_damaged_one_is_an_error(explain: Any, tmp_path: Path) -> None:
+    file = tmp_path / "out" / "doubts.json"
+    file.write_text('{"doubts": [{"kind": "whim"}]}')
+    code, _, err = explain("out")
+    assert code == 1
+    assert "doubts.json" in err
+    assert "kind" in err
+    file.unlink()
+    code, _, err = explain("out")
+    assert code == 1
+    assert "run it again" in err
+    assert load_doubts(tmp_path / "out") is None
+
+
+def test_a_table_fits_80_columns_and_loses_no_word() -> None:
+    screen = Console(file=io.StringIO(), width=80)
+    screen.print(doubts_table([CUPS, replace(CUPS, label="a label of many words")], "boxes"))
+    lines = screen.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert " ".join(" ".join(line.split("│")[2] for line in lines if line.startswith("│")).split()) == f"{TEXT} {TEXT}"

@@ -1,0 +1,164 @@
+"""Doubts about a result: each is made on purpose, and must be found with its reason. A clean drive has none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from doubtful_drives import LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled, with_boxes
+
+from objslam.config import Settings
+from objslam.core.result import Doubt, RunResult
+from objslam.core.types import Log
+from objslam.simulation import pair, preset, simulate
+from objslam.simulation.settings import DepthNoise
+
+
+def only(result: RunResult) -> Doubt:
+    """The one doubt of a result."""
+    assert len(result.doubts) == 1, [one.text for one in result.doubts]
+    assert sum(result.summary["doubts"].values()) == 1
+    return result.doubts[0]
+
+
+def with_association(**changes: Any) -> Settings:
+    """The settings with other values for the association."""
+    return LEAN.model_copy(update={"association": LEAN.association.model_copy(update=changes)})
+
+
+@pytest.fixture(scope="module")
+def rooms() -> Log:
+    return simulate(preset("rooms", false=0.05), 1)
+
+
+@pytest.mark.parametrize("drive", ["demo", "rooms"])
+def test_a_clean_drive_has_no_doubts(drive):
+    result = mapped(simulate(preset(drive), 2))
+    assert result.doubts == ()
+    assert set(result.summary["doubts"].values()) == {0}
+
+
+def test_two_objects_taken_as_one_may_be_two():
+    result = mapped(simulate(pair(0.25, pixel_sigma=2.0, missed=0.2), 0))
+    assert len(result.map) == 2
+    assert result.doubts == ()
+    found = only(reassociated(result, np.minimum(result.association.object, 0)))
+    assert (found.kind, found.objects) == ("split", (0,))
+    assert found.numbers["gap_m"] == pytest.approx(0.25, abs=0.03)
+    true = np.bincount(result.association.object)
+    assert sorted([found.numbers["rays_first"], found.numbers["rays_second"]]) == pytest.approx(sorted(true), rel=0.1)
+    assert "of its rays meet near (1.50, " in found.text
+    frames = result.rays.keyframe
+    both = np.intersect1d(*(frames[result.association.object == j] for j in (0, 1)))
+    assert found.numbers["frames_with_both"] == pytest.approx(len(both), rel=0.1)
+
+
+def test_one_object_taken_as_two_may_be_one():
+    result = mapped(simulate(preset("rooms", false=0.0, missed=0.3), 3))
+    objects, count = result.association.object, len(result.map)
+    mine = np.flatnonzero(objects == 4)
+    later = objects.copy()
+    later[mine[len(mine) // 2 :]] = count
+    found = only(reassociated(result, later))
+    assert (found.kind, set(found.objects)) == ("pair", {4, count})
+    assert found.numbers["probability"] > 0.5
+    assert set(found.rays) == set(mine)
+
+
+def test_objects_that_frames_show_together_are_two():
+    # Their distance is less than two standard deviations, so nothing but the frames tells them apart.
+    result = mapped(simulate(pair(0.08, pixel_sigma=1.0), 1))
+    assert len(result.map) == 2
+    assert [one for one in result.doubts if one.kind == "pair"] == []
+
+
+def test_a_thing_that_moves():
+    log = simulate(preset("rooms", moving=1, tracks="perfect", missed=0.1, false=0.05), 0)
+    result = mapped(log)
+    moving = len(log.truth.objects)
+    found = [one for one in result.doubts if one.reason in ("follow", "moves")]
+    assert found == list(result.doubts) != []
+    rays = np.concatenate([one.rays for one in found])
+    assert (result.rays.track_id[rays] == moving).mean() > 0.9
+    assert len(rays) > 0.4 * (result.rays.track_id == moving).sum()
+
+
+def test_a_ghost_at_one_place_of_the_image(rooms):
+    rng = np.random.default_rng(0)
+    frames = np.flatnonzero(rng.random(len(camera_poses(rooms))) < 0.3)
+    boxes = np.array([300.0, 400.0, 360.0, 470.0]) + rng.normal(scale=1.5, size=(len(frames), 4))
+    result = mapped(with_boxes(rooms, frames, boxes, "person"))
+    found = only(result)
+    assert (found.kind, found.reason, found.label, found.position) == ("boxes", "fixed in the image", "person", None)
+    assert len(found.rays) > 0.9 * len(frames)
+    assert "pixel (330, 435)" in found.text
+
+
+def test_a_far_thing_has_no_parallax():
+    far = (("tower", (300.0, 15.0, 20.0)),)
+    found = only(mapped(simulate(preset("rooms", placed=far, max_range=400.0, false=0.0, objects=6), 0)))
+    assert (found.kind, found.reason, found.label) == ("unresolved", "no parallax", "tower")
+    assert found.numbers["parallax_deg"] < 3
+
+
+def test_rays_that_pass_a_place_apart(rooms):
+    # A thing that is at another place near (1, 1, 0.8) in each frame. Association takes it as one noisy object.
+    rng, place = np.random.default_rng(0), np.array([1.0, 1.0, 0.8])
+    places = place + rng.normal(scale=0.15, size=(len(camera_poses(rooms)), 3))
+    frames, boxes = boxes_of(rooms, places, 0.1)
+    result = mapped(with_boxes(rooms, frames, boxes, "wasp"))
+    wasp = result.rays.label == result.rays.label_names.index("wasp")
+    others = np.where(wasp, -1, result.association.object)
+    kept = np.unique(others[others >= 0])
+    found = only(reassociated(result, np.where(others >= 0, np.searchsorted(kept, others), -1)))
+    assert (found.kind, found.reason, found.label) == ("boxes", "apart", "wasp")
+    assert np.linalg.norm(found.position - place) < 0.2
+    assert len(found.rays) > 0.8 * wasp.sum()
+    # Of a normal distribution in the plane across a ray, half are within 1.18 standard deviations.
+    assert found.numbers["miss_m"] == pytest.approx(1.18 * 0.15, rel=0.2)
+    assert "their rays pass 1" in found.text
+    assert found.numbers["miss_m"] > 3 * found.numbers["sigma_m"]
+
+
+def test_a_thing_that_is_seen_too_rarely(rooms):
+    frames, boxes = boxes_of(rooms, np.tile([1.0, 1.0, 0.8], (len(camera_poses(rooms)), 1)), 0.1)
+    few = np.linspace(0, len(frames) - 1, 9).astype(int)
+    label = rooms.cameras[0].detections.label_names[0]
+    found = only(mapped(with_boxes(rooms, frames[few], boxes[few], label)))
+    assert (found.kind, found.reason, found.label) == ("boxes", "rare", label)
+    assert np.linalg.norm(found.position - [1.0, 1.0, 0.8]) < 0.05
+    assert found.numbers["frames"] == len(found.rays) in (8, 9)
+    assert found.numbers["frames_expected"] == pytest.approx(len(frames), rel=0.3)
+
+
+def test_too_few_rays_for_an_object(rooms):
+    frames, boxes = boxes_of(rooms, np.tile([1.0, 1.0, 0.8], (len(camera_poses(rooms)), 1)), 0.1)
+    few = np.linspace(0, len(frames) - 1, 10).astype(int)
+    found = only(mapped(with_boxes(rooms, frames[few], boxes[few], "kite"), with_association(min_rays=12, few_rays=False)))
+    assert (found.kind, found.reason, found.label) == ("boxes", "few", "kite")
+    assert len(found.rays) in (9, 10)
+    assert "association.min_rays 12" in found.text
+
+
+def test_ranges_that_end_elsewhere():
+    result = mapped(simulate(preset("rooms", false=0.0, depth=DepthNoise()), 5))
+    ranged = replace(result.rays, range=np.where(result.association.object == 3, 0.6, 1.0) * result.rays.range)
+    without = np.where(result.association.object == 3, -1, result.association.object)
+    without[without > 3] -= 1
+    found = only(reassociated(replace(result, rays=ranged), without))
+    assert (found.kind, found.reason) == ("boxes", "range")
+    assert np.linalg.norm(found.position - result.map.objects[3].position) < 0.1
+    assert set(found.rays) <= set(np.flatnonzero(result.association.object == 3))
+
+
+def test_boxes_of_another_label_on_an_object():
+    log = simulate(preset("rooms", false=0.0, tracks="perfect"), 4)
+    ids = log.cameras[0].detections.track_ids
+    often = int(np.bincount(ids[ids >= 0]).argmax())
+    third = (ids == often) & (np.arange(len(ids)) % 3 == 0)
+    result = mapped(relabelled(log, third, "thing"), with_association(fuse_labels=False))
+    on = [one for one in result.doubts if one.reason == "on an object"]
+    pairs = [one for one in result.doubts if one.kind == "pair"]
+    assert len(on) + len(pairs) == len(result.doubts) == 1
