@@ -1,10 +1,12 @@
 """Measure losses and delays of messages over DDS on the loopback interface, and compare with a bare cyclonedds reader.
 
 python tools/bench_dds.py [--seconds 30] [--sink session|count] [--best-effort]
+python tools/bench_dds.py --beside none malformed flood-tf ...      # beside publishers that send what they should not
 
 A robot in another process sends 200 odometry messages and 20 Detection2DArray of 5 boxes per second. The delay `accepted`
 begins just before a message is written, and ends when its push is accepted. The bare reader runs at the same time in a third
-process, on the same topics. Its delay ends when it has the bytes, which it does not decode.
+process, on the same topics. Its delay ends when it has the bytes, which it does not decode. --beside runs once for each kind
+of hostile publisher (tools/live_parts/hostile.py), and prints a table. MB is what the process of the session grew by.
 """
 
 from __future__ import annotations
@@ -19,10 +21,13 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from live_parts import hostile
+from live_parts.hostile import KINDS
 
 from objslam.core.camera import Camera
 
@@ -43,14 +48,38 @@ def main() -> None:
     parser.add_argument("--domain", type=int, default=77)
     parser.add_argument("--sink", choices=("session", "count"), default="session", help="count: only times, without a map")
     parser.add_argument("--best-effort", action="store_true")
+    parser.add_argument("--beside", nargs="+", choices=("none", "topics", *KINDS), help="hostile publishers, in turn")
+    parser.add_argument("--as-json", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--role", choices=("robot", "bare"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.role == "robot":
         print(json.dumps(drive(options)))
     elif options.role == "bare":
         print(json.dumps(read_bare(options)))
+    elif options.beside:
+        beside(options)
     else:
         compare(options)
+
+
+def beside(options: argparse.Namespace) -> None:
+    """Run this tool beside each kind of hostile publisher, and print a row of its results for each."""
+    print(f"{'beside':16}{'sent':>8}  topic        lost of      p50 ms  p99 ms   bare: lost  p50 ms  p99 ms      MB")
+    for number, kind in enumerate(options.beside):
+        domain = options.domain + number
+        command = [sys.executable, str(Path(hostile.__file__)), kind, str(domain)]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        other = None if kind == "none" else subprocess.Popen(command, text=True, **pipes)
+        mine = [sys.executable, __file__, "--domain", str(domain), "--seconds", str(options.seconds), "--sink", options.sink]
+        mine += ["--as-json", *["--best-effort"] * options.best_effort]
+        found = json.loads(subprocess.run(mine, stdout=subprocess.PIPE, text=True, check=True).stdout)
+        sent = other.communicate()[0].strip() if other is not None else ""
+        for topic, row in found["topics"].items():
+            (lost, *own), (bare, *others) = row["accepted"], row["bare reader"]
+            times = f"{own[0]:9.1f}{own[1]:9.1f}{bare:12d}{others[0]:9.1f}{others[1]:9.1f}{found['megabytes']:8.1f}"
+            print(f"{kind:16}{sent:>8}  {topic:11}{lost:6d} of {row['sent']:<5d}{times}", flush=True)
+        for line in found["lines"]:
+            print(f"    {line}", flush=True)
 
 
 def compare(options: argparse.Namespace) -> None:
@@ -63,7 +92,7 @@ def compare(options: argparse.Namespace) -> None:
 
     low_latency.configure()  # as `objslam live` is
     with tempfile.TemporaryDirectory() as folder:
-        sink = Timed(session(Path(folder)) if options.sink == "session" else None)
+        sink, before = Timed(session(Path(folder)) if options.sink == "session" else None), resident()
         adapter = DdsAdapter(open_network(options.domain), RosMessages(sink), TopicChoice())
         stop = threading.Event()
         thread = threading.Thread(target=adapter.run, args=(stop,))
@@ -74,22 +103,42 @@ def compare(options: argparse.Namespace) -> None:
         stop.set()
         thread.join()
         heard = json.loads(bare.communicate("\n")[0])
+        grown, told = resident() - before, ""
         if sink.session is not None:
             snapshot = sink.session.snapshot()
             p50, p99 = (f"{1e3 * value:.2f}" for value in snapshot.update)
-            print(f"session: {snapshot.keyframes} keyframes, {len(snapshot.map)} objects, update p50 {p50} ms, p99 {p99} ms")
+            told = f"session: {snapshot.keyframes} keyframes, {len(snapshot.map)} objects, update p50 {p50} ms, p99 {p99} ms"
+            adapter.ledger.add(sink.session.counters.ledger)
             sink.session.abort()
-    for kind, stamps in sent.items():
-        mine, other = delays(stamps, sink.times[kind]), delays(stamps, heard[kind])
-        print(f"{kind}: sent {len(stamps)} in {options.seconds:g} s")
-        for name, delay in (("accepted", mine), ("bare reader", other)):
-            quantiles = np.quantile(delay, [0.5, 0.99, 1.0]) * 1e3
-            p50, p99, most = (f"{value:.2f}" for value in quantiles)
-            print(f"  {name:11}  lost {len(stamps) - len(delay)}  p50 {p50} ms  p99 {p99} ms  most {most} ms")
-        ratio = np.quantile(mine, [0.5, 0.99]) / np.quantile(other, [0.5, 0.99])
+    topics = {kind: summary(stamps, sink.times[kind], heard[kind]) for kind, stamps in sent.items()}
+    if options.as_json:
+        print(json.dumps({"topics": topics, "megabytes": grown, "lines": [told, *adapter.ledger.lines()]}))
+        return
+    print(told)
+    for kind, row in topics.items():
+        print(f"{kind}: sent {row['sent']} in {options.seconds:g} s")
+        for name in ("accepted", "bare reader"):
+            lost, p50, p99, most = row[name]
+            print(f"  {name:11}  lost {lost}  p50 {p50:.2f} ms  p99 {p99:.2f} ms  most {most:.2f} ms")
+        ratio = np.array(row["accepted"][1:3]) / row["bare reader"][1:3]
         print(f"  ratio to the bare reader: p50 {ratio[0]:.2f}, p99 {ratio[1]:.2f}")
     for line in adapter.ledger.lines():
         print(line)
+
+
+def summary(sent: list[float], accepted: dict[str, float], bare: dict[str, float]) -> dict[str, Any]:
+    """How many messages were sent, and for both readers: how many were lost, and the delays of 50 %, 99 % and all, ms."""
+    found: dict[str, Any] = {"sent": len(sent)}
+    for name, arrived in (("accepted", accepted), ("bare reader", bare)):
+        delay = delays(sent, arrived)
+        lost = len(sent) - int(np.isfinite(delay).sum())
+        found[name] = [lost, *(1e3 * np.quantile(delay, [0.5, 0.99, 1.0])).tolist()]
+    return found
+
+
+def resident() -> float:
+    """The resident size of this process, MB."""
+    return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 def delays(sent: list[float], arrived: dict[str, float]) -> np.ndarray:
@@ -207,7 +256,8 @@ def drive(options: argparse.Namespace) -> dict[str, list[float]]:
     send_odometry, send_found = writer("odom", ODOMETRY, plain), writer("front/detections", FOUND, plain)
     writer("tf_static", TF, latched)(maker.tf(0, ("base_link", FRAME, BASE_T_CAMERA)))
     writer("front/camera_info", INFO, latched)(maker.camera_info(0, CAMERA, FRAME))
-    while [len(writer.get_matched_subscriptions()) for writer in writers] != [2, 2, 1, 1]:
+    # Beside a best-effort publisher of the same topic, the session has one more reader.
+    while not all(len(w.get_matched_subscriptions()) >= n for w, n in zip(writers, (2, 2, 1, 1), strict=True)):
         time.sleep(0.05)
     time.sleep(0.5)
     world = np.random.default_rng(0).uniform([-6, -4, 0.2], [6, 8, 1.5], (40, 3))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from objslam.errors import one_line
 
 _EXAMPLES = 3  # The most places that are kept for each reason. A larger number makes the lines of text longer.
+_MOST_WARNINGS = 1000  # The most warnings. A larger number costs memory if somebody makes up what is warned of.
 
 
 @dataclass
@@ -35,10 +36,14 @@ class Ledger:
             places.append(place)
 
     def warn(self, message: str) -> None:
-        """Add a warning, unless the ledger has it already."""
+        """Add a warning, unless the ledger has it already. Warnings beyond the first `_MOST_WARNINGS` are counted."""
         message = one_line(message)
-        if message not in self.warnings:
+        if message in self.warnings:
+            return
+        if len(self.warnings) < _MOST_WARNINGS:
             self.warnings.append(message)
+        else:
+            self.drop(f"warnings beyond the first {_MOST_WARNINGS}", where=message)
 
     def add(self, other: Ledger) -> None:
         """Add the counts and warnings of another ledger, with the first example of each reason."""

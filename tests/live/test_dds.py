@@ -4,6 +4,7 @@ import itertools
 import os
 import socket
 import struct
+import subprocess
 import sys
 import threading
 from collections import Counter
@@ -18,6 +19,9 @@ from waiting import LIMIT, wait_for
 pytest.importorskip("cyclonedds")
 sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
 from bag_writer import Maker, serialize
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
 
 from objslam.errors import ConfigError, ObjslamError
 from objslam.live.adapters.dds import DdsAdapter, _Publication
@@ -154,10 +158,6 @@ def rtps_data(writer: bytes, number: int, payload: bytes) -> bytes:
 
 
 def test_an_older_layout_of_vision_msgs_is_read(domain):
-    from cyclonedds.domain import DomainParticipant
-    from cyclonedds.pub import DataWriter
-    from cyclonedds.topic import Topic
-
     newer, older = layouts_of("vision_msgs/msg/Detection2DArray")
     assert newer.__idl__.get_type_id() == messages()["Detection2DArray"].__idl__.get_type_id()
     maker = Maker("2")
@@ -174,6 +174,39 @@ def test_an_older_layout_of_vision_msgs_is_read(domain):
     ((_, _, boxes, labels, scores, tracks, _),) = sink.detections
     np.testing.assert_allclose(boxes, [box[0][:4]])
     assert (labels, scores.tolist(), tracks) == (["mug"], [0.5], [4])
+
+
+def test_the_library_writes_nothing_to_the_terminal():
+    """A session in a process of its own receives a malformed payload."""
+    domain = next(_DOMAINS)
+    listener = """
+import sys, time
+from objslam.live.dds.network import open_network
+network = open_network(int(sys.argv[1]))
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from objslam.live.dds.types import layouts_of
+reader = DataReader(network.participant, Topic(network.participant, "rt/odom", layouts_of("nav_msgs/msg/Odometry")[0]))
+while network.unread["rt/odom"] < 20:
+    time.sleep(0.01)
+"""
+    env = {name: value for name, value in os.environ.items() if name != "CYCLONEDDS_URI"}
+    command = [sys.executable, "-c", listener, str(domain)]
+    process = subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    network, numbers = open_network(domain), itertools.count(10)
+    writer = DataWriter(network.participant, Topic(network.participant, "rt/odom", layouts_of("nav_msgs/msg/Odometry")[0]))
+    wait_for(writer.get_matched_subscriptions)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+
+        def ended():
+            packet = rtps_data(writer.get_guid().bytes, next(numbers), b"\0\1\0\0garbage!")
+            for index in range(8):
+                wire.sendto(packet, ("127.0.0.1", 7400 + 250 * domain + 11 + 2 * index))
+            return process.poll() is not None
+
+        wait_for(ended)
+    assert process.communicate() == ("", "")
+    assert process.returncode == 0
 
 
 def test_a_type_that_nobody_knows_is_left_out_with_a_warning():

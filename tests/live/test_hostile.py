@@ -4,17 +4,24 @@ import struct
 import sys
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+pytest.importorskip("cyclonedds")
 sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
 from bag_writer import Maker, serialize
-from robot import time_of_day
+from cyclonedds.core import InstanceState, Qos
+from robot import Recorder, time_of_day
 
 from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.live.adapters.dds import DdsAdapter
 from objslam.live.counters import Counters
+from objslam.live.dds.types import dds_type
 from objslam.live.ros.message_handler import RosMessages
+from objslam.live.ros.topic_discovery import TopicChoice
 from objslam.live.session import intake as intakes
 from objslam.live.session.intake import Intake
 from objslam.live.session.session import Session
@@ -90,6 +97,7 @@ def test_numbers_that_are_none_and_stamps_that_cannot_be(robot):
         send("/odom", ODOMETRY, good[:4] + struct.pack("<iI", seconds, 2**32 - 1) + good[12:])
     for cut in range(0, len(good), 7):
         send("/odom", ODOMETRY, good[:cut])
+    entry.end()
     lost = sum(messages.ledger.dropped.values()) + sum(entry.counters.dropped().values())
     assert lost == 4 + 3 + len(range(0, len(good), 7)) + (1 if len(taken) == 1 else 0)
     assert entry.newest == 1.0
@@ -107,6 +115,53 @@ def test_one_message_moves_no_clock(robot):
     assert len(taken) == 400
     assert [message.stamp for message in taken] == pytest.approx([10 + 0.005 * i for i in range(400)])
     assert sum(entry.counters.dropped().values()) == 4
+
+
+class Discovery:
+    """What DDS found: publishers with topics and types, as cyclonedds gives them."""
+
+    def __init__(self, offered):
+        info = SimpleNamespace(instance_state=InstanceState.Alive, valid_data=True)
+        self.samples = [
+            SimpleNamespace(
+                topic_name=f"rt{topic}",
+                type_name=dds_type(type_),
+                qos=Qos(),
+                type_id=None,
+                sample_info=SimpleNamespace(**vars(info), instance_handle=handle),
+            )
+            for handle, (topic, type_) in enumerate(offered)
+        ]
+
+    def take(self, count):
+        taken, self.samples = self.samples[:count], self.samples[count:]
+        return taken
+
+
+def test_topics_without_end_cost_a_bounded_memory():
+    odometry = [("/odom", ODOMETRY)]
+    other = [(f"/made/up{i}", f"made_up{i}/msg/Thing") for i in range(20_000)]
+    same = [(f"/odom{i}", ODOMETRY) for i in range(5_000)]
+    tags = [(f"/tags{i}", f"apriltag{i}/msg/TagArray") for i in range(5_000)]
+    messages = RosMessages(Recorder())
+    adapter, found = DdsAdapter(None, messages, TopicChoice(messages.chosen)), Discovery(odometry + other + same + tags)
+    rounds = 0
+    while found.samples:
+        adapter._look_around(found)
+        rounds += 1
+    assert rounds >= 30  # Between two of them, messages are taken.
+    assert len(adapter._publications) == 1000
+    assert adapter.choice.wanted({p.topic: p.type for p in adapter._publications.values()}, messages, True) == {"/odom"}
+    assert adapter.ledger.dropped == {"publisher beyond the first 1000": 9001}
+
+
+def test_warnings_without_end_are_counted():
+    ledger = Ledger()
+    for i in range(1500):
+        ledger.warn(f"topic {i} is unknown")
+        ledger.warn("topic 0 is unknown")
+    assert len(ledger.warnings) == 1000
+    assert ledger.dropped == {"warnings beyond the first 1000": 500}
 
 
 def test_a_flood_costs_a_bounded_memory(monkeypatch):

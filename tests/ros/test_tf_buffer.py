@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from objslam.core.diagnostics import Ledger
 from objslam.ros.tf.buffer import TfBuffer, UnknownTransform
+from objslam.ros.tf.frames import find_base
 from objslam.ros.tf.tree import TfRows, TfTree
 
 
@@ -145,3 +146,19 @@ def test_no_sequence_of_transforms_breaks_it(feed):
             except UnknownTransform:
                 continue
             assert np.isfinite(pose).all()
+
+
+def test_the_base_is_found_as_among_all_frames():
+    """Frames get other parents, so some frames vanish again."""
+    rng = np.random.default_rng(0)
+    names = ["odom", "base_link", "base_footprint", "a/base_link", "b/base_footprint", "camera", "arm", "c"]
+    for _ in range(30):
+        buffer, parents = TfBuffer(), {}
+        for step in range(40):
+            parent, child = rng.choice(names, 2, replace=False).tolist()
+            buffer.add(transform(100.0 * step + 1, parent, child, np.eye(4)), 0.0, True)
+            parents[child] = parent
+            frames = set(parents) | set(parents.values())
+            assert buffer.frames == frames
+            for moved in ("", "arm", "base_link", "unknown"):
+                assert find_base(buffer.likely_bases(moved), None, moved) == find_base(frames, None, moved)

@@ -12,11 +12,16 @@ from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP
 from objslam.ros.bag.records import Connection, plain
 from objslam.ros.message_limits import check_size
 from objslam.ros.messages.decode import DecodeError, make_decoder
-from objslam.ros.messages.topic_types import IMAGES, LATCHED
+from objslam.ros.messages.topic_types import IMAGES, LATCHED, is_read
 
 _LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
-_TAKE = 200  # The most messages that one call takes from a reader. A larger number makes fewer calls, and costs memory.
+_TAKE = 50
+"""The most messages that are taken from one reader before the next reader's turn. With a larger number, a flood of one topic
+delays the other topics more, and each message costs a little less."""
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
+_MAX_PUBLICATIONS = 1000
+"""The most publishers of types that objslam reads. With a larger number, it takes longer to choose topics among made-up
+ones."""
 _MIN_BUFFER = 2 << 20  # With a smaller socket buffer, bytes, raw images bring a warning. A larger value warns more often.
 _Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
@@ -91,16 +96,22 @@ class DdsAdapter:
     def _look_around(self, found: Any) -> None:
         from cyclonedds.core import InstanceState
 
-        while samples := found.take(_TAKE):
+        for _ in range(QUEUE // _TAKE):  # Messages of the readers do not wait longer, even if publishers come without end.
+            samples = found.take(_TAKE)
             for sample in samples:
                 handle = sample.sample_info.instance_handle
                 if sample.sample_info.instance_state != InstanceState.Alive or not sample.sample_info.valid_data:
                     self._publications.pop(handle, None)
                     continue
                 topic, type_ = ros_topic(sample.topic_name), ros_type(sample.type_name)
-                if topic is not None and type_ is not None:
-                    publication = _Publication(plain(topic), type_, _kind(sample.qos, type_), sample.type_id)
-                    self._publications[handle] = publication
+                if topic is None or type_ is None or not is_read(type_):
+                    continue
+                if handle not in self._publications and len(self._publications) >= _MAX_PUBLICATIONS:
+                    self.messages.refuse(f"publisher beyond the first {_MAX_PUBLICATIONS}", topic)
+                    continue
+                self._publications[handle] = _Publication(plain(topic), type_, _kind(sample.qos, type_), sample.type_id)
+            if len(samples) < _TAKE:
+                return
 
     def _open(self, age: float) -> list[_Reader]:
         """Open readers for the wanted topics that have none, and return them. age: the time since the start, s."""
@@ -152,22 +163,18 @@ class DdsAdapter:
         return _Reader(publication, entity, make_decoder(Connection(topic, type_, "cdr")), time.monotonic())
 
     def _take(self, reader: _Reader, found: Any) -> None:
-        """Push the messages that wait in a reader, at most QUEUE, so that other readers and a stop do not wait long."""
-        for _ in range(QUEUE // _TAKE):
-            samples = reader.entity.take(_TAKE)
-            for sample in samples:
-                info = sample.sample_info
-                if not info.valid_data or not self._is_mine(reader, info.publication_handle, found):
-                    continue
-                try:
-                    check_size(reader.of.type, sample.data, "cdr")
-                    message = reader.decode(sample.data)
-                except DecodeError as error:
-                    self.messages.refuse("message that cannot be decoded", f"{reader.of.topic}: {error}")
-                    continue
-                self.messages.receive(reader.of.type, reader.of.topic, message, info.source_timestamp / 1e9)
-            if len(samples) < _TAKE:
-                return
+        """Push messages that wait in a reader, at most _TAKE, so that other readers and a stop do not wait long."""
+        for sample in reader.entity.take(_TAKE):
+            info = sample.sample_info
+            if not info.valid_data or not self._is_mine(reader, info.publication_handle, found):
+                continue
+            try:
+                check_size(reader.of.type, sample.data, "cdr")
+                message = reader.decode(sample.data)
+            except DecodeError as error:
+                self.messages.refuse("message that cannot be decoded", f"{reader.of.topic}: {error}")
+                continue
+            self.messages.receive(reader.of.type, reader.of.topic, message, info.source_timestamp / 1e9)
 
     def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
         """Return whether this reader pushes a message of the publisher with this handle.

@@ -1,11 +1,14 @@
 """Joins DDS domains on a chosen network, and counts the payloads that the DDS library rejects."""
 
+import ctypes
 import ipaddress
 import os
 import re
 import socket
 import threading
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,7 +50,8 @@ def open_network(domain: int | None = None, interface: str | None = None) -> Net
     another interface.
     """
     try:
-        import cyclonedds  # noqa: F401
+        with _without_stderr():
+            import cyclonedds.domain  # noqa: F401
     except ImportError as error:
         raise ObjslamError("cyclonedds is not installed", hint='pip install "objslam[dds]"') from error
     domain = _domain(domain)
@@ -79,7 +83,8 @@ def _join(domain: int, interface: str | None) -> Network:
     own = f"<CycloneDDS><Domain>{trace}{settings if where != _URI else ''}{buffer}</Domain></CycloneDDS>"
     before = _sockets()
     try:
-        entity = Domain(domain, f"{settings},{own}" if where == _URI else own)
+        with _without_stderr():
+            entity = Domain(domain, f"{settings},{own}" if where == _URI else own)
         if where == LOOPBACK:
             _keep_inside(_sockets() - before)
         participant = DomainParticipant(domain)
@@ -92,6 +97,29 @@ def _join(domain: int, interface: str | None) -> Network:
     network = Network(domain, where, participant, (entity,))
     threading.Thread(target=_listen, args=(reading, network.unread), name="dds-log", daemon=True).start()
     return network
+
+
+@contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Hide C's `stderr` while the DDS library is imported and opens a domain. It keeps the file, and writes warnings to it.
+
+    Otherwise each malformed packet from the network would write a line to the terminal, besides the one that `_listen`
+    counts. The library has no setting for this. Python itself does not write to C's `stderr`, but to its descriptor. Where
+    the system has no such variable, the warnings are printed.
+    """
+    system = ctypes.CDLL(None)
+    try:
+        stderr = ctypes.c_void_p.in_dll(system, "stderr")
+    except ValueError:  # It has another name here.
+        yield
+        return
+    system.fopen.restype = ctypes.c_void_p
+    kept, nowhere = stderr.value, system.fopen(os.devnull.encode(), b"w")
+    stderr.value = nowhere or kept
+    try:
+        yield
+    finally:
+        stderr.value = kept
 
 
 def _settings(interface: str | None) -> tuple[str, str]:

@@ -37,7 +37,7 @@ def ros_type(name: str) -> str | None:
     return type_name(f"{package}/msg/{rest.removesuffix(_PARTS[1])}") if middle and rest.endswith(_PARTS[1]) else None
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=1024)
 def layouts_of(type_: str) -> tuple[type, ...]:
     """Return the DDS types of a ROS type, one per known layout.
 

@@ -130,7 +130,7 @@ class RosMessages:
         return False
 
     def _base(self) -> str:
-        return find_base(self._tf.frames, self._options.base_frame, self._child)
+        return find_base(self._tf.likely_bases(self._child), self._options.base_frame, self._child)
 
     def _take_odometry(self, topic: str, message: Any, received: float) -> None:
         frame, child = frame_name(message.header.frame_id), frame_name(message.child_frame_id)

@@ -1,13 +1,11 @@
 """The clock of a session. It converts stamps to session time, which never goes back, even when the robot's clock does."""
 
-import math
 from dataclasses import dataclass, field
 
 from objslam.sources.journal.records import PathKind
 
 _SURE = 5  # The clock was set back if this many poses in a row are older than the path. A larger number is surer but slower.
 _BACK = 0.5  # A pose older than the path by less than this, s, is only late. A larger value ignores larger steps back.
-_LEAP = 60.0  # A stamp this far ahead, s, must be confirmed by the next pose. A larger value accepts more wrong stamps.
 _KEPT = 8  # The earlier shifts that are kept, for stamps from before the clock changed. More shifts only cost memory.
 _MISSED = 0.005  # The assumed time, s, from the last pose before a step back to the next: a period of odometry at 200 Hz.
 
@@ -23,21 +21,15 @@ class Clock:
     shift: float = 0.0
     newest: float = -float("inf")
     _older: list[float] = field(default_factory=list)  # The stamps of the last poses in a row that were older than the path.
-    _ahead: float | None = None  # The stamp of the last pose, if it leapt ahead.
     _shifts: list[float] = field(default_factory=list)  # Earlier values of `shift`, the newest last.
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
         """Return a new pose's stamp in session time, None if the pose is refused, and whether the clock was set back.
 
-        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too. A pose that
-        leaps ahead is refused, unless the previous pose leapt to about the same time.
+        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too. No single
+        wrong stamp ahead comes here (`stamp_leaps`).
         """
         time = stamp + self.shift
-        if self.newest + _LEAP < time and math.isfinite(self.newest):
-            before, self._ahead = self._ahead, stamp
-            if before is None or not before < stamp < before + _LEAP:
-                return None, False
-        self._ahead = None
         if time > self.newest:
             self.newest = time
             self._older.clear()
@@ -77,24 +69,16 @@ class Lead:
         self._clock, self._max_gap = clock, max_gap
         self._newest: dict[PathKind, float] = {}
         self._odometry_until = -float("inf")
-        self._unconfirmed = False
         self.path: PathKind | None = None
 
-    def choose(self, path: PathKind, at: float) -> bool:
-        """Choose again for a new pose of a path, and return whether the pose may be used. at: session time of the pose, s.
+    def choose(self, path: PathKind, at: float) -> None:
+        """Choose again for a new pose of a path. at: session time of the pose, s.
 
-        A path that leads again continues from its own newest stamp. A single localisation whose stamp leaps far ahead is
-        refused, because the stamp may be wrong. The next one confirms that the odometry is silent.
+        A path that leads again continues from its own newest stamp.
         """
         silent = at > self._odometry_until + self._max_gap
         if path != self.path and (path == "odometry" or self.path is None or silent):
-            far = at > self._odometry_until + _LEAP
-            if path == "localization" and self.path is not None and far and not self._unconfirmed:
-                self._unconfirmed = True
-                return False
             self.path, self._clock.newest = path, self._newest.get(path, -float("inf"))
-        self._unconfirmed = False
-        return True
 
     def heard(self, path: PathKind, at: float) -> None:
         """Record that a pose of a path was accepted. at: its session time, s."""

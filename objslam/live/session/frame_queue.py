@@ -39,6 +39,7 @@ class FrameQueue:
         # Of each frame: the corrected stamp, s, its number in the order of arrival, the message, the time of arrival, s.
         self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
+        self._newest = -np.inf  # When the newest message arrived, s. A frame may come behind a pose that arrived later.
         self.lag = 0.0
         self.worked = -np.inf
 
@@ -47,6 +48,7 @@ class FrameQueue:
 
         measured: whether the time until the map contains a frame is limited and counted. False for a journal.
         """
+        self._newest = max(self._newest, arrival)
         if isinstance(message, FrameMessage):
             self._frames += 1
             bisect.insort(self._waiting, (self._mapper.corrected_stamp(message), self._frames, message, arrival))
@@ -61,7 +63,7 @@ class FrameQueue:
             # If a camera's clock is behind, its frames have to wait longer for their poses, so their limit is longer.
             limit = self._limit + max(0.0, stamp - frame.stamp)
             if measured and not self._patient and time.perf_counter() - came > limit:
-                self._counters.drop_frame(frame, _RARE_POSES if arrival - came > limit else TOO_SLOW)
+                self._counters.drop_frame(frame, _RARE_POSES if self._newest - came > limit else TOO_SLOW)
                 continue
             update = self._mapper.take(frame)
             if update is not None:

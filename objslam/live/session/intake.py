@@ -5,6 +5,8 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from objslam.core.validity import valid_positions
 from objslam.live.counters import Counters
 from objslam.live.session import checks
 from objslam.live.session.clock import Clock, Lead
+from objslam.live.session.stamp_leaps import StampLeaps
 from objslam.sources.journal.records import (
     CameraMessage,
     FrameMessage,
@@ -43,12 +46,23 @@ _WAIT = 2.0
 """A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
 larger value misses more of these stamps."""
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
-_ALONE = "with a stamp far ahead, which the next one did not confirm yet"
+_ALONE = "with a stamp far ahead, which the next ones did not confirm"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}
+
+
+class _Checked(NamedTuple):
+    """A message that was checked. push: delivers it. kind, where: its name in reports."""
+
+    push: Callable[[], bool]
+    kind: str
+    where: str
 
 
 class Intake:
     """A `Sink` that checks messages and delivers the valid ones.
+
+    A message whose stamp leaps ahead waits until the next ones of its publisher confirm the leap (`stamp_leaps`). Its push
+    returns True. If the next ones refute it, it is dropped and counted.
 
     It converts stamps to session time, in which the stamps of the path always increase. After a restart of the robot's
     odometry, it converts the new poses, so that they continue the old path.
@@ -68,6 +82,7 @@ class Intake:
         self._last: dict[PathKind, PoseMessage] = {}
         self._heard: dict[PathKind, dict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
         self._lead = Lead(self._clock, settings.poses.max_gap)
+        self._leaps = StampLeaps[_Checked]()
 
     def push_camera(self, camera: Camera) -> bool:
         """Push a camera, as `Sink.push_camera`. A known camera that has not changed is accepted, but not delivered again."""
@@ -101,7 +116,10 @@ class Intake:
         with self._lock:
             if not checks.is_camera_name(camera) or camera not in self._cameras:
                 return self._refuse("mount of an unknown camera", checks.told(camera))
-            return self._hand_on(MountMessage(self._place(given), camera, pose))
+            checked = _Checked(
+                partial(self._take_mount, given, camera, pose), "mount", f"camera {camera}, stamp {given:.3f}"
+            )
+            return self._take(f"mounts of {camera}", given, checked)
 
     def push_detections(
         self,
@@ -123,24 +141,13 @@ class Intake:
         with self._lock:
             if camera not in self._cameras:
                 return self._refuse("frame of an unknown camera", checks.told(camera))
-            at, newest = frame.stamp + self._clock.shift, self.newest
-            if math.isfinite(newest):
-                at = self._place(frame.stamp)
-                if at < newest - self._settings.live.max_late:
-                    return self._refuse("frame that is late (live.max_late)", where)
-                if at > newest + _AHEAD:
-                    return self._refuse("frame with a stamp too far ahead of the path", where)
-            seen = self._stamps.get(camera, {})
-            if at in seen:
-                return self._refuse("frame with a repeated stamp", where)
-            if seen and at < next(reversed(seen)):
-                self.counters.accept("frames out of order")
-            frame = self._with_known_labels(frame, where)
-            if not self._hand_on(replace(frame, stamp=at)):
-                return False
-            self.counters.accept("boxes", len(frame))
-            self._remember(camera, at)
-            return True
+            checked = _Checked(partial(self._take_frame, frame, where, time.perf_counter()), "frame", where)
+            return self._take(f"frames of {camera}", frame.stamp, checked)
+
+    def end(self) -> None:
+        """Drop and count the messages that still wait for the next ones to confirm their stamps."""
+        with self._lock:
+            self._refute(self._leaps.clear())
 
     @property
     def newest(self) -> float:
@@ -159,6 +166,7 @@ class Intake:
                 if message.path == self._lead.path:
                     self._clock.newest = message.stamp
                 self._lead.heard(message.path, message.stamp)
+                self._leaps.recall(message.path, message.stamp - self._clock.shift)
             elif isinstance(message, NoteMessage):
                 self._clock.shift, self._start_T_odom = message.clock, message.odometry
             elif isinstance(message, FrameMessage):
@@ -176,41 +184,86 @@ class Intake:
             self.counters.accept(f"{path}{NOT_USED}")  # The user chose so (poses.use): nothing is lost.
             return False
         with self._lock:
-            if not self._lead.choose(path, given + self._clock.shift):
-                return self._refuse(f"{path} {_ALONE}", f"stamp {given:.3f}")
-            last = self._last.get(path)
-            if self._is_known(path, given + self._clock.shift, matrix):
-                return self._refuse(f"{path} that came before", f"stamp {given:.3f}")
-            if path == self._lead.path:
-                before = self.newest - self._clock.shift
-                at, back = self._clock.step(given)
-                if at is None:
-                    again = last is not None and last.stamp == given + self._clock.shift
-                    ahead = given + self._clock.shift > self.newest
-                    fault = "with a repeated stamp" if again else _ALONE if ahead else "that is late"
-                    return self._refuse(f"{path} {fault}", f"stamp {given:.3f}")
-                if back:
-                    if "clock set back" not in self.counters.accepted():
-                        self.counters.ledger.warn(
-                            f"the clock was set back by about {before - given:.1f} s at stamp {given:.3f}"
-                        )
-                    self.counters.accept("clock set back")
-                    self._note()
-            else:
-                at = self._place(given)
-                if last is not None and at <= last.stamp:
-                    return self._refuse(f"{path} that is late", f"stamp {given:.3f}")
-            if path == "odometry":
-                matrix = self._continuous(at, matrix)
-                if not valid_positions(matrix[:3, 3]):
-                    return self._refuse("odometry that leads too far away", f"stamp {given:.3f}")
-            message = PoseMessage(path, at, matrix)
-            if not self._hand_on(message):
-                return False
-            self._last[path] = message
-            self._keep(message)
-            self._lead.heard(path, at)
-            return True
+            checked = _Checked(partial(self._take_pose, path, given, matrix), path, f"stamp {given:.3f}")
+            return self._take(path, given, checked, alone=True)
+
+    def _take(self, stream: str, stamp: float, message: _Checked, alone: bool = False) -> bool:
+        """Deliver a message of a stream, and those that it confirms, and return whether it is accepted. stamp: s.
+
+        The path that sets the clock confirms the stamps of all other streams, and only its own next poses confirm its own.
+        alone: as in `StampLeaps.take`.
+        """
+        clock = -math.inf if stream == self._lead.path else self._clock.newest - self._clock.shift
+        passing, refuted = self._leaps.take(stream, stamp, clock, message, alone)
+        self._refute(refuted)
+        accepted = {id(one): one.push() for one in passing}
+        if stream == self._lead.path:
+            for one in self._leaps.confirmed(self._clock.newest - self._clock.shift):
+                one.push()
+        return accepted.get(id(message), True)
+
+    def _refute(self, messages: list[_Checked]) -> None:
+        for one in messages:
+            self._refuse(f"{one.kind} {_ALONE}", one.where)
+
+    def _take_pose(self, path: PathKind, given: float, pose: Floats) -> bool:
+        """Deliver a pose, unless it is late. given: its stamp, s."""
+        where, last = f"stamp {given:.3f}", self._last.get(path)
+        self._lead.choose(path, given + self._clock.shift)
+        if self._is_known(path, given + self._clock.shift, pose):
+            return self._refuse(f"{path} that came before", where)
+        if path == self._lead.path:
+            before = self.newest - self._clock.shift
+            at, back = self._clock.step(given)
+            if at is None:
+                again = last is not None and last.stamp == given + self._clock.shift
+                return self._refuse(f"{path} {'with a repeated stamp' if again else 'that is late'}", where)
+            if back:
+                if "clock set back" not in self.counters.accepted():
+                    self.counters.ledger.warn(f"the clock was set back by about {before - given:.1f} s at {where}")
+                self.counters.accept("clock set back")
+                self._note()
+                self._refute(self._leaps.clear())
+                self._leaps.recall(path, given)
+        else:
+            at = self._place(given)
+            if last is not None and at <= last.stamp:
+                return self._refuse(f"{path} that is late", where)
+        if path == "odometry":
+            pose = self._continuous(at, pose)
+            if not valid_positions(pose[:3, 3]):
+                return self._refuse("odometry that leads too far away", where)
+        message = PoseMessage(path, at, pose)
+        if not self._hand_on(message):
+            return False
+        self._last[path] = message
+        self._keep(message)
+        self._lead.heard(path, at)
+        return True
+
+    def _take_frame(self, frame: FrameMessage, where: str, arrival: float) -> bool:
+        """Deliver a frame of a known camera, unless it is late, repeated or far ahead of the path. arrival: s."""
+        camera, at, newest = frame.camera, frame.stamp + self._clock.shift, self.newest
+        if math.isfinite(newest):
+            at = self._place(frame.stamp)
+            if at < newest - self._settings.live.max_late:
+                return self._refuse("frame that is late (live.max_late)", where)
+            if at > newest + _AHEAD:
+                return self._refuse("frame with a stamp too far ahead of the path", where)
+        seen = self._stamps.get(camera, {})
+        if at in seen:
+            return self._refuse("frame with a repeated stamp", where)
+        if seen and at < next(reversed(seen)):
+            self.counters.accept("frames out of order")
+        frame = self._with_known_labels(frame, where)
+        if not self._hand_on(replace(frame, stamp=at), arrival):
+            return False
+        self.counters.accept("boxes", len(frame))
+        self._remember(camera, at)
+        return True
+
+    def _take_mount(self, stamp: float, camera: str, pose: Floats) -> bool:
+        return self._hand_on(MountMessage(self._place(stamp), camera, pose))
 
     def _is_known(self, path: PathKind, at: float, pose: Floats) -> bool:
         """Return whether this pose was accepted before at this stamp, in session time, s, and newer ones after it."""
@@ -273,9 +326,9 @@ class Intake:
     def _note(self) -> None:
         self._hand_on(NoteMessage(self._clock.shift, self._start_T_odom))
 
-    def _hand_on(self, message: Message) -> bool:
-        """Deliver a message, count it if it is accepted, and return whether it is accepted."""
-        if not self._deliver(message, time.perf_counter()):
+    def _hand_on(self, message: Message, arrival: float | None = None) -> bool:
+        """Deliver a message, count it if it is accepted, and return whether it is accepted. arrival: now, if None."""
+        if not self._deliver(message, time.perf_counter() if arrival is None else arrival):
             return False
         self.counters.accept(_kind(message))
         return True

@@ -142,6 +142,7 @@ class Session(Intake):
 
     def _close(self, discard: bool = False) -> None:
         """End the thread, and then close the journal, because no push writes into it any more."""
+        self.end()
         with self._changed:
             self._stopping = True
             if discard:

@@ -71,6 +71,9 @@ def _read_topics(database: sqlite3.Connection, path: Path) -> dict[int, Connecti
     tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND rootpage > 0")}
     if not {"topics", "messages"} <= tables:
         raise LogError("not a ROS 2 bag: the database has no tables of topics and messages", where=str(path))
+    columns = {name for _, name, *_ in database.execute("PRAGMA table_info(messages)")}
+    if not {"topic_id", "timestamp", "data"} <= columns:
+        raise LogError("not a ROS 2 bag: its table of messages lacks a topic, a time or the data", where=str(path))
     definitions: dict[str, tuple[str, str]] = {}
     if "message_definitions" in tables:
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"

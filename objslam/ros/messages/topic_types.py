@@ -17,3 +17,8 @@ def is_tags(type_: str) -> bool:
 def is_boxes(type_: str) -> bool:
     """Return whether messages of a type contain boxes, either detections or AprilTags."""
     return type_ == DETECTIONS or is_tags(type_)
+
+
+def is_read(type_: str) -> bool:
+    """Return whether objslam reads messages of a type."""
+    return type_ in (ODOMETRY, CAMERA_INFO, *POSES, *IMAGES, *TRANSFORMS) or is_boxes(type_)

@@ -1,7 +1,8 @@
 """A buffer of the transforms on /tf and /tf_static of a live robot. It keeps at least the last 10 s, as tf2 does."""
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import KeysView, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.ros.messages.poses import one_pose
-from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, link, part, unchanged
+from objslam.ros.tf.frames import MAX_GAP, MAX_TRANSFORMS, climb, is_base, link, part, unchanged
 
 _MAX_KEPT = 10_000  # The limit of buffered transforms per child frame, enough for 10 s at 1 kHz. A larger one costs memory.
 
@@ -87,6 +88,8 @@ class TfBuffer:
 
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
+        self._names: Counter[str] = Counter()  # How many transforms each frame is in.
+        self._bases: set[str] = set()
 
     def add(self, transform: Any, received: float, static: bool) -> str:
         """Add a geometry_msgs/TransformStamped and return its child frame. Raises ValueError if it is refused.
@@ -108,15 +111,30 @@ class TfBuffer:
             if edge.parent != parent and abs(stamp - edge.stamps[-1]) < MAX_GAP:
                 raise ValueError("transform of a frame that has another parent")
         if edge is None or edge.static or edge.parent != parent:  # Only the newest static transform counts.
+            self._count(child, parent, None if edge is None else edge.parent)
             edge = self._edges[child] = _Edge(parent, static)
         if not edge.add(stamp, pose):
             raise ValueError("transform that is older than the last")
         return child
 
     @property
-    def frames(self) -> set[str]:
+    def frames(self) -> KeysView[str]:
         """The names of all frames."""
-        return set(self._edges) | {edge.parent for edge in self._edges.values()}
+        return self._names.keys()
+
+    def likely_bases(self, moved: str) -> set[str]:
+        """Return the frames among which `find_base` finds the base. moved: the child frame of the odometry."""
+        return self._bases | {moved} if moved in self._names else set(self._bases)
+
+    def _count(self, child: str, parent: str, old: str | None) -> None:
+        """Count the frames of a new transform, which replaces one with the parent `old`, None if there was none."""
+        self._names.update((parent,) if old is not None else (parent, child))
+        if old is not None:
+            self._names[old] -= 1
+            if not self._names[old]:
+                del self._names[old]
+                self._bases.discard(old)
+        self._bases.update(frame for frame in (parent, child) if is_base(frame))
 
     def above(self, frame: str) -> Sequence[str]:
         """Return the frames from a frame up to the root. Raises UnknownTransform if they form a cycle."""

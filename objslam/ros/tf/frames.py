@@ -25,6 +25,11 @@ def is_world(frame: str) -> bool:
     return not _WORLDS.isdisjoint(re.split(r"[^a-z]+", _leaf(frame).lower()))
 
 
+def is_base(frame: str) -> bool:
+    """Return whether the name of a frame says that it is the base of a robot, with any namespace."""
+    return _leaf(frame) in BASES
+
+
 def find_odom(frames: Iterable[str]) -> str:
     """Return the first odom frame, "" without one."""
     return next((frame for frame in frames if _leaf(frame) == "odom"), "")
@@ -46,7 +51,7 @@ def find_base(frames: Iterable[str], given: str | None, moved: str) -> str:
     known = set(frames)
     if moved in known:
         return moved
-    named = [frame for frame in known if _leaf(frame) in BASES]
+    named = [frame for frame in known if is_base(frame)]
     return min(named, key=lambda frame: (BASES.index(_leaf(frame)), frame), default=moved or BASES[-1])
 
 

@@ -169,6 +169,17 @@ def test_a_view_that_makes_up_rows_without_end(tmp_path):
         describe(tmp_path / "evil.db3")
 
 
+@pytest.mark.parametrize("column", ["topic_id", "timestamp", "data"])
+def test_a_table_of_messages_without_a_column(tmp_path, makers, column):
+    folder = write_bag(tmp_path / "drive", "sqlite3", makers["4"], _odometry(makers["4"]))
+    with sqlite3.connect(folder / "drive.db3") as database:
+        database.execute(f"ALTER TABLE messages RENAME COLUMN {column} TO other")
+    database.close()
+    for use in (describe, lambda path: read_bag(path, Ledger())):
+        with pytest.raises(LogError, match="its table of messages lacks"):
+            use(folder)
+
+
 def test_rows_that_are_no_messages(tmp_path, makers):
     folder = write_bag(tmp_path / "drive", "sqlite3", makers["4"], _odometry(makers["4"]))
     database = sqlite3.connect(folder / "drive.db3")
