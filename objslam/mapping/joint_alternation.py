@@ -137,7 +137,7 @@ class JointState:
         solve. So these stay as the first round found them until the rounds end, and are then estimated again. drifting:
         whether to allow for the drift of keyframes without an assigned ray.
         """
-        state, earlier = self, dict[bytes, Self]()
+        state, earlier, held = self, dict[bytes, Self](), False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"association, round {number + 1}", 0, 0)
             found = state._associate(map_T_base, guess, drifting)
@@ -147,17 +147,19 @@ class JointState:
                 if not same and (state.errors is None or state.hold):
                     returned = list(earlier).index(key)
                     state = state.continued_from(max(list(earlier.values())[returned:], key=lambda one: one.explained))
-                if state.hold == self.hold:
-                    return replace(state, settled=True)
-                state = state.released(self.hold)
+                if not held:
+                    return replace(state, hold=self.hold, settled=True)
+                state, held = state.released(self.hold), False
             else:
-                state = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera)
-                state = replace(state, hold=state.errors is not None).merged()
+                solved = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera)
+                solved = replace(solved, hold=state.errors is not None)
+                before, state = state.hold, solved.merged()
+                held = solved.hold != self.hold and (before or state is not solved)
                 earlier[key] = state
             assert state.association is not None
             assert state.estimate is not None
             map_T_base, guess = state.estimate.map_T_base, (state.association, state.estimate.positions)
-        return replace(state if state.hold == self.hold else state.released(self.hold), settled=False)
+        return replace(state.released(self.hold) if held else state, hold=self.hold, settled=False)
 
     def released(self, hold: bool) -> Self:
         """Return the state after one more solve, which estimates the shared errors again unless they are to `hold`."""

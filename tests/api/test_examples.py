@@ -74,7 +74,7 @@ def test_pushed_data_become_a_map(folder: Path) -> None:
 
 def test_boxes_of_another_detector_become_a_map(folder: Path) -> None:
     said = play("own_detector", folder / "red")
-    assert "ObjectMap of 1 objects" in said
+    assert "ObjectMap of 1 object " in said
     place: Any = [float(x) for x in said.split("at (")[1].split(")")[0].split(",")]
     np.testing.assert_allclose(place, (1.0, 0.5, 0.5), atol=0.05)
 

@@ -39,7 +39,7 @@ def corners(result):
 
 
 def test_a_table_has_the_quaternion_and_the_size(result):
-    rows = list(csv.DictReader(io.StringIO(EXPORT.dump(SimpleNamespace(objects=result.map.objects)).decode())))
+    rows = list(csv.DictReader(io.StringIO(EXPORT.dump(SimpleNamespace(objects=result.map)).decode())))
     found = Rotation.from_quat([float(rows[0][f"tag_q{axis}"]) for axis in "xyzw"])
     assert (found.inv() * TURN).magnitude() < 1e-12
     assert (float(rows[0]["tag_size"]), float(rows[0]["tag_size_sigma"])) == (SIDE, 0.002)
