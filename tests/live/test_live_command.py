@@ -259,3 +259,11 @@ def test_what_a_source_cannot_be_and_what_an_option_cannot_do(log, tmp_path):
     done = subprocess.run(command("stdin", tmp_path / "b", *more), input="", capture_output=True, text=True, timeout=LIMIT)
     for option in (*more[:-1:2], "--rectified"):
         assert f"warning: {option} has no meaning for stdin" in done.stderr
+
+
+def test_a_closed_standard_input_is_said(tmp_path):
+    command = f"{sys.executable} -m objslam live stdin -o {tmp_path / 'out'} <&-"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "standard input is closed" in done.stderr
+    assert "internal error" not in done.stderr

@@ -91,30 +91,60 @@ def test_more_rays_that_are_noisier_are_no_better_map():
     assert state(80, 100.0).explained == 0  # 0.5 rad, more than a view
 
 
-@pytest.mark.parametrize("first", [0, 1])
-def test_of_associations_that_take_turns_the_one_that_explains_more_rays_counts(monkeypatch, first):
-    """One of them has an object more. Which one returns first is chance."""
-    shared = np.zeros(20, dtype=np.int64)
-    found = [Association(np.append(shared, np.full(10, more)), shared[: 1 + (more > 0)]) for more in (-1, 1)]
-    turns = [found[first], found[1 - first], found[first]]
+def taking_turns(monkeypatch, turns, errors=None):
+    """A state whose rounds find these associations, and the list of whether each of its solves held the shared errors."""
     rays = SimpleNamespace(sigma=np.full(30, 0.01))
     keyframes = SimpleNamespace(base_T_camera=np.eye(4)[None])
     settings = load_settings(None, ("mode=joint", "output.recording=false"))
-    begin = JointState(keyframes, rays, keyframes, rays, (), settings, Ledger(), lambda *_: None, None, None)
-    begin = replace(begin, association=Association(np.full(30, -1), shared[:0]))
-    monkeypatch.setattr(JointState, "_associate", lambda state, *_: turns[len(state.rounds)])
-    monkeypatch.setattr(JointState, "merged", lambda state: state)
+    begin = JointState(keyframes, rays, keyframes, rays, (), settings, Ledger(), lambda *_: None, None, errors)
+    held = []
 
     def solve(state, why, association, start):
+        held.append(state.hold)
         weight = (association.object >= 0).astype(float)
         estimate = SimpleNamespace(weight=weight, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
         return replace(state, association=association, estimate=estimate)
 
+    monkeypatch.setattr(JointState, "_associate", lambda state, *_: turns[len(state.rounds)])
+    monkeypatch.setattr(JointState, "merged", lambda state: state)
     monkeypatch.setattr(JointState, "solve", solve)
+    return replace(begin, association=Association(np.full(30, -1), np.zeros(0, dtype=np.int64))), held
+
+
+@pytest.fixture
+def two():
+    """Two associations of 30 rays, of which the second has an object more."""
+    shared = np.zeros(20, dtype=np.int64)
+    return [Association(np.append(shared, np.full(10, more)), shared[: 1 + (more > 0)]) for more in (-1, 1)]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_associations_that_take_turns_the_one_that_explains_more_rays_counts(monkeypatch, two, first):
+    """Which one returns first is chance."""
+    begin, _ = taking_turns(monkeypatch, [two[first], two[1 - first], two[first]])
     chosen = begin.alternated(np.eye(4)[None], None)
     assert chosen.settled
-    assert chosen.association is found[1]
+    assert chosen.association is two[1]
     assert [one["rays_changed"] for one in chosen.rounds[1:]] == [10, 10]
+
+
+@pytest.mark.parametrize(
+    ("turns", "expected"),
+    [
+        ([1, 1], [False]),
+        ([0, 1, 1, 1], [False, True, False]),
+        ([0, 1, 0, 0, 1], [False, True, False]),
+    ],
+    ids=["found at once", "settles", "takes turns"],
+)
+def test_the_last_solve_estimates_the_shared_errors(monkeypatch, two, turns, expected):
+    """The first solve estimates them. Later ones hold them, until the rounds end."""
+    begin, held = taking_turns(monkeypatch, [two[i] for i in turns], errors=SimpleNamespace())
+    monkeypatch.setattr(JointState, "explained", property(lambda state: (state.association.object >= 0).sum()))
+    chosen = begin.alternated(np.eye(4)[None], None)
+    assert chosen.settled
+    assert not chosen.hold
+    assert held == expected
 
 
 def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from objslam.core.diagnostics import Ledger
+from objslam.errors import ObjslamError
 from objslam.sources import SourceOptions
 from objslam.sources.options import DETECTOR, Option
 from objslam.sources.ros_bag.options import RosOptions
@@ -109,6 +110,8 @@ def _stdin(sink: Sink, settings: Settings, options: object, wait: Wait | None) -
 
     from objslam.live.adapters.stdin import StdinAdapter
 
+    if sys.stdin is None:
+        raise ObjslamError("standard input is closed", hint="pipe JSON lines into it, or give a file: < messages.jsonl")
     return Feed(StdinAdapter(sink, sys.stdin.buffer, wait=wait))
 
 
@@ -118,7 +121,7 @@ def _is_file() -> bool:
     import stat
     import sys
 
-    return stat.S_ISREG(os.fstat(sys.stdin.fileno()).st_mode)
+    return sys.stdin is not None and stat.S_ISREG(os.fstat(sys.stdin.fileno()).st_mode)
 
 
 def _dds(sink: Sink, settings: Settings, options: DdsOptions, wait: Wait | None) -> Feed:
