@@ -172,6 +172,10 @@ class CalibratedMeasurements(Protocol):
         """The noise of the measurements, as factors on the nominal noise."""
 
     @property
+    def odometry_stamps(self) -> Floats:
+        """(n,) s, the stamps of the odometry, empty without odometry."""
+
+    @property
     def unknown_noise(self) -> frozenset[str]:
         """The kinds of noise that are estimated: any of `rays`, `ranges` and `odometry`."""
 

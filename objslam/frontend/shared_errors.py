@@ -81,6 +81,11 @@ class SharedErrors:
         scales = {"odometry.scale"} | ({"range_scale"} if np.isfinite(self.rays.range).any() else set())
         return frozenset(scales) if scales <= set(self.names) else frozenset()
 
+    @property
+    def odometry_stamps(self) -> Floats:
+        """(n,) s, the stamps of the odometry, empty without odometry."""
+        return np.zeros(0) if self.log.odometry is None else self.log.odometry.stamps
+
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same measurements with other noise."""
         return replace(self, noise=noise)

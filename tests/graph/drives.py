@@ -12,13 +12,24 @@ from objslam.config import Odometry, Settings, load_settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
-from objslam.core.geometry import align, angles_off, interpolate
-from objslam.core.types import Association, Keyframes, Log, Rays, Trajectory
+from objslam.core.geometry import align, angles_off, interpolate, lift_se2
+from objslam.core.types import (
+    Association,
+    Camera,
+    CameraLog,
+    Detections,
+    Keyframes,
+    Log,
+    Rays,
+    Trajectory,
+    Truth,
+    TruthObject,
+)
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.graph.batch_solver import solve_fixed, solve_joint
 from objslam.graph.fixed_pose_triangulation import triangulate_at
-from objslam.simulation import preset, simulate
+from objslam.simulation import make_camera, preset, simulate
 
 ODOMETRY_ALONE: dict[str, Any] = {"localization": None, "odometry": Odometry()}
 
@@ -94,3 +105,43 @@ def _stretched(log: Log, stretch: float) -> Log:
     poses = log.odometry.poses.copy()
     poses[:, :3, 3] = poses[0, :3, 3] + stretch * (poses[:, :3, 3] - poses[0, :3, 3])
     return replace(log, odometry=Trajectory(log.odometry.stamps, poses))
+
+
+def circle_log(
+    seed: int, frames: int, clock: float, *, radius: float = 4.0, turn_noise: float = 0.004, commanded: bool = False
+) -> Log:
+    """Laps on a circle at one speed, between 40 labelled objects. The odometry has one pose a frame, and measures each step.
+
+    commanded: whether the odometry has the commanded steps, and the robot the noise.
+    clock: how much later, in s, the camera's stamps are than the odometry's. turn_noise: rad a step.
+    """
+    rng = np.random.default_rng(seed)
+    apart, speed, focal = 0.2, 0.5, 400.0
+    stamps = apart * np.arange(frames)
+    turn, arc = speed * stamps / radius, speed * apart
+    path = np.column_stack([radius * np.sin(turn), radius * (1 - np.cos(turn)), turn])
+    steps = np.array([arc, 0.0, arc / radius]) + rng.normal(size=(frames - 1, 3)) * [0.004, 0.002, turn_noise]
+    yaw = np.append(0.0, np.cumsum(steps[:, 2]))
+    c, s = np.cos(yaw[:-1] + steps[:, 2] / 2), np.sin(yaw[:-1] + steps[:, 2] / 2)
+    ways = np.column_stack([c * steps[:, 0] - s * steps[:, 1], s * steps[:, 0] + c * steps[:, 1]])
+    said = np.column_stack([np.vstack([np.zeros(2), np.cumsum(ways, axis=0)]), yaw])
+    if commanded:
+        path, said = said, path
+    around, out = rng.uniform(0, 2 * np.pi, 40), radius + rng.choice([-1, 1], 40) * rng.uniform(1, 2.5, 40)
+    points = np.column_stack([out * np.sin(around), radius - out * np.cos(around), rng.uniform(0.2, 1.0, 40)])
+    base_T_camera = make_camera(position=(0.0, 0.0, 0.5)).base_T_camera
+    there = lift_se2(path) @ base_T_camera
+    seen = np.einsum("kji,knj->kni", there[:, :3, :3], points - there[:, None, :3, 3])
+    pixel = focal * seen[..., :2] / np.maximum(seen[..., 2:], 1e-6) + [640.0, 360.0]
+    inside = (seen[..., 2] > 0.5) & (seen[..., 2] < 6) & ((pixel > 40) & (pixel < [1240, 680])).all(axis=2)
+    frame, label = np.nonzero(inside)
+    middle = pixel[inside] + rng.normal(scale=1.0, size=(len(frame), 2))
+    depth = seen[..., 2][inside] * (1 + rng.normal(scale=0.02, size=len(frame)))
+    names = tuple(f"object {i}" for i in range(40))
+    boxes, none = np.hstack([middle - 10, middle + 10]), np.full(len(frame), -1)
+    whole = np.ones(len(frame))
+    found = Detections(stamps - clock, frame, boxes, label, whole, depth, none, names, whole=True)
+    matrix = np.array([[focal, 0, 640.0], [0, focal, 360.0], [0, 0, 1]])
+    camera = Camera("front", 1280, 720, matrix, base_T_camera=base_T_camera, sees_size=False)
+    truth = Truth(tuple(TruthObject(i, names[i], points[i]) for i in range(40)), Trajectory(stamps, lift_se2(path)))
+    return Log(name="circle", cameras=(CameraLog(camera, found),), odometry=Trajectory(stamps, lift_se2(said)), truth=truth)

@@ -16,7 +16,8 @@ from objslam.core.types import Keyframes
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
-from objslam.graph.calibration.shared_error_jacobian import Linearised, linearise
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.shared_error_jacobian import linearise
 from objslam.graph.factors.bearing import bearings, ray_residuals, tangent_basis
 from objslam.graph.factors.range import ranges
 from objslam.graph.multiframes import TOGETHER, Multiframes

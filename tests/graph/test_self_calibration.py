@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from drives import drive_of
+from drives import circle_log, drive_of
 from numpy.testing import assert_allclose
 
 from objslam.config import Odometry, load_settings
@@ -14,7 +14,9 @@ from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
 from objslam.graph.calibration.correlated_errors import correlation_factors
-from objslam.graph.calibration.shared_error_jacobian import Linearised, linearise
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.noise_in_instruments import noise_shares
+from objslam.graph.calibration.shared_error_jacobian import linearise
 from objslam.graph.calibration.variance_components import TOGETHER
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import make_values, read_poses, with_points
@@ -72,8 +74,6 @@ def test_the_reduced_system_is_that_of_solving_anew(localization):
     every = np.ones(len(made.rays), dtype=bool)
     solved = Linearised(measured, made.association, poses, places, every)
     system = linearise(solved, errors, theta).reduce()
-    for k in range(len(theta)):
-        assert_allclose(linearise(solved, errors, theta, [k]).reduce().gradient, system.gradient[[k]], atol=1e-9)
     told = system.sensitivity[: 3 * len(places)].reshape(-1, 3, len(theta))
     for k, step in enumerate(0.1 * errors.steps):
         ahead, behind = (optimum(errors, theta + s * step * np.eye(len(theta))[k], made, (poses, places)) for s in (1, -1))
@@ -173,3 +173,39 @@ def test_errors_that_hang_together_make_the_gradient_less_certain():
     together = white.copy()
     together[: len(rows)] = rng.standard_normal(window.max() + 1)[window] * np.sign(pushes[: len(rows)])
     assert correlation_factors(state, replace(system, residual=together))[k] > 1.5
+
+
+@pytest.mark.parametrize("clock", [0.0, 0.07])
+def test_a_circle_at_one_speed_tells_no_clock_and_no_share_of_scale_and_bias(clock):
+    """The turns that the odometry measured too long or too short in all are one number, which landmarks tell exactly.
+
+    How much of it is a scale, and how much a bias, is unknown: both stay at their priors in proportion. So is the clock.
+    """
+    log = circle_log(0, 700, clock, turn_noise=0.008)
+    made = drive_of(log, load_settings(None, ("mode=joint",)))
+    errors = shared_errors(log, made.keyframes, made.rays, made.settings)
+    found = solve(made, errors).calibration
+    value, sigma = (dict(zip(found.names, one, strict=True)) for one in (found.values, found.sigma))
+    turn = np.unwrap(np.arctan2(log.odometry.poses[:, 1, 0], log.odometry.poses[:, 0, 0]))
+    rate = 0.5 / 4.0
+    too_long = (turn[-1] - turn[0]) / (rate * (log.odometry.stamps[-1] - log.odometry.stamps[0])) - 1
+    assert value["odometry.turn_scale"] + value["odometry.turn_bias"] / rate == pytest.approx(-too_long, abs=0.005)
+    assert abs(value["odometry.turn_bias"]) < 0.5e-3  # Half of the prior's sigma.
+    assert sigma["odometry.turn_bias"] > 0.9e-3
+    assert abs(value["front.clock"]) < 3 * sigma["front.clock"]
+    assert abs(value["front.clock"]) < 0.05  # The noise of the odometry would move it to its bound, 0.5 s.
+
+
+def test_only_measured_motions_have_noise_in_their_derivatives():
+    """Commands are smooth: what the robot did differently is in the residuals, but not in the odometry."""
+    shares = []
+    for commanded in (False, True):
+        log = circle_log(0, 200, 0.0, turn_noise=0.008, commanded=commanded)
+        made = drive_of(log, load_settings(None, ("mode=joint",)))
+        errors = shared_errors(log, made.keyframes, made.rays, made.settings)
+        theta, start = np.zeros(len(errors.names)), (made.map_T_base @ made.keyframes.base_T_camera, made.points)
+        poses, places, _, measured = optimum(errors, theta, made, start)
+        state = Linearised(measured, made.association, poses, places, np.ones(len(made.rays), dtype=bool))
+        shares.append(noise_shares(state, linearise(state, errors, theta), errors)[errors.names.index("front.clock")])
+    assert shares[0] > 0.5
+    assert shares[1] < 0.01

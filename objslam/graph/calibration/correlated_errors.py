@@ -7,7 +7,8 @@ variance of these sums. Noise need not be white inside a window (cluster-robust 
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.calibration.variance_components import TOGETHER
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.geometry import exp_se3
 from objslam.graph.assembly import Measurements
-from objslam.graph.calibration.shared_error_jacobian import Linearised, ReducedSystem
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
 from objslam.graph.optimizers import levenberg_marquardt
 from objslam.graph.outlier_rejection import supported
 from objslam.graph.variables import read_poses, with_points

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
-from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
+from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
@@ -20,6 +21,7 @@ from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.inner_solve import InnerSolve
+from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers
@@ -35,11 +37,9 @@ larger number ends it sooner, but then the residuals from which the noise is est
 _HALVINGS = 3
 """The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
-_LEAST_SIGNAL = 0.05
-"""The least share of signal in the information about a clock or odometry scale. A smaller share takes larger steps."""
 _RIDGE = 1e-9
-"""The share of the information about the clocks that is added to its diagonal. It prevents a division by zero if a log
-cannot tell two clocks apart. A larger share mixes such clocks more."""
+"""The share of the variance of a gradient that is added to its diagonal. It prevents a division by zero if a log cannot tell
+two parameters apart. A larger share mixes such parameters more."""
 
 _NOISE_ROUNDS = 3
 """The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
@@ -47,8 +47,8 @@ _SAME_NOISE = 0.1
 """The relative change of the noise below which it is not estimated again. A larger value ends sooner."""
 
 _SAME_SHARES = 0.5
-"""The relative change of the noise below which the shares of noise in the information stay as they were. These shares change
-slowly with the noise, and take two inner solves for each clock. A larger value measures them less often."""
+"""The relative change of the noise below which its shares in the information stay as they were. They change slowly with the
+noise. A larger value computes them less often."""
 
 _LEAST_GROWTH = 0.5
 """The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
@@ -56,8 +56,6 @@ _LEAST_GROWTH = 0.5
 _FAR = 3.0
 """Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
 determined landmarks count too."""
-_SHRINKINGS = 30
-"""The most reductions of the noise in the information until the curvature is positive. More reductions keep less noise."""
 
 Measure = Callable[[Keyframes, Rays, Settings], Measurements]
 """A function that collects the measurements of keyframes and rays with the noise of the settings."""
@@ -104,17 +102,16 @@ def calibrate(
         fit = replace(fit, errors=fit.errors.with_noise(noise))
         state = fit.remeasured(state, theta).settled()
         if nearly or not same:
-            at = fit.shared_errors(state, theta, _CONVERGED, at.noisy if noise.like(before, _SAME_SHARES) else None)
+            at = fit.shared_errors(state, theta, _CONVERGED, at.noise if noise.like(before, _SAME_SHARES) else None)
             state, theta, steps, nearly = at.state, at.theta, steps + at.steps, False
         if same:
             break
     nothing = np.zeros(len(state.used), dtype=bool)
     final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
     state = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used).ordered()
-    system = linearise(state, fit.errors, theta)
+    system = linearise(state, fit.errors, theta, at.noise)
     reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
-    prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
-    _, covariance = _curvature(reduced.information, at.noisy, prior, correlation_factors(state, system))
+    covariance = _covariance(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
     sensitivity = np.full((association.count, 3, len(theta)), np.nan)
     by_landmark = (len(state.landmarks), 3, len(theta))
     sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
@@ -127,14 +124,52 @@ def calibrate(
 class _Found:
     """The parameters theta (P,) that fit best, and the solution at them.
 
-    system: the linear system at the solution. noisy: (P, P) from `noise_shares`. steps: the number of outer steps.
+    system: the linear system at the solution. noise: (P,) from `noise_shares`. steps: the number of outer steps.
     """
 
     theta: Floats
     state: InnerSolve
     system: LinearSystem
-    noisy: Floats
+    noise: Floats
     steps: int
+
+
+@dataclass(frozen=True)
+class _Outer:
+    """The outer problem at parameters theta (P,).
+
+    gradient: (P,) and information: (P, P) of the likelihood. curvature: (P, P) the information with the prior. step: (P,) of
+    Gauss-Newton.
+    """
+
+    state: InnerSolve
+    theta: Floats
+    linear: LinearSystem
+    system: ReducedSystem
+    gradient: Floats
+    information: Floats
+    curvature: Floats
+    step: Floats
+
+    @cached_property
+    def deviations(self) -> Floats:
+        """(P,) the standard deviations of the parameters."""
+        return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(self.curvature))))
+
+    @property
+    def left(self) -> float:
+        """The decrease of the cost that the step promises."""
+        return float(self.step @ self.curvature @ self.step) / 2
+
+    def converged(self, step: Floats, share: float) -> bool:
+        """Return whether a step (P,) is below this share of the standard deviations."""
+        return bool((np.abs(step) < share * self.deviations).all())
+
+    def cost_of_signal(self, cost: float, other: Floats) -> float:
+        """Return the cost at other parameters (P,) without noise of the odometry, which pulls at them and bends the cost."""
+        moved = other - self.theta
+        bent = self.system.information - self.information
+        return float(cost - (self.gradient - self.system.descent) @ moved - moved @ bent @ moved / 2)
 
 
 @dataclass(frozen=True)
@@ -150,120 +185,93 @@ class _Fit:
         """The weight of the nominal noise: it counts like this number of residuals."""
         return self.errors.settings.noise.prior
 
-    def shared_errors(self, state: InnerSolve, theta: Floats, converged: float, noisy: Floats | None = None) -> _Found:
+    def shared_errors(self, state: InnerSolve, theta: Floats, converged: float, noise: Floats | None = None) -> _Found:
         """Return the parameters that fit best. The search starts at theta (P,).
 
-        converged: the number of posterior standard deviations below which a step ends the search. noisy: from
+        converged: the number of posterior standard deviations below which a step ends the search. noise: (P,) from
         `noise_shares`, if known.
         """
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
         sigma = np.sqrt(np.diagonal(errors.prior))
         if len(theta) == 0:
-            return _Found(theta, state, linearise(state, errors, theta), errors.prior, 0)
+            return _Found(theta, state, linearise(state, errors, theta), theta, 0)
 
         def deviation(values: Floats) -> float:
             """Return half the squared Mahalanobis distance of parameters (P,) from their prior."""
             return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
 
-        history: list[tuple[Floats, Floats]] = []
-        steps = 0
-        while True:
-            linear = linearise(state, errors, theta)
+        shares = noise_shares(state, linearise(state, errors, theta), errors) if noise is None else noise
+
+        def at(state: InnerSolve, theta: Floats) -> _Outer:
+            linear = linearise(state, errors, theta, shares)
             system = _without_shrinking(state, linear.reduce(), errors, theta)
-            noisy = self.noise_shares(state, system, theta) if noisy is None else noisy
-            if steps == _ROUNDS:
-                break
-            curvature, covariance = _curvature(system.information, noisy, prior)
-            step = np.asarray(np.linalg.solve(curvature, system.gradient - prior @ (theta - errors.mean)), dtype=np.float64)
-            pull = system.gradient - system.descent
-            deviations = np.sqrt(np.diagonal(covariance))
-            if (np.abs(step) < converged * deviations).all():
-                break
-            history = [*history[-MEMORY:], (theta, step)]
+            weights, information = _likelihood(system)
+            gradient = weights @ system.gradient
+            step = np.linalg.solve(information + prior, gradient - prior @ (theta - errors.mean))
+            return _Outer(state, theta, linear, system, gradient, information, information + prior, np.asarray(step))
+
+        now, history, steps = at(state, theta), list[tuple[Floats, Floats]](), 0
+        while steps < _ROUNDS and not now.converged(now.step, converged):
+            history = [*history[-MEMORY:], (now.theta, now.step)]
             target = accelerated(history, sigma)
-            before, better = state.cost + deviation(theta), None
+            before, better = now.state.cost + deviation(now.theta), None
             for _ in range(_HALVINGS + 1):
                 other = np.clip(target, -errors.bounds, errors.bounds)
-                trial = state.predicted(system, other - theta, self.measure(*errors.at(other))).solved()
-                if trial.cost + deviation(other) - pull @ (other - theta) <= before:
-                    better = trial
+                trial = now.state.predicted(now.system, other - now.theta, self.measure(*errors.at(other))).solved()
+                after = at(trial.settled(), other)
+                # The noise of the odometry makes the cost rugged along the clocks. There, the gradient tells more.
+                if now.cost_of_signal(trial.cost + deviation(other), other) <= before or after.left < now.left / 2:
+                    better = after
                     break
-                target, history = theta + (target - theta) / 2, []
-                if (np.abs(target - theta) < converged * deviations).all():
+                target, history = now.theta + (target - now.theta) / 2, []
+                if now.converged(target - now.theta, converged):
                     break
             if better is None:
                 break
-            theta, state, steps = other, better.settled(), steps + 1
+            now, steps = better, steps + 1
             if self.trace is not None:
-                self.trace.base_T_camera = state.measured.keyframes.base_T_camera
-                moved = Parameters(errors.names, theta, deviations)
-                self.trace.iteration("solve", state.cost, state.map_T_camera, state.positions, moved)
-        return _Found(theta, state, linear, noisy, steps)
-
-    def noise_shares(self, state: InnerSolve, system: ReducedSystem, theta: Floats) -> Floats:
-        """Return the part (P, P) of the information that comes from noise. Entry i, j is divided by sqrt(I_ii I_jj).
-
-        Only clocks and odometry scales have such a part. The derivative of a motion by a clock is a difference of measured
-        velocities. The noise of the velocities is in the Jacobian, and makes its square too large. But the noise does not
-        affect the change of the gradient between two values of the clock. The clocks of several cameras share this noise.
-        """
-        noisy = np.diag(1 - np.maximum(system.signal, _LEAST_SIGNAL))
-        clocks = np.flatnonzero([kind(name) == "clock" for name in self.errors.names])
-        if not len(clocks):
-            return noisy
-        change = np.zeros((len(clocks), len(clocks)))
-        for i, k in enumerate(clocks.tolist()):
-            step = self.errors.steps[k] * np.eye(len(theta))[k]
-            ahead, behind = (self.gradient(state, system, theta, at, clocks.tolist()) for at in (step, -step))
-            change[:, i] = (behind - ahead) / (2 * self.errors.steps[k])
-        scale = np.sqrt(np.maximum(np.diagonal(system.information)[clocks], 1e-300))
-        block = np.ix_(clocks, clocks)
-        whole = system.information[block] / np.outer(scale, scale) + _RIDGE * np.eye(len(clocks))
-        root = np.linalg.cholesky(whole)
-        told = np.linalg.solve(root, np.linalg.solve(root, change / np.outer(scale, scale)).T)
-        size, axes = np.linalg.eigh((told + told.T) / 2)
-        lost = root @ (axes * (1 - np.clip(size, _LEAST_SIGNAL, 1.0)))
-        noisy[block] = lost @ (root @ axes).T
-        return noisy
-
-    def gradient(self, state: InnerSolve, system: ReducedSystem, theta: Floats, step: Floats, which: list[int]) -> Floats:
-        """Return the gradient by the parameters `which` (indices) at the optimum after a step (P,) of all parameters."""
-        side = state.predicted(system, step, self.measure(*self.errors.at(theta + step))).solved()
-        return linearise(side, self.errors, theta + step, which).reduce().gradient
+                self.trace.base_T_camera = now.state.measured.keyframes.base_T_camera
+                shown = Parameters(errors.names, now.theta, now.deviations)
+                self.trace.iteration("solve", now.state.cost, now.state.map_T_camera, now.state.positions, shown)
+        return _Found(now.theta, now.state, now.linear, shares, steps)
 
     def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
         """Return the optimum for the measurements with the present noise."""
         return state.measuring(self.measure(*self.errors.at(theta))).solved()
 
 
-def _curvature(information: Floats, noisy: Floats, prior: Floats, wider: Floats | float = 1.0) -> tuple[Floats, Floats]:
-    """Return the curvature (P, P) of the profile of the cost, and the covariance (P, P) of the parameters.
+def _likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:
+    """Return the weights (P, P) of the system's gradient, and the information (P, P) that it has about the parameters.
 
-    noisy: (P, P) from `_Fit.noise_shares`, the noise in the information. The curvature comes from the signal alone, but the
-    variance of the gradient is the whole information. So the covariance is a sandwich (Huber 1967). It never exceeds the
-    covariance of the prior in any direction. wider: (P,) factors on the standard deviations of the gradient, for noise that
-    is not white.
-    SolveError if the information is not finite.
+    The gradient g is Gaussian: its mean is the slope C times the error of the parameters, and V is its variance. So the
+    weights are C' V^-1 and the information is C' V^-1 C (limited information likelihood; Kim 2002). They are 1 and C where
+    the sides have no noise. Where a side has only noise, V is large, C is small, and the log tells nothing: the parameters
+    stay at their prior. SolveError if the system is not finite.
     """
-    if not np.isfinite(information).all():
+    variance, slope = system.variance, system.slope
+    if not (np.isfinite(variance).all() and np.isfinite(slope).all()):
         raise SolveError("the information about the shared errors is not finite")
-    scale = np.sqrt(np.maximum(np.diagonal(information), 0.0))
-    noise = noisy * np.outer(scale, scale)
-    curvature = information - noise + prior
-    for _ in range(_SHRINKINGS):
-        if (np.linalg.eigvalsh(curvature) > 0).all():
-            break
-        noise = 0.8 * noise
-        curvature = information - noise + prior
-    else:
-        curvature = information + prior
-    inverse = np.linalg.inv(curvature)
+    size = np.sqrt(np.maximum(np.diagonal(variance), 1e-300))
+    scaled = variance / np.outer(size, size) + _RIDGE * np.eye(len(size))
+    weights = np.linalg.solve(scaled, slope / size[:, None]).T / size
+    information = weights @ slope
+    return np.asarray(weights), np.asarray((information + information.T) / 2)
+
+
+def _covariance(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats:
+    """Return the covariance (P, P) of the parameters, at most the covariance of their prior in every direction.
+
+    prior: (P, P) information. wider: (P,) factors on the standard deviations of the gradient, for noise that is not white.
+    With them, the covariance is a sandwich (Huber 1967).
+    """
+    weights, information = _likelihood(system)
+    inverse = np.linalg.inv(information + prior)
+    varies = weights @ (system.variance * np.outer(wider, wider)) @ weights.T + prior
     root = np.linalg.cholesky(prior)
-    varies = information * np.outer(wider, wider) + prior
     size, axes = np.linalg.eigh(root.T @ inverse @ varies @ inverse @ root)
     axes = np.linalg.solve(root.T, axes)
-    return curvature, np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
+    return np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
 
 
 def _without_shrinking(
@@ -290,4 +298,9 @@ def _without_shrinking(
     if not growing @ size > _LEAST_GROWTH:
         return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
     project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
-    return replace(system, gradient=project @ system.gradient, information=project @ system.information @ project.T)
+    return replace(
+        system,
+        gradient=project @ system.gradient,
+        slope=project @ system.slope @ project.T,
+        variance=project @ system.variance @ project.T,
+    )

@@ -15,7 +15,9 @@ from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import MOST_NOISE, NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
 from objslam.graph.calibration.anderson import MEMORY, accelerated
-from objslam.graph.calibration.shared_error_jacobian import Linearised, LinearSystem, from_neighbours
+from objslam.graph.calibration.instruments import from_neighbours
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry import motions
 from objslam.graph.least_squares.joint_rows import whitening

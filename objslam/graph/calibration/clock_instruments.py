@@ -1,0 +1,85 @@
+"""Instruments for the offsets of clocks: derivatives by the velocities of the solved path."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import adjoint, inverse, log_se3
+from objslam.graph.calibration.instruments import Motions
+from objslam.graph.calibration.linearised_graph import Linearised
+
+
+@dataclass(frozen=True)
+class ClockInstruments:
+    """The instruments of clocks as a linear function of the velocities of base at the K poses of a graph.
+
+    The derivative of a motion by a clock is the difference of the velocities at its ends. Measured velocities have noise,
+    and so have the residuals. The velocities of the solved path do not correlate with the residuals.
+
+    moved: for each clock, by the index of its parameter, the poses (K,) whose images have this clock. steps: (s,) the
+    motions in the graph. motions: None without odometry. back: (s, 6, 6) from twists before a motion to twists after it.
+    absolute: (a, 6, 6) from velocities to the rows of absolute poses, which begin at the row `first`. before, after: (K,)
+    the poses between which the velocity at a pose is measured. along: (K, 6, 6) from twists of `before` to twists of
+    `after`. seconds: (K,) between them, 0 without a measured motion. to_base: (K, 6, 6) from camera to base twists.
+    velocity: (K, 6) twists of base per s, with the rotation first.
+    """
+
+    moved: Mapping[int, Bools]
+    steps: Ints
+    motions: Motions | None
+    back: Floats
+    absolute: Floats
+    first: int
+    before: Ints
+    after: Ints
+    along: Floats
+    seconds: Floats
+    to_base: Floats
+    velocity: Floats
+
+    @classmethod
+    def of(cls, of: Linearised, moved: Mapping[int, Bools]) -> Self:
+        """Return the instruments of a graph."""
+        keyframes, graph = of.measured.keyframes, of.graph
+        path = of.map_T_camera @ inverse(keyframes.base_T_camera)
+        apart = np.where(keyframes.measured, np.maximum(np.diff(keyframes.stamps), 0.0), 0.0)
+        index, there = np.arange(len(path)), (apart > 0).astype(np.int64)
+        before, after = index - np.append(0, there), index + np.append(there, 0)
+        seconds = np.append(0.0, apart) + np.append(apart, 0.0)
+        moves = inverse(path[before]) @ path[after]
+        _, roots, _ = graph.absolute_roots(of.map_T_camera)
+        local = len(roots) == len(path)  # With a localisation. Otherwise, the only absolute pose is the first.
+        rate = np.where(seconds > 0, 1 / np.maximum(seconds, 1e-9), 0.0)
+        return cls(
+            moved,
+            graph.steps,
+            Motions.of(of) if len(graph.steps) else None,
+            adjoint(inverse(path[1:]) @ path[:-1])[graph.steps],
+            roots @ adjoint(inverse(keyframes.base_T_camera)) if local else np.zeros((0, 6, 6)),
+            graph.first_motion + 6 * len(graph.steps),
+            before,
+            after,
+            adjoint(inverse(moves)),
+            seconds,
+            adjoint(keyframes.base_T_camera),
+            log_se3(moves) * rate[:, None],
+        )
+
+    def put(self, instruments: Floats, clock: int, velocity: Floats) -> None:
+        """Write the instruments of a clock for velocities (K, 6, n) into columns (M, n)."""
+        own = np.where(self.moved[clock][:, None, None], velocity, 0.0)
+        if self.motions is not None:
+            change = own[1:][self.steps] - self.back @ own[:-1][self.steps]
+            instruments[self.motions.rows] = -self.motions.weighted(change)
+        if len(self.absolute):
+            rows = (self.absolute @ own).reshape(-1, own.shape[2])
+            instruments[self.first : self.first + len(rows)] = -rows
+
+    def changes(self, poses: Floats) -> Floats:
+        """Return the changes (K, 6, n) of the velocities for changes (K, 6, n) of the poses, twists of the cameras."""
+        moved = self.to_base @ poses
+        change = moved[self.after] - self.along @ moved[self.before]
+        return np.asarray(np.where(self.seconds > 0, 1 / np.maximum(self.seconds, 1e-9), 0.0)[:, None, None] * change)

@@ -1,0 +1,105 @@
+"""Instruments for the scales of the odometry: the neighbours of a motion predict it without its own noise."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import adjoint
+from objslam.graph.calibration.linearised_graph import Linearised
+
+ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
+"""Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
+_ALIKE = 3.0
+"""The largest ratio of the variances that neighbours predict to the own variances of a motion, and of the reverse. With a
+larger ratio, motions that differ from their neighbours make the parameters less certain: with 10, the clock of a robot that
+often stands had a standard deviation five times as large. With a smaller ratio, the noise of a motion changes its weight."""
+
+
+@dataclass(frozen=True)
+class Motions:
+    """The measured motions in the graph: s twists of base, with the rotation first.
+
+    to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. weight: (s,) robust. covariance: (s, 6, 6) of the
+    twists, which neighbours predict. seconds: (s,) durations. rows: of the motions in the linear system.
+    """
+
+    to_twist: Floats
+    weight: Floats
+    covariance: Floats
+    seconds: Floats
+    rows: slice
+
+    @classmethod
+    def of(cls, of: Linearised) -> Self:
+        """Return the motions of a graph with odometry."""
+        keyframes, steps = of.measured.keyframes, of.graph.steps
+        robust, _ = of.graph.motion_weights(of.map_T_camera)
+        to_base = adjoint(keyframes.base_T_camera[1:][steps])
+        seconds = np.maximum(np.diff(keyframes.stamps)[steps], 0.0)
+        covariance = to_base @ of.measured.odometry()[1][steps] @ np.swapaxes(to_base, 1, 2)
+        near = from_neighbours(covariance.reshape(-1, 36), seconds).reshape(-1, 6, 6)
+        near = np.where((np.einsum("kii->k", near) > 0)[:, None, None], near, covariance)
+        to_twist = to_base @ np.linalg.inv(robust[:, None, None] * of.graph.motion_roots)
+        first = of.graph.first_motion
+        return cls(to_twist, robust, _alike(near, covariance), seconds, slice(first, first + 6 * len(steps)))
+
+    def twists(self, columns: Floats) -> Floats:
+        """Return the twists (s, 6, n) of columns (M, n) of the linear system."""
+        return self.to_twist @ columns[self.rows].reshape(len(self.seconds), 6, columns.shape[1])
+
+    def whitened(self, twists: Floats) -> Floats:
+        """Return the rows (6 s, n) of twists (s, 6, n)."""
+        return np.asarray(np.linalg.solve(self.to_twist, twists).reshape(6 * len(twists), twists.shape[2]))
+
+    def predicted(self, twists: Floats) -> Floats:
+        """Return the twists (s, 6, n) that neighbours predict for twists (s, 6, n)."""
+        return from_neighbours(twists.reshape(len(twists), -1), self.seconds).reshape(twists.shape)
+
+    def weighted(self, twists: Floats) -> Floats:
+        """Return the rows (6 s, n) whose product with the residuals weighs twists (s, 6, n) by the covariance."""
+        weighted = self.weight[:, None, None] ** 2 * np.linalg.solve(self.covariance, twists)
+        return np.asarray((np.swapaxes(self.to_twist, 1, 2) @ weighted).reshape(6 * len(twists), twists.shape[2]))
+
+
+def motion_instruments(of: Linearised, names: Sequence[str], sides: Floats) -> Floats:
+    """Return instruments (M, p): the sides, but without the noise of motions in scales of the odometry, and in weights.
+
+    The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
+    if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is independent
+    (instrumental variables; Fuller 1987, 1.4). The noise is also in the weight, because longer motions have more noise. So
+    motions that were measured too short would weigh more, and bias all columns. Hence the neighbours also predict the
+    covariance, within limits (`_ALIKE`), because a motion between two stands has no like neighbours.
+    """
+    instruments = sides.copy()
+    if len(of.graph.steps):
+        motions, scales = Motions.of(of), [k for k, name in enumerate(names) if name in ODOMETRY_SCALES]
+        twists = motions.twists(sides)
+        twists[..., scales] = motions.predicted(twists[..., scales])
+        instruments[motions.rows] = motions.weighted(twists)
+    return instruments
+
+
+def _alike(near: Floats, covariance: Floats) -> Floats:
+    """Return covariances (s, 6, 6) like `near`, but with variances that differ from `covariance` at most by `_ALIKE`."""
+    root = np.linalg.cholesky(covariance)
+    back = np.linalg.inv(root)
+    size, axes = np.linalg.eigh(back @ near @ np.swapaxes(back, 1, 2))
+    axes = root @ axes
+    return (axes * np.clip(size, 1 / _ALIKE, _ALIKE)[:, None]) @ np.swapaxes(axes, 1, 2)
+
+
+def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
+    """Predict motions (n, D) at the rate of four motions near each: two before, two after. seconds: (n,) the durations.
+
+    The motions next to it do not count: they may share a step of the odometry with it, and so share its noise.
+    """
+
+    def near(values: Floats) -> Floats:
+        padded = np.pad(values, ((3, 3), (0, 0)))
+        return np.asarray(sum(padded[i : i + len(values)] for i in (0, 1, 5, 6)))
+
+    time = near(seconds[:, None])
+    return np.asarray(np.where(time > 0, near(motions) / np.maximum(time, 1e-9), 0.0) * seconds[:, None])

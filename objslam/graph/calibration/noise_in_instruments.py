@@ -1,0 +1,94 @@
+"""The noise of the odometry in the derivatives by scales and clocks."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.calibration import CalibratedMeasurements
+from objslam.core.geometry import inverse, log_se3
+from objslam.graph.calibration.instruments import Motions, from_neighbours
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.shared_error_jacobian import LinearSystem
+
+_AXES_OF = {"odometry.scale": (3, 4), "odometry.turn_scale": (2,)}
+"""The parts of a twist that these parameters make longer."""
+_PROBES = 4
+"""The number of random probes. More probes are more exact and slower. With 4, the error of a product is a small part of the
+standard deviation of the gradient."""
+
+
+def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasurements) -> Floats:
+    """Return the shares (P,) of the information that come from noise of the odometry.
+
+    Only scales of the odometry and clocks have such noise. For a scale, it is the product of the noise in the instrument and
+    in the eliminated side. Neighbours have independent noise, but the poses that are eliminated spread the noise of a motion
+    over the residuals of its neighbours. For a clock, it is the square of the noise in the eliminated side. The products are
+    traces, which random probes measure (Hutchinson 1990). A probe is a random walk at the stamps of the odometry, because
+    keyframes between two stamps share a step. The noise is at most as rough as the measured motions, and leaves at most the
+    residuals of the solution. Commanded motions are smooth: their residuals come from the robot and not from the
+    measurement, so the sides have no noise.
+    """
+    names, clocks = errors.names, system.clocks.moved
+    scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}
+    if not len(of.graph.steps) or not (scales or clocks):
+        return np.zeros(len(names))
+    motions, stamps, steps = Motions.of(of), of.measured.keyframes.stamps, of.graph.steps
+    sigma = np.sqrt(np.einsum("kii->ki", motions.covariance)) / np.sqrt(np.maximum(motions.seconds, 1e-9))[:, None]
+    walks = _random_walks(errors.odometry_stamps)
+    walk = np.diff(walks(stamps), axis=0)[steps]
+    rates = {}
+    for k, mine in clocks.items():
+        step = errors.steps[k]
+        rates[k] = np.diff(mine[:, None] * (walks(stamps + step) - walks(stamps - step)) / (2 * step), axis=0)[steps]
+    odometry = of.measured.keyframes.odom_T_base
+    assert odometry is not None
+    said = log_se3(inverse(odometry[:-1]) @ odometry[1:])[steps] / sigma
+    residual = system.left(system.residual[:, None])[motions.rows]
+    products = np.zeros(len(names))
+    for axis in (2, 3, 4):
+
+        def rows(steps: Floats, axis: int = axis) -> Floats:
+            """The rows (6 s, n) of noise (s, n) along the axis."""
+            noise = np.zeros((len(sigma), 6, steps.shape[1]))
+            noise[:, axis] = sigma[:, axis, None] * steps
+            return motions.whitened(noise)
+
+        probes = np.zeros((len(system.residual), _PROBES * (1 + len(clocks))))
+        probes[motions.rows] = rows(np.hstack([walk, *rates.values()]))
+        left = system.left(probes)[motions.rows]
+        along = rows(np.ones((len(sigma), 1)))
+        fits = _energy(along * residual) / max(_energy(along * left[:, :_PROBES]), 1e-12)
+        rough = _roughness(said[:, [axis]], motions.seconds) / max(_roughness(walk, motions.seconds), 1e-12)
+        size = min(rough**2, fits)
+        for k, axes in scales.items():
+            if axis in axes:
+                noise = np.zeros((len(sigma), 6, _PROBES))
+                noise[:, axis] = sigma[:, axis, None] * walk
+                told = motions.weighted(motions.predicted(noise))
+                products[k] += size * float((told * left[:, :_PROBES]).sum()) / _PROBES
+        for i, k in enumerate(rates):
+            part = slice(_PROBES * (i + 1), _PROBES * (i + 2))
+            products[k] += size * float((probes[motions.rows, part] * left[:, part]).sum()) / _PROBES
+    information = (system.left(system.sides) ** 2).sum(axis=0)
+    shares = products / np.maximum(information, 1e-300)
+    shares[list(clocks)] = np.clip(shares[list(clocks)], 0.0, 1.0)
+    return np.asarray(shares)
+
+
+def _random_walks(stamps: Floats) -> Callable[[Floats], Floats]:
+    """Return random walks with steps at `stamps` (m,), s, as a function of times (n,) with values (n, probes)."""
+    rng = np.random.default_rng(0)
+    steps = rng.standard_normal((len(stamps) - 1, _PROBES)) * np.sqrt(np.maximum(np.diff(stamps), 0.0))[:, None]
+    walks = np.vstack([np.zeros((1, _PROBES)), np.cumsum(steps, axis=0)])
+    return lambda at: np.column_stack([np.interp(at, stamps, walk) for walk in walks.T])
+
+
+def _roughness(motions: Floats, seconds: Floats) -> float:
+    """Return the median difference between motions (n, D) and their prediction by neighbours."""
+    return float(np.median(np.abs(motions - from_neighbours(motions, seconds))))
+
+
+def _energy(rows: Floats) -> float:
+    """Return the mean over the columns of the squared sums of the rows (6 n, D) of each motion."""
+    return float((rows.reshape(-1, 6, rows.shape[1]).sum(axis=1) ** 2).sum()) / rows.shape[1]
