@@ -208,7 +208,7 @@ def test_what_a_session_cannot_observe_stays_as_it_is():
 
 
 def test_a_worker_that_fails_costs_no_frame(log, monkeypatch):
-    monkeypatch.setattr("objslam.live.worker.Worker._run", lambda self, request: self._process.kill())
+    monkeypatch.setattr("objslam.live.worker.Worker._run", lambda self: self._process.kill())
     session = drive(log, settings_of("live.calibrate_from=80"))
     snapshot = session.snapshot()
     session.abort()
