@@ -34,6 +34,7 @@ import objslam
 from objslam.config import Odometry, load_settings
 from objslam.core.geometry import inverse
 from objslam.core.types import Log
+from objslam.live.session import low_latency
 from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
 from objslam.sources.journal.segments import NAME
@@ -209,6 +210,7 @@ def main() -> int:
     options = parser.parse_args()
     log, rows, spent = lap(options.odometry, options.frames), list[Hour](), Spent()
     first: tracemalloc.Snapshot | None = None
+    low_latency.configure()  # As `objslam live` does.
     if options.owners:
         tracemalloc.start()
     print(f"odometry at {options.odometry:g} Hz, frames at {options.frames:g} Hz; times in ms\n{_HEAD}", flush=True)
