@@ -3,6 +3,7 @@
     python tools/bench_soak.py                               # 24 hours of a robot in about 3 hours of CPU
     python tools/bench_soak.py --odometry 20 --frames 4      # the same day at lower rates, in about 30 minutes of CPU
     python tools/bench_soak.py --check                       # exit code 1 if something grows
+    python tools/bench_soak.py --hours 4 --owners 10         # and the lines of code whose memory grew most
 
 A robot drives the same lap of a room with 30 objects again and again, so every lap closes a loop. Its odometry drifts and
 comes at 200 Hz, and its boxes at 20 Hz. One box in 50 is false, so tracks begin and are lost. In every 10th lap the camera
@@ -23,14 +24,17 @@ import sys
 import tempfile
 import threading
 import time
+import tracemalloc
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+import objslam
 from objslam.config import Odometry, load_settings
 from objslam.core.geometry import inverse
 from objslam.core.types import Log
+from objslam.live.session import low_latency
 from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
 from objslam.sources.journal.segments import NAME
@@ -166,6 +170,16 @@ def measure(session: Session, folder: Path, hours: float, begin: float, spent: S
     )
 
 
+def told_owners(before: tracemalloc.Snapshot, most: int) -> list[str]:
+    """The lines of code whose memory has grown most since a snapshot, and the growth of all, one line each."""
+    grown = tracemalloc.take_snapshot().compare_to(before, "lineno")
+    package = str(Path(objslam.__file__).parent) + os.sep
+    named = [(one.size_diff / 1e6, one.count_diff, str(one.traceback[0]).removeprefix(package)) for one in grown]
+    named.sort(reverse=True)
+    rows = [f"{size:10.2f} MB {count:9d} blocks  {place}" for size, count, place in named[:most]]
+    return [*rows, f"{sum(size for size, _, _ in named):10.2f} MB in all"]
+
+
 def judge(rows: list[Hour], segment: float) -> list[str]:
     """What grew that should not have, one line each. segment: the largest size of the journal's open segment, MB."""
     settled = [row for row in rows if row.hour >= min(2.0, rows[-1].hour / 2)]
@@ -191,9 +205,14 @@ def main() -> int:
     parser.add_argument("--frames", type=float, default=20.0, help="the rate of the camera, frames per second")
     parser.add_argument("--every", type=float, default=1.0, help="the hours of the robot between two rows")
     parser.add_argument("--seconds", type=float, default=float("inf"), help="stop after this number of CPU seconds")
+    parser.add_argument("--owners", type=int, default=0, help="trace the memory (twice the CPU time), and name this many")
     parser.add_argument("--check", action="store_true", help="exit code 1 if something grows")
     options = parser.parse_args()
     log, rows, spent = lap(options.odometry, options.frames), list[Hour](), Spent()
+    first: tracemalloc.Snapshot | None = None
+    low_latency.configure()  # As `objslam live` does.
+    if options.owners:
+        tracemalloc.start()
     print(f"odometry at {options.odometry:g} Hz, frames at {options.frames:g} Hz; times in ms\n{_HEAD}", flush=True)
     with tempfile.TemporaryDirectory() as name:
         settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
@@ -210,9 +229,13 @@ def main() -> int:
                 rows.append(measure(session, Path(name), number * _LAP / 3600, begin, spent))
                 spent = Spent()
                 print(rows[-1], flush=True)
+                if options.owners and first is None:
+                    first = tracemalloc.take_snapshot()
         hours = number * _LAP / 3600
+        owners = told_owners(first, options.owners) if first is not None and len(rows) > 1 else []
         failure, counted, dropped = session.failure, session.counters.accepted(), session.counters.dropped()
         session.abort()
+    print(*owners, sep="\n", end="\n" if owners else "")
     for reason, count in (counted | dropped).items():
         print(f"{count:12d} {reason}")
     print(f"{hours:.2f} hours of the robot" + (f"; the session failed: {failure}" if failure else ""))

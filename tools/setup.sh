@@ -101,15 +101,44 @@ system_libraries() {
 }
 
 pip_install() {
-    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --constraint "$root/tools/constraints.txt" "$@"
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "$@"
 }
 
-# The ordinary torch brings several GB of CUDA. Without an NVIDIA GPU, take the CPU build, where its index can be reached.
+# Prints the packages of one set in tools/constraints.txt, with the hashes of their files.
+pinned() {
+    awk -v want="$1" '/^# set: /{here = $3 == want; next} here' "$root/tools/constraints.txt"
+}
+
+# Installs the packages that it reads, in the very files that were tested, and nothing else. No package may be built here,
+# because a build runs code that no hash covers.
+install_pinned() {
+    pip_install --require-hashes --no-deps --only-binary :all: --requirement /dev/stdin "$@"
+}
+
+# The ordinary torch brings several GB of CUDA. Without an NVIDIA GPU, take the CPU build, where it can be reached.
 small_torch() {
-    local index=https://download.pytorch.org/whl/cpu
-    [ -e /dev/nvidiactl ] && return
-    "$venv/bin/python" -c 'import sys, urllib.request; urllib.request.urlopen(sys.argv[1] + "/torch/", timeout=5)' "$index" 2>/dev/null || return 0
-    pip_install --extra-index-url "$index" torch || say "no CPU build of torch; taking the ordinary one"
+    local index=https://download.pytorch.org/whl/cpu from=()
+    [ "$(uname -s)" = Linux ] && [ ! -e /dev/nvidiactl ] || return 0
+    if "$venv/bin/python" -c 'import sys, urllib.request; urllib.request.urlopen(sys.argv[1] + "/torch/", timeout=5)' "$index" 2>/dev/null; then
+        from=(--extra-index-url "$index")
+    fi
+    pinned run | awk '/^[^ ]/{here = /^torch==/} here' | sed 's/^torch==[^ ]*/&+cpu/' | install_pinned "${from[@]}" 2>/dev/null ||
+        say "no CPU build of torch; taking the ordinary one"
+}
+
+# Whether the installed build of torch needs the packages of CUDA.
+needs_cuda() {
+    "$venv/bin/python" -c 'import importlib.metadata as m, sys; sys.exit(not any("nvidia" in r for r in m.requires("torch") or ()))'
+}
+
+install_all() {
+    small_torch
+    pinned run | install_pinned || return
+    if needs_cuda; then pinned cuda | install_pinned || return; fi
+    if [ "$want" = dev ]; then pinned dev | install_pinned || return; fi
+    # compat: a path that mypy and editors follow too; the default is an import hook that only Python sees
+    pip_install --no-index --no-deps --no-build-isolation --config-settings editable_mode=compat --editable "$root" &&
+        "$venv/bin/python" -m pip check --disable-pip-version-check >&2
 }
 
 case $want in run | dev) ;; *) die "use: tools/setup.sh [run|dev]" ;; esac
@@ -122,11 +151,7 @@ fi
 rm -f "$stamp"
 system_libraries
 say "installing objslam and what it needs into .venv (the first time, this takes some minutes)"
-small_torch
-extras="[open3d,torch]"
-[ "$want" = run ] || extras="[dev]"
-# compat: a path that mypy and editors follow too; the default is an import hook that only Python sees
-pip_install --config-settings editable_mode=compat --editable "$root$extras" || die "pip could not install everything: see above (the network is needed for the first set-up)"
+install_all || die "pip could not install everything: see above (the network is needed for the first set-up)"
 problem=$("$venv/bin/python" -c 'import open3d' 2>&1) || die "Open3D cannot be imported: $(tail -n 1 <<<"$problem")"
 echo "$key $want" >"$stamp"
 say "done"

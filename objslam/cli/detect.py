@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from objslam.cli.console import say
-from objslam.cli.options import Config, Json, Set, settings_of
+from objslam.cli.options import ClassNames, Config, Json, Set, settings_of
 
 
 def detect(
@@ -17,6 +17,7 @@ def detect(
     out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG file for the photo with the boxes drawn.")] = None,
     config: Config = None,
     set_: Set = None,
+    names: ClassNames = None,
     json: Json = False,
 ) -> None:
     """Try a detector on one photo: say how the model is read, and which boxes it finds. No log is needed."""
@@ -28,7 +29,7 @@ def detect(
     from objslam.output.plot.boxes_plot import draw_boxes
     from objslam.results.files import dump_json
 
-    settings = settings_of(None, config, set_)
+    settings = settings_of(None, config, set_, names=names)
     pixels = decode_colour(read_bytes(image))
     if pixels is None:
         raise LogError("this is no image, or it is too large", where=str(image))

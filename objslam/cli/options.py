@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
-from objslam.sources.options import DETECTOR, Option, flags
+from objslam.sources.options import DETECTOR, NAMES, Option, flags
 
 if TYPE_CHECKING:
     from objslam.config import Settings
@@ -69,6 +69,7 @@ Radius = Annotated[
     float, typer.Option("--radius", min=0.0, help="Maximum distance in m between a map object and its match in the truth.")
 ]
 DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
+ClassNames = Annotated[str | None, typer.Option(NAMES.flag, metavar=NAMES.metavar, help=NAMES.help)]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print warnings and errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs in place of text.")]
 CalibrationFile = Annotated[
@@ -76,15 +77,28 @@ CalibrationFile = Annotated[
 ]
 
 
-def settings_of(mode: str | None, config: Path | None, set_: list[str] | None, calibration: Path | None = None) -> Settings:
-    """Load the settings from --config, --set, --calibration and --mode. --set overrides --mode and --calibration. All three
-    override --config. A calibration file is read too, so that a wrong one fails before a long log is read."""
+def settings_of(
+    mode: str | None,
+    config: Path | None,
+    set_: list[str] | None,
+    calibration: Path | None = None,
+    names: str | None = None,
+) -> Settings:
+    """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides the others, which override
+    --config. Files of a calibration and of names are read too, so that a wrong one fails before a long log is read."""
     import yaml
 
     from objslam.config import load_settings
     from objslam.config.presets import find_config
 
-    more = () if calibration is None else (f"calibration.file={yaml.safe_dump(str(calibration.resolve()))}",)
+    more: tuple[str, ...] = ()
+    if calibration is not None:
+        more += (f"calibration.file={yaml.safe_dump(str(calibration.resolve()))}",)
+    if names is not None:
+        from objslam.frontend.class_names import KNOWN, load_names
+
+        load_names(names)
+        more += (f"detector.names={yaml.safe_dump(names if names in KNOWN else str(Path(names).resolve()))}",)
     settings = load_settings(
         None if config is None else find_config(config), ((f"mode={mode}",) if mode else ()) + more + tuple(set_ or ())
     )

@@ -89,7 +89,7 @@ def run(
     from objslam.core.diagnostics import Ledger
     from objslam.output.result_folder import output_folder
 
-    settings = settings_of(mode, config, set_, calibration)
+    settings = settings_of(mode, config, set_, calibration, options.class_names)
     ledger = Ledger()
     with output_folder(out):
         tell = _say_nothing if quiet else _say_json if json else say_result

@@ -3,7 +3,8 @@
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.geometry import interpolate, inverse, log_se3
+from objslam.core.geometry import interpolate, inverse, log_se3, twist_lengths
+from objslam.core.rotation import rotation_vector
 from objslam.core.types import Keyframes, Trajectory
 
 _SPAN = 0.4
@@ -22,6 +23,17 @@ def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
     moved = np.stack([np.linalg.norm(twist[:, 3:], axis=1), twist[:, 2]])
     speed, turn = np.divide(moved, span, out=np.zeros_like(moved), where=span > 0)
     return speed, turn
+
+
+def travel(poses: Floats) -> Floats:
+    """Return how far a path with poses (N, 4, 4) goes from each pose to the next: (N - 1, 3).
+
+    The columns are the length of the way, m, the size of the turn, rad, and the turn about the vertical axis with its sign,
+    rad. If poses are left out, the sum of the rows of several steps belongs to the step in their place.
+    """
+    turn, way = twist_lengths(inverse(poses[:-1]) @ poses[1:])
+    rotation = poses[:, :3, :3]
+    return np.stack([way, turn, rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))[:, 2]], axis=1)
 
 
 def correct_path(path: Trajectory, stamps: Floats, before: Floats, after: Floats) -> Trajectory:

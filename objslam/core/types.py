@@ -31,15 +31,19 @@ def _need(condition: Any, message: str) -> None:
 class Trajectory:
     """Poses of one coordinate frame in another over time.
 
-    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. Other values raise ValueError.
+    stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. travel: (N, 3) the sum of
+    `trajectory.travel` since the pose before, over all measured poses. None if no measured pose was left out. Other values
+    raise ValueError.
     """
 
     stamps: Floats
     poses: Floats
+    travel: Floats | None = None
 
     def __post_init__(self) -> None:
         n = len(self.stamps)
         _need(self.stamps.shape == (n,) and self.poses.shape == (n, 4, 4), "a trajectory needs (N,) stamps, (N, 4, 4) poses")
+        _need(self.travel is None or self.travel.shape == (n, 3), "a trajectory needs (N, 3) travel")
         _need(np.isfinite(self.stamps).all() and np.isfinite(self.poses).all(), "the values of a trajectory must be finite")
         _need((np.diff(self.stamps) > 0).all(), "the stamps of a trajectory must increase")
 

@@ -36,7 +36,7 @@ def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log
 
 def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Trajectory:
     """Return the odometry with the lengths and the turns of its steps corrected. Its first pose stays."""
-    return Trajectory(odometry.stamps, CorrectablePath(odometry).poses(error))
+    return CorrectablePath(odometry).path(error)
 
 
 class CorrectablePath:
@@ -46,10 +46,23 @@ class CorrectablePath:
         """Measure the steps of the odometry."""
         self.odometry = odometry
         rotation, places = odometry.poses[:, :3, :3], odometry.poses[:, :3, 3]
-        turn = rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))[:, 2]  # About the vertical axis.
+        if odometry.travel is None:
+            turn = rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))[:, 2]  # About the vertical axis.
+        else:  # It may be several rounds.
+            turn = odometry.travel[1:, 2]
         self._turned = np.append(0.0, np.cumsum(turn))
         self._seconds = odometry.stamps - odometry.stamps[0]
         self._ways = np.ascontiguousarray(np.diff(places, axis=0).T)
+
+    def path(self, error: Mapping[str, float]) -> Trajectory:
+        """Return the corrected path, as `corrected_odometry` does."""
+        travel = self.odometry.travel
+        if travel is not None:
+            scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+            bias = turn_bias * np.diff(self._seconds, prepend=0.0)
+            turn = (1 + turn_scale) * travel[:, 2] + bias
+            travel = np.stack([(1 + scale) * travel[:, 0], np.abs(1 + turn_scale) * travel[:, 1], turn], axis=1)
+        return Trajectory(self.odometry.stamps, self.poses(error), travel)
 
     def poses(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
         """Return the corrected poses (n, 4, 4) with the indices `which`, or all poses, as `corrected_odometry` does."""

@@ -45,7 +45,7 @@ class DriftPath:
     """
 
     def __init__(self, odometry: Trajectory) -> None:
-        """Measure the steps of the odometry."""
+        """Measure the steps of the odometry. Where poses were left out, a step is as long as what was travelled in it."""
         self._odometry = odometry
         poses = odometry.poses
         start, places = poses[0, :3, :3], (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3]
@@ -56,8 +56,11 @@ class DriftPath:
         heading = poses[:, :3, 0] @ start[:, :2]
         c, s = (heading[1:] / np.maximum(np.linalg.norm(heading[1:], axis=1, keepdims=True), 1e-12)).T
         yaw = np.arctan2(heading[:, 1], heading[:, 0])
-        self._turn = np.abs((np.diff(yaw) + np.pi) % (2 * np.pi) - np.pi)
-        self._way = np.hypot(*np.diff(places[:, :2], axis=0).T) / np.sinc(self._turn / (2 * np.pi))
+        if odometry.travel is None:
+            self._turn = np.abs((np.diff(yaw) + np.pi) % (2 * np.pi) - np.pi)
+            self._way = np.hypot(*np.diff(places[:, :2], axis=0).T) / np.sinc(self._turn / (2 * np.pi))
+        else:
+            self._way, self._turn = odometry.travel[1:, 0], odometry.travel[1:, 1]
         px, py = places[1:, 0], places[1:, 1]
         one, none = np.ones_like(px), np.zeros_like(px)
         # How each variance of a step (of yaw, x, y) adds to the six distinct elements of the covariance, see `_PLANAR`.
@@ -77,7 +80,9 @@ class DriftPath:
             angle, x, y = (variance[:, None] * part for variance, part in zip(variances, self._parts, strict=True))
             steps = angle + x + y
         else:
-            steps = step_drift(inverse(odometry.poses[0]) @ odometry.poses, settings, False).reshape(-1, 36)
+            start_T_base, travel = inverse(odometry.poses[0]) @ odometry.poses, odometry.travel
+            lengths = None if travel is None else (travel[1:, 1], travel[1:, 0])
+            steps = step_drift(start_T_base, settings, False, lengths).reshape(-1, 36)
         total = np.zeros((len(odometry), steps.shape[1]))
         np.cumsum(steps, axis=0, out=total[1:])
         after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, len(odometry) - 1)
@@ -97,13 +102,16 @@ _PLANAR_TOLERANCE = 1e-6
 """The largest change (m, rad) of height, roll or pitch on a planar path, as in `geometry.is_planar`."""
 
 
-def step_drift(start_T_base: Floats, settings: Odometry, planar: bool) -> Floats:
+def step_drift(
+    start_T_base: Floats, settings: Odometry, planar: bool, lengths: tuple[Floats, Floats] | None = None
+) -> Floats:
     """Return the covariance (N-1, 6, 6), rotation first, of the noise of each step between poses (N, 4, 4).
 
     The covariance is in the frame `start`. The noise of a step grows with its length and with its angle. If `planar`, it
-    affects x, y and yaw of the base. If not, it affects all six directions.
+    affects x, y and yaw of the base. If not, it affects all six directions. lengths: (N-1,) rad and (N-1,) m, of each step.
+    Without them, they are those of the poses.
     """
-    turn, way = twist_lengths(inverse(start_T_base[:-1]) @ start_T_base[1:])
+    turn, way = lengths or twist_lengths(inverse(start_T_base[:-1]) @ start_T_base[1:])
     angle, x, y = _step_variances(turn, way, settings)
     none = np.zeros_like(way)
     noise = np.stack([none, none, angle, x, y, none] if planar else [angle, angle, angle, x, x, x], axis=1)

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Floats
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
@@ -240,13 +240,12 @@ class SharedErrors:
         needed = np.zeros(len(odometry), dtype=bool)
         needed[after - 1] = needed[np.minimum(after, len(odometry) - 1)] = True
         around = np.flatnonzero(needed)
-        path = Trajectory(odometry.stamps[around], self._corrected(error, around))
+        path = Trajectory(odometry.stamps[around], self._correctable().poses(self._of_odometry(error), around))
         return _at_stamps(path, stamps, self.settings.poses.max_gap)
 
-    def _corrected(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
-        """Poses (n, 4, 4) of the corrected odometry. Its distances compensate the shrinkage of the map, as the ranges do."""
-        named = dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
-        return self._correctable().poses(named, which)
+    def _of_odometry(self, error: Mapping[str, float]) -> dict[str, float]:
+        """The errors of the odometry. Its distances compensate the shrinkage of the map, as the ranges do."""
+        return dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
 
     def _correctable(self) -> CorrectablePath:
         odometry = self.log.odometry
@@ -259,7 +258,7 @@ class SharedErrors:
         """The steps of the corrected odometry, which give its drift."""
 
         def measured() -> DriftPath:
-            return DriftPath(Trajectory(self._correctable().odometry.stamps, self._corrected(error)))
+            return DriftPath(self._correctable().path(self._of_odometry(error)))
 
         return self._kept_drift.get(self._odometry_key(error), measured)
 

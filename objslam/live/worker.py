@@ -38,13 +38,15 @@ class Worker(Generic[Answer]):
         self._answer: Answer | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._thread: threading.Thread | None = None
+        self._waiting: list[bytes] = []  # The request until it is sent, because it may be large.
 
     def ask(self, request: Request[Answer]) -> None:
         """Send a request. The process must not have an earlier one whose `result` was not taken."""
         self._answer = None
         if self._process is None or self._process.poll() is not None:
             self._process = _start()
-        self._thread = threading.Thread(target=self._run, args=(pickle.dumps(request),), name="objslam worker", daemon=True)
+        self._waiting = [pickle.dumps(request)]
+        self._thread = threading.Thread(target=self._run, name="objslam worker", daemon=True)
         self._thread.start()
 
     @property
@@ -74,7 +76,7 @@ class Worker(Generic[Answer]):
             _reap(self._process)
         self._thread = self._process = None
 
-    def _run(self, request: bytes) -> None:
+    def _run(self) -> None:
         process = self._process
         if process is None or process.stdin is None or process.stdout is None:
             return
@@ -82,7 +84,7 @@ class Worker(Generic[Answer]):
         limit.daemon = True
         limit.start()
         with suppress(OSError):  # The process has ended.
-            _write(process.stdin, request)
+            _write(process.stdin, self._waiting.pop())
             answer = _read(process.stdout)
             if answer is not None:
                 self._answer = pickle.loads(answer)  # noqa: S301 - this program wrote it
@@ -118,7 +120,8 @@ def _reap(process: subprocess.Popen[bytes]) -> None:
 
 
 def _write(pipe: IO[bytes], content: bytes) -> None:
-    pipe.write(_LENGTH.pack(len(content)) + content)
+    pipe.write(_LENGTH.pack(len(content)))
+    pipe.write(content)
     pipe.flush()
 
 

@@ -110,7 +110,12 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
     source = choose(path, options.format)
     for flag in unused(options, SourceOptions, names(source.options, AnyOptions)):
         ledger.warn(f"{path}: {flag} has no meaning for a {source.name} recording")
-    return replace(source.reads(path, ledger, options), path=path.resolve())
+    log = replace(source.reads(path, ledger, options), path=path.resolve())
+    if options.class_names is None:
+        return log
+    from objslam.frontend.class_names import with_names
+
+    return with_names(log, options.class_names, ledger)
 
 
 def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, overwrite: bool = False) -> None:

@@ -29,14 +29,23 @@ DETECTOR = Option("--detector", "ONNX model that finds boxes in the rgb images. 
 """The option that chooses the detector, in `objslam run` and in live sessions."""
 
 
+NAMES = Option(
+    "--names",
+    "Names of classes that a log or a model only numbers: coco, coco91, or a file (a name in each line, or YAML or JSON).",
+    metavar="FILE|coco",
+)
+"""The option with the names of numbered classes, of all recordings, adapters and detectors."""
 _KINDS = "Kind of the recording: log, ros, mrclam, tum, tum_numbered, journal. [default: found from its content]"
 
 
 @dataclass(frozen=True)
 class AnyOptions:
-    """The options of every source. format: the name of the source. None chooses the source by the recording's content."""
+    """The options of every source. format: the name of the source. None chooses the source by the recording's content.
+    class_names: of `frontend.class_names.load_names`, for labels that are numbers. None keeps the numbers.
+    """
 
     format: Annotated[str | None, Option("--format", _KINDS)] = None
+    class_names: Annotated[str | None, NAMES] = None
 
 
 def names(*kinds: type[Any] | None) -> frozenset[str]:

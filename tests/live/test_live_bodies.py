@@ -59,7 +59,7 @@ def test_a_snapshot_has_the_bodies_of_its_objects(log, monkeypatch):
 
 def test_a_process_that_fails_leaves_points_and_is_not_asked_again(log, monkeypatch):
     asked = []
-    monkeypatch.setattr(Worker, "_run", lambda self, request: asked.append(len(request)))
+    monkeypatch.setattr(Worker, "_run", lambda self: asked.append(len(self._waiting)))
     monkeypatch.setattr("objslam.live.session.body_estimation._REST", 0.0)
     session = session_of(log)
     for _ in range(20):

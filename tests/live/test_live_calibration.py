@@ -12,7 +12,7 @@ from waiting import LIMIT
 
 from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
-from objslam.core.geometry import interpolate, lift_se2
+from objslam.core.geometry import lift_se2
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.corrected_log import OdometryCorrection
 from objslam.frontend.shared_errors import SharedErrors
@@ -20,7 +20,6 @@ from objslam.io.calibration_yaml import dump_calibration
 from objslam.live.adapters.replay import events
 from objslam.live.calibration.calibrator import observed
 from objslam.live.calibration.recalibration import recalibrate
-from objslam.live.mapper.tables import PathTable
 from objslam.live.session.session import Session
 from objslam.simulation import PoseNoise, preset, simulate
 from objslam.simulation.settings import DepthNoise
@@ -209,7 +208,7 @@ def test_what_a_session_cannot_observe_stays_as_it_is():
 
 
 def test_a_worker_that_fails_costs_no_frame(log, monkeypatch):
-    monkeypatch.setattr("objslam.live.worker.Worker._run", lambda self, request: self._process.kill())
+    monkeypatch.setattr("objslam.live.worker.Worker._run", lambda self: self._process.kill())
     session = drive(log, settings_of("live.calibrate_from=80"))
     snapshot = session.snapshot()
     session.abort()
@@ -250,22 +249,3 @@ def test_paths_that_stop_and_come_back_are_corrected(order, tmp_path):
     assert resumed.calibration.values.tolist() == snapshot.calibration.values.tolist()
     for one, other in zip(resumed.map.objects, snapshot.map.objects, strict=True):
         np.testing.assert_allclose(one.position, other.position, atol=1e-6)
-
-
-def test_a_long_path_keeps_few_poses_and_its_gaps(monkeypatch):
-    monkeypatch.setattr("objslam.live.mapper.tables._MOST_POSES", 1000)
-    stamps = np.concatenate([np.arange(0, 60, 0.005), np.arange(70, 100, 0.005)])
-    poses = lift_se2(np.stack([np.sin(stamps / 5), np.cos(stamps / 5), stamps / 5], axis=1))
-    table = PathTable(max_gap=1.1)
-    for stamp, pose in zip(stamps.tolist(), poses, strict=True):
-        table.append(stamp, pose)
-    assert len(table) <= 1000
-    kept = table.trajectory()
-    assert kept.stamps[0] == stamps[0]
-    assert kept.stamps[-1] == stamps[-1]
-    wide = np.diff(kept.stamps) > 1.1
-    assert wide.sum() == 1  # the gap is there, and no other
-    np.testing.assert_allclose(kept.stamps[np.flatnonzero(wide)[0]], 59.995, atol=0.01)
-    inside = (stamps < 59.9) | (stamps > 70.1)
-    found, _ = interpolate(kept.stamps, kept.poses, stamps[inside], np.inf)
-    np.testing.assert_allclose(found, poses[inside], atol=2e-3)  # 0.2 s apart, on a path that does not follow its heading

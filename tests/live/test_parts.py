@@ -63,7 +63,7 @@ def on_course(odometry, localization):
     course = Course(Settings())
     for stamp, by_odometry in sorted([*((s, True) for s in odometry), *((s, False) for s in localization)]):
         if by_odometry:
-            course.add_odometry(stamp, lift_se2(np.array([3.0, stamp, np.pi / 2])))
+            course.add_odometry(stamp, lift_se2(np.array([3.0, stamp, np.pi / 2])), KeyframeTable())
         else:
             course.localization.append(stamp, lift_se2(np.array([stamp, 0.0, 0.0])))
     return course
@@ -82,7 +82,7 @@ def test_what_places_a_frame_is_decided_by_the_poses_alone():
         assert dead.ready(0.15) == (stamp > 1.2)  # poses.max_gap later, the odometry counts as silent
     ahead = on_course([], [*rate[:30], 500.0])
     for stamp in rate[:60]:
-        ahead.add_odometry(stamp, np.eye(4))
+        ahead.add_odometry(stamp, np.eye(4), KeyframeTable())
     assert not ahead.ready(5.95)  # a localisation far ahead says nothing about the odometry
     assert ahead.ready(5.85)
 
@@ -110,7 +110,7 @@ def test_odometry_that_comes_back_waits_for_the_localisation_and_lies_as_it_says
     assert keyframes.by_odometry.tolist() == [True, True, False]
     assert keyframes.piece.tolist() == [0, 0, 1]
     for stamp in np.arange(6.0, 7.0, 0.1):
-        course.add_odometry(float(stamp), lift_se2(np.array([-stamp, 7.0, np.pi])))
+        course.add_odometry(float(stamp), lift_se2(np.array([-stamp, 7.0, np.pi])), keyframes)
     assert not course.ready(6.3)
     course.localization.append(6.0, lift_se2(np.array([6.0, 0.0, 0.0])))
     assert course.ready(6.3)  # the localisation has come to where the odometry begins, if not to the frame

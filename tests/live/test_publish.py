@@ -2,12 +2,17 @@
 
 import itertools
 import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
-from robot import messages
+from robot import LOOPBACK, messages
 from scipy.spatial.transform import Rotation
-from waiting import wait_for
+from waiting import LIMIT, wait_for
 
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import Snapshot
@@ -19,6 +24,7 @@ pytest.importorskip("cyclonedds")
 
 from objslam.live.dds.network import open_network
 from objslam.live.dds.publisher import TOPICS, DdsPublisher, messages_of
+from objslam.live.dds.types import layouts_of
 from objslam.output.export.map_messages import MapMessages
 
 _DOMAINS = itertools.count(90 + os.getpid() % 9)
@@ -103,6 +109,42 @@ def test_objects_and_path_reach_those_who_come_late(monkeypatch):
     assert [pose.header.stamp.nanosec for pose in path.poses] == [0, 100_000_000, 200_000_000]
     turn = path.poses[0].pose.orientation
     np.testing.assert_allclose([turn.x, turn.y, turn.z, turn.w], [0, 0, np.sin(0.2), np.cos(0.2)], atol=1e-12)
+
+
+def test_a_reader_that_stops_does_not_hold_the_session_up(monkeypatch):
+    """It acknowledges nothing any more. A message is larger than all that the library sends without an acknowledgement."""
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    domain = next(_DOMAINS)
+    publisher = DdsPublisher(open_network(domain))
+    writer, layout = publisher._writers["objects"], layouts_of(TOPICS["objects"])[0]
+
+    def message(x):
+        objects = (thing(1, "cup", [x, 0.0, 0.0]), *(thing(i, "c" * 100_000, [0.0] * 3) for i in range(2, 12)))
+        maker = MapMessages("map")
+        return layout(bytes(maker.store.serialize_cdr(maker.detections(1.0, objects), TOPICS["objects"])))
+
+    environment = {**os.environ, "CYCLONEDDS_URI": LOOPBACK, "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, str(Path(__file__).with_name("map_reader.py")), str(domain)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as reader:
+        try:
+            writer.write(message(1.0))
+            assert float(reader.stdout.readline()) == 1.0
+            os.kill(reader.pid, signal.SIGSTOP)
+            older, newest, written = message(2.0), message(3.0), threading.Event()
+
+            def write():
+                for _ in range(200):
+                    writer.write(older)
+                writer.write(newest)
+                written.set()
+
+            threading.Thread(target=write, daemon=True).start()
+            assert written.wait(LIMIT)
+            os.kill(reader.pid, signal.SIGCONT)
+            while float(reader.stdout.readline()) != 3.0:  # The newest map arrives when the reader goes on.
+                pass
+        finally:
+            reader.kill()
 
 
 def read_back(snapshot):

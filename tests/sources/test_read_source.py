@@ -167,3 +167,16 @@ def test_a_result_is_no_log(tmp_path):
         (tmp_path / name).write_text("{}")
     with pytest.raises(LogError, match="this is a result, not a log"):
         read(tmp_path, Ledger())
+
+
+def test_numbered_labels_get_names_while_any_recording_is_read(tmp_path):
+    box = '{"stamp": 1.5, "boxes": [[1, 2, 30, 40], [5, 6, 70, 80]], "labels": ["41", "99"], "scores": [0.9, 0.8]}\n'
+    folder, ledger = _write(_log(tmp_path / "log"), {"detections.jsonl": box}), Ledger()
+    found = read(folder, ledger, SourceOptions(class_names="coco")).cameras[0].detections
+    assert [found.label_names[label] for label in found.label] == ["cup", "99"]
+    assert [line for line in ledger.warnings if "class number" in line] == [
+        "1 box keeps a class number that coco does not name: 99"
+    ]
+    assert read(folder, Ledger()).cameras[0].detections.label_names == ("41", "99")
+    with pytest.raises(ConfigError, match="no names file"):
+        read(folder, Ledger(), SourceOptions(class_names="missing.txt"))

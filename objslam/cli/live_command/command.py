@@ -71,6 +71,7 @@ def live(
     from objslam.cli.run import NOT_LOCALISED
     from objslam.errors import ConfigError, OutputError
     from objslam.live.adapters.replay import ReplayAdapter
+    from objslam.live.class_names import NamedSink
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
     from objslam.results.files import RECORDING
@@ -82,7 +83,7 @@ def live(
         raise ConfigError("--resume needs the journal, and --no-journal disables it", hint="leave out one of them")
     if publish_tf and source == "rclpy":
         raise ConfigError("--publish-tf and rclpy: the session would hear its own tf", hint="use the source dds")
-    settings = settings_of("joint", config, set_, calibration)
+    settings = settings_of("joint", config, set_, calibration, options.class_names)
     _say_what_is_not_used(source, options, speed, publish or publish_tf)
     known = None if map_ is None else prior_map(map_)
     # The recording is read first, because it may be the journal in OUT, which is renamed below.
@@ -96,7 +97,8 @@ def live(
         stack.callback(session.abort)
         truth = None
         if recording is None:
-            feed = ADAPTERS[source].opens(session, settings, options, session.wait if patient else None)
+            sink = session if options.class_names is None else NamedSink(session, options.class_names, session.counters)
+            feed = ADAPTERS[source].opens(sink, settings, options, session.wait if patient else None)
         else:
             (log, ledger), newest = recording, lambda: session.newest
             adapter = ReplayAdapter(session, log, speed or None, session.wait, newest, ledger=ledger, settings=settings)
@@ -148,8 +150,7 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
     """Warn of the given options that have no effect on a source. `sources.read` checks the options for recordings."""
     adapter = ADAPTERS.get(source)
     taken = names(adapter.options if adapter else SourceOptions, NetworkOptions if publish else None)
-    if adapter is None:
-        taken |= {"detector"}
+    taken |= {"class_names"} if adapter else {"detector"}
     paced = speed == 0 if adapter and adapter.recorded else adapter is None
     for flag in unused(options, LiveOptions, taken) + (["--speed"] if speed != 1.0 and not paced else []):
         say(f"warning: {flag} has no meaning for {source if adapter else 'a recording'}", stderr=True)

@@ -71,9 +71,8 @@ class Calibrator:
         """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
-        self._asked: tuple[int, CalibrationRequest] | None = (
-            None  # The keyframes when a calibration began, and what the worker got.
-        )
+        # The keyframes when a calibration began, and the request if the worker does not have it yet, for it takes memory.
+        self._asked: tuple[int, CalibrationRequest | None] | None = None
         self._worker: Worker[Calibration | None] = Worker()
         self._known: deque[CalibrationMessage] = deque()
         self._replaying = False
@@ -85,8 +84,9 @@ class Calibrator:
     def begin(self) -> None:
         """Continue after the journal of a resumed session. Repeat a calibration that had begun but not been applied."""
         self._replaying = False
-        if self._asked is not None:
+        if self._asked is not None and self._asked[1] is not None:
             self._worker.ask(self._asked[1])
+            self._asked = self._asked[0], None
 
     def after_keyframe(self) -> bool:
         """Start or apply a calibration if it is due, and return whether the map was corrected."""
@@ -118,7 +118,7 @@ class Calibrator:
         settings = m.given.model_copy(update={"noise": Noise(rays=False, ranges=False, odometry=False)})
         errors = replace(found.errors, settings=settings)
         request = CalibrationRequest(errors, found.theta, found.association, found.map_T_camera, settings)
-        self._asked = number, request
+        self._asked = number, request if self._replaying else None
         if not self._replaying:
             self._worker.ask(request)
 

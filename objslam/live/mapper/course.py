@@ -54,8 +54,8 @@ class _Piece:
 class Course:
     """The paths of odometry and localisation, and the course that they form.
 
-    driven, localized: the whole odometry and localisation, as received. odometry, localization: their poses of the last
-    seconds, this odometry corrected for its shared errors.
+    driven, localized: the whole odometry and localisation, as received. In a long session, not every pose stays. odometry,
+    localization: their poses of the last seconds, this odometry corrected for its shared errors.
     """
 
     def __init__(self, settings: Settings, correction: OdometryCorrection | None = None) -> None:
@@ -64,22 +64,24 @@ class Course:
         self._correction = correction or OdometryCorrection({})
         self.odometry = PathBuffer(settings.odometry, seconds, self._max_gap)
         self.localization = PathBuffer(settings.odometry, seconds, self._max_gap)
-        self.driven, self.localized = PathTable(self._max_gap), PathTable(self._max_gap)
+        reach = 2 * settings.calibration.max_clock  # A correction of a clock may move a stamp from one bound to the other.
+        self.driven = PathTable(self._max_gap, reach, seconds)
+        self.localized = PathTable(self._max_gap, reach, seconds)
         self._noise = settings.localization.yaw, settings.localization.xy
         self._localized_by_then = -np.inf
         self._pieces: list[_Piece] = []
         self._last: Placed | None = None
         self._newest = -np.inf
 
-    def add_odometry(self, stamp: float, pose: Floats) -> None:
-        """Append a pose (4, 4) of the odometry at a stamp, s, later than all others."""
-        self.driven.append(stamp, pose)
+    def add_odometry(self, stamp: float, pose: Floats, keyframes: KeyframeTable) -> None:
+        """Append a pose (4, 4) of the odometry at a stamp, s, later than all others. keyframes: those of the map so far."""
+        self.driven.append(stamp, pose, keyframes.stamp)
         self.odometry.append(stamp, self._correction.correct(stamp, pose))
         self._localized_by_then = self.localization.newest
 
-    def add_localization(self, stamp: float, pose: Floats) -> None:
-        """Append a pose (4, 4) of the localisation at a stamp, s, later than all others."""
-        self.localized.append(stamp, pose)
+    def add_localization(self, stamp: float, pose: Floats, keyframes: KeyframeTable) -> None:
+        """Append a pose of the localisation, as `add_odometry`."""
+        self.localized.append(stamp, pose, keyframes.stamp)
         self.localization.append(stamp, pose)
 
     def recalibrate(

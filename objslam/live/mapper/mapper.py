@@ -53,10 +53,10 @@ class Mapper:
         m = self.state
         if isinstance(message, PoseMessage):
             if message.path == "odometry":
-                m.course.add_odometry(message.stamp, message.pose)
+                m.course.add_odometry(message.stamp, message.pose, m.keyframes)
                 return
             m.localization.received += 1
-            m.course.add_localization(message.stamp, message.pose)
+            m.course.add_localization(message.stamp, message.pose, m.keyframes)
             if localize(m):
                 self._predicted = None
         elif isinstance(message, CameraMessage):

@@ -1,4 +1,4 @@
-"""Tables of arrays that grow by rows, and the tables of keyframes and rays."""
+"""Tables of arrays that grow by rows, and the tables of paths, keyframes and rays."""
 
 from copy import copy
 from typing import Any, Self
@@ -7,11 +7,17 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.trajectory import travel
 from objslam.core.types import Trajectory
 
-_MOST_POSES = 131_072
-"""The number of poses of a path above which some are dropped: 11 minutes at 200 Hz. A larger number keeps long paths finer,
-for 136 bytes per pose."""
+_MOST_POSES = 65_536
+"""The number of poses of a path above which some are dropped: 5 minutes at 200 Hz, 2 hours at 10 Hz. A larger number keeps
+long paths finer, for 160 bytes per pose."""
+_FULL = 0.75
+"""The share of the most poses that may stay when some are dropped. A larger share keeps more, and drops some more often."""
+_LEAST = 0.25
+"""The share of the most poses that is left to poses that no solve asks for. A larger share keeps the path between old
+keyframes finer, and costs memory if there are many keyframes."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
 
@@ -71,36 +77,80 @@ class GrowingTable:
 class PathTable(GrowingTable):
     """The poses of a path in the order of their stamps, as the robot sent them.
 
-    Above _MOST_POSES, some are dropped, evenly over time, to save memory. No new gap may arise, so the limit doubles if too
-    many poses must stay. max_gap: s, the shortest time between two poses that is a gap.
+    Above _MOST_POSES, some are dropped, evenly over time, so that a session of months takes no more memory. Near the stamps
+    that a later solve asks for, no new gap arises. Elsewhere, the poses may be any time apart. What the robot travelled
+    between the kept poses is not lost, because the drift of the odometry grows with it.
+
+    max_gap: s, the shortest time between two poses that is a gap. reach: s, a solve takes poses so far from the stamps that
+    it asks for. newest: s, it may yet ask for stamps so far from the end of the path.
     """
 
     stamp: Floats = column(np.float64)
     pose: Floats = column(np.float64, 4, 4)
+    travel: Floats = column(np.float64, 3)
 
-    def __init__(self, max_gap: float) -> None:
+    def __init__(self, max_gap: float, reach: float, newest: float) -> None:
         super().__init__()
+        self._reach, self._newest = reach + max_gap, newest + max_gap
         self._widest, self._spacing, self._most = max_gap / 4, 0.0, _MOST_POSES
+        self._summed = 0  # The number of poses whose `travel` is filled in. It is 0 until poses are dropped.
 
-    def append(self, stamp: float, pose: Floats) -> None:
-        """Append a pose (4, 4) at a stamp, s, later than all others."""
+    def append(self, stamp: float, pose: Floats, asked: Floats) -> None:
+        """Append a pose (4, 4) at a stamp, s, later than all others. asked: (K,) s, the stamps that later solves ask for."""
         if len(self) >= self._most:
-            self._thin()
-        self.add(stamp=[stamp], pose=pose[None])
+            self._thin(asked)
+        self.add(stamp=[stamp], pose=pose[None], travel=np.zeros((1, 3)))
 
     def trajectory(self) -> Trajectory | None:
         """Return a copy of the path, None if it has no pose."""
-        return Trajectory(self.stamp.copy(), self.pose.copy()) if len(self) else None
+        if not len(self):
+            return None
+        if self._summed:
+            self._sum_up()
+        return Trajectory(self.stamp.copy(), self.pose.copy(), self.travel.copy() if self._summed else None)
 
-    def _thin(self) -> None:
-        """Keep one pose per period, and the poses at gaps. The period at least doubles each time, up to max_gap / 4."""
-        usual = (self.stamp[-1] - self.stamp[0]) / len(self)
-        self._spacing = min(max(2 * self._spacing, 2 * usual), self._widest)
-        period = np.floor((self.stamp - self.stamp[0]) / self._spacing)
-        far = np.append(np.diff(self.stamp) > self._spacing, True)
-        self.keep(np.append(True, np.diff(period) > 0) | far)
-        if len(self) > 3 * self._most // 4:
+    def _thin(self, asked: Floats) -> None:
+        """Keep one pose per period, and the poses at gaps. The period doubles until few enough poses stay.
+
+        A period above max_gap / 4 does not apply to poses near `asked` or near the end of the path. If so many of these stay
+        that the others would have to be fewer than _LEAST, the limit doubles instead.
+        """
+        near = self._near(asked)
+        self._spacing = self._spacing or min(2 * float(self.stamp[-1] - self.stamp[0]) / len(self), self._widest)
+        stays = self._spaced(near)
+        while stays.sum() > _FULL * self._most and (
+            self._spacing < self._widest or (stays & ~near).sum() > _LEAST * self._most
+        ):
+            self._spacing *= 2
+            stays = self._spaced(near)
+        self._sum_up()
+        total = np.cumsum(self.travel, axis=0)[stays]
+        self.keep(stays)
+        self.travel[1:] = np.diff(total, axis=0)
+        self._summed = len(self)
+        if len(self) > _FULL * self._most:
             self._most *= 2
+
+    def _spaced(self, near: Bools) -> Bools:
+        return self._one_per(self._spacing) | (near & self._one_per(min(self._spacing, self._widest)))
+
+    def _one_per(self, period: float) -> Bools:
+        """Return a mask of the first pose in each period, s, and of the poses before longer steps."""
+        number = np.floor((self.stamp - self.stamp[0]) / period)
+        return np.append(True, np.diff(number) > 0) | np.append(np.diff(self.stamp) > period, True)
+
+    def _near(self, asked: Floats) -> Bools:
+        """Return a mask of the poses within the reach of the stamps `asked` (K,), s, and of the newest poses."""
+        known = np.sort(asked)
+        begin, end = self.stamp - self._reach, self.stamp + self._reach
+        is_asked = np.searchsorted(known, begin) < np.searchsorted(known, end, "right")
+        return np.asarray(is_asked | (self.stamp >= self.stamp[-1] - self._newest))
+
+    def _sum_up(self) -> None:
+        """Fill in `travel` of the poses that were appended since the last time."""
+        begin = max(self._summed, 1)
+        self.travel[begin:] = travel(self.pose[begin - 1 :])
+        self._summed = len(self)
 
 
 class KeyframeTable(GrowingTable):

@@ -1,13 +1,24 @@
-"""Settings of the Python process that shorten its pauses."""
+"""Settings of the Python process that shorten its pauses, and keep its memory small for months."""
 
+import ctypes
 import gc
 import sys
 
 _SWITCH_INTERVAL = 5e-4  # The time until Python switches threads, s. A larger value costs less, but messages wait longer.
 
+_LARGE = 2**20
+"""Blocks of memory from this size on, bytes, go back to the system when they are freed. glibc itself raises the limit, up to
+32 MB, when it frees a larger block, and then keeps what a calibration took. A larger value keeps more, and saves time."""
+_M_MMAP_THRESHOLD = -3  # The name of this limit in glibc's malloc.h.
+
 
 def configure() -> None:
-    """Switch threads sooner than Python's 5 ms. Exempt present objects from garbage collection, to save pauses of 0.15 s."""
+    """Switch threads sooner than Python's 5 ms. Exempt present objects from garbage collection, to save pauses of 0.15 s.
+
+    Where the C library is glibc, fix the size of the blocks that go back to the system.
+    """
     sys.setswitchinterval(_SWITCH_INTERVAL)
+    if hasattr(ctypes.CDLL(None), "mallopt"):
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE)
     gc.collect()
     gc.freeze()

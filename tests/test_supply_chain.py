@@ -1,0 +1,51 @@
+"""The list of pinned packages: tools/setup.sh installs what it names, and pip checks the hashes."""
+
+import re
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+LIST = (ROOT / "tools" / "constraints.txt").read_text(encoding="utf-8")
+
+
+def name_of(requirement):
+    return re.sub(r"[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", requirement)[0]).lower()
+
+
+def pinned():
+    """The names of the pinned packages by set."""
+    found = {}
+    for part in re.split(r"^# set: ", LIST, flags=re.MULTILINE)[1:]:
+        which, _, lines = part.partition("\n")
+        found[which] = {name_of(line) for line in lines.splitlines() if not line.startswith(" ")}
+    return found
+
+
+def needed(*extras):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    more = project["project"]["optional-dependencies"]
+    wanted = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
+    for extra in extras:
+        wanted += more[extra]
+    return {name_of(one) for one in wanted} - {"objslam"}
+
+
+def test_every_package_is_of_one_version_and_has_hashes():
+    packages = re.split(r"\n(?=[A-Za-z0-9])", LIST)[1:]
+    assert len(packages) > 100
+    for package in packages:
+        body = re.sub(r"\n# set: .*", "", package)
+        first, *lines = body.replace(" \\\n", "\n").strip().splitlines()
+        assert re.fullmatch(r"[a-z0-9.-]+==[0-9][^\s;]*( ; .*)?", first), first
+        assert lines, f"{first} has no hash"
+        assert all(re.fullmatch(r"    --hash=sha256:[0-9a-f]{64}", line) for line in lines), first
+
+
+def test_each_set_has_what_its_extras_need():
+    found = pinned()
+    assert list(found) == ["run", "cuda", "dev", "docs"]
+    names = [name for names in found.values() for name in names]
+    assert len(names) == len(set(names))
+    assert needed("open3d", "torch") <= found["run"]
+    assert needed("dev", "fleet", "dds", "open3d", "torch") <= found["run"] | found["dev"]
+    assert needed("docs") <= set(names)
