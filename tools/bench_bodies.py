@@ -1,9 +1,10 @@
 """Points against bodies on simulated boxes of ellipsoids: errors of centres, sizes and yaws, honesty, and time.
 
     python tools/bench_bodies.py [--objects 200] [--boxes 30] [--noise 2] [--seeds 3]
-    python tools/bench_bodies.py --drives 10
+    python tools/bench_bodies.py --drives 10 [--short 0.05]
 
-The second line runs whole drives in joint mode instead, with bodies and without.
+The second line runs whole drives in joint mode instead, with bodies and without. With --short, the detector also draws boxes
+that the image's edge cuts off.
 
 The nearest peer, gtsam-quadrics, has wheels for Python 3.10 and numpy below 1.24 only. The benchmark says whether it can be
 imported here, and compares nothing with it otherwise.
@@ -44,9 +45,10 @@ def main() -> None:
     parser.add_argument("--arc", type=float, nargs=2, default=(60.0, 180.0), help="range of azimuths of the views, degrees")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--drives", type=int, default=0, help="drives between large objects, in place of single bodies")
+    parser.add_argument("--short", type=float, help="draw cut off boxes, up to this share of their size short")
     options = parser.parse_args()
     if options.drives:
-        drives(options.drives)
+        drives(options.drives, options.short)
         return
     for seed in range(options.seeds):
         rng = np.random.default_rng(seed)
@@ -62,9 +64,9 @@ def main() -> None:
     )
 
 
-def drives(number: int) -> None:
+def drives(number: int, short: float | None) -> None:
     """Run drives with bodies and without, and print the medians of their scores and the CPU time of one drive."""
-    logs = [drive(seed) for seed in range(number)]
+    logs = [drive(seed, short=short) for seed in range(number)]
     for name, change in (("points", "bodies.use=false"), ("bodies", "bodies.use=true")):
         begin = time.process_time()
         found = [scores(log, change)[1] for log in logs]

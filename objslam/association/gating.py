@@ -11,6 +11,7 @@ from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.association.refinement import range_costs, refine, variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
+from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 
 TRACK_GAIN = 2.0
 """The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
@@ -20,6 +21,20 @@ _FAR = 1e6  # The distance (m) from the first camera beyond which only parallel 
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
+_SIZE_SPREAD = 0.25
+"""The expected standard deviation of the logarithms of width and height over the boxes of a landmark, which change with the
+side and with the detector. A larger value needs larger differences of size."""
+_SIZE_POOLED = 5.0
+"""With this many boxes, the spread of a landmark's own sizes weighs as much as `_SIZE_SPREAD`. A larger number trusts own
+sizes less."""
+_SIZED_BY = 5
+"""The least number of boxes that tell the size of a landmark. A larger number leaves more landmarks without a size."""
+_SIZE_FREE = 5.99
+"""The squared deviation of a size that costs nothing, chi-squared of 2 degrees of freedom at 95 %. A larger value needs
+larger differences of size."""
+SIZE_LOSS = 6.0
+"""The largest cost of a size. It is less than a usual gate, because a half hidden thing still has its bearing. A larger
+value loses more boxes of half hidden things."""
 
 
 @dataclass(frozen=True)
@@ -208,6 +223,31 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
     of = np.where(tracks[t] == track[ray], total[t], 0) - (matched[ray] >= 0)
     bonus[which] = np.where((others >= 2) & (2 * others > of), TRACK_GAIN, 0.0)
     return bonus
+
+
+def size_costs(state: State, edges: Edges) -> Floats:
+    """Return the cost (E,), from 0 to `SIZE_LOSS`, of the size of the box in each match, in squared standard deviations.
+
+    Bearings do not tell a small thing from a large one in front of or behind it. If only one of them is detected, its box
+    fits both bearings, but only one size. A landmark has the median of the sizes of its boxes, and their spread. Boxes of
+    another size than usual cost more. A box without a size, and a landmark with few boxes, cost nothing.
+    """
+    obs, number = state.obs, state.ray_count
+    if not (number >= _SIZED_BY).any():
+        return np.zeros(len(edges.ray))
+    with np.errstate(divide="ignore"):  # A box without a size gets a deviation that is not finite.
+        size = np.log(obs.size)
+        noise = 2 * obs.sigma[edges.ray, None] / obs.size[edges.ray]  # Two edges, each with sqrt(2) times a centre's noise.
+    own = size[state.assigned] + np.log(state.distance)[:, None]
+    middle = grouped_median(own, state.owner, state.count)
+    away = np.linalg.norm(state.landmarks.position[edges.landmark] - obs.origin[edges.ray], axis=1)
+    with np.errstate(invalid="ignore"):
+        spread = grouped_median(np.abs(own - middle[state.owner]), state.owner, state.count) / NORMAL_MEDIAN
+        spread2 = (number[:, None] * spread**2 + _SIZE_POOLED * _SIZE_SPREAD**2) / (number[:, None] + _SIZE_POOLED)
+        off = size[edges.ray] + np.log(away)[:, None] - middle[edges.landmark]
+        squared = (off**2 / (spread2[edges.landmark] + noise**2)).sum(axis=1)
+    told = np.isfinite(squared) & (number[edges.landmark] >= _SIZED_BY)
+    return np.where(told, np.clip(squared - _SIZE_FREE, 0.0, SIZE_LOSS), 0.0)
 
 
 def gate_limit(share: float) -> float:

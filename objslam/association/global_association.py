@@ -1,7 +1,8 @@
 """Global association at known poses: assign rays to an unknown number of objects.
 
 A search finds points where rays of one label meet, and the best points become landmarks. Then landmarks are merged, fused
-across labels or dropped, if this explains the boxes and the misses at a lower cost.
+across labels or dropped, if this explains the boxes and the misses at a lower cost. At the end, the sizes of boxes decide
+between landmarks that bearings do not tell apart.
 """
 
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import numpy as np
 
 from objslam import config
 from objslam.association.existence import chance_odds, existence
-from objslam.association.gating import alternate, gate_limit, near
+from objslam.association.gating import alternate, gate_limit, near, size_costs
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
@@ -99,6 +100,8 @@ def associate_globally(
     if settings.association.fuse_labels:
         landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
+    sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
+    state, likely = _by_size(task, state, likely, sized)
     return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])
 
 
@@ -144,6 +147,24 @@ def _add_distant(task: _Task, state: State) -> State:
 
 def _alternate(task: _Task, state: State, times: int = 3) -> State:
     return alternate(state, task.gate, lambda now: _plausible(task, now), times)
+
+
+def _by_size(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats]:
+    """Assign the rays once more, by bearing and size. likely: (N,) is returned for the landmarks that keep enough rays.
+
+    Sizes count only here. While the existence of an often hidden landmark is judged, it needs every ray. sized: (R,) whether
+    the camera of each ray sees sizes.
+    """
+    obs = state.obs
+    every = alternate(
+        replace(state, obs=replace(obs, size=np.where(sized[:, None], obs.size, 0.0))),
+        task.gate,
+        lambda now: np.ones(now.count, dtype=bool),
+        unmatched=lambda now, edges: task.gate - size_costs(now, edges),
+    )
+    every = replace(every, obs=obs)
+    stays = _plausible(task, every)
+    return every.keep(stays), likely[stays]
 
 
 def _plausible(task: _Task, state: State) -> Bools:

@@ -31,7 +31,7 @@ class RayNoise(Section):
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     border: Finite = 1.0
     """Distance in px from the image edge within which a box counts as cut off. The centre of such a box is not the centre of
-    its object, so the box is dropped and counted. A negative value keeps such boxes."""
+    its object, so the box gives no ray, and is counted. Only bodies use its edges. A negative value keeps such boxes."""
     border_share: NotNegative = 0.07
     """Distance from the image edge within which a box also counts as cut off, as a share of the box width or height.
     Detectors often end a cut box short of the edge."""

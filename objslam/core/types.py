@@ -225,6 +225,23 @@ class Keyframes:
 
 
 @dataclass(frozen=True)
+class CutBoxes:
+    """The boxes that the image's edge cuts off. Their centres are wrong, so they give no rays, but bodies use their edges.
+
+    camera: (C,) index into log.cameras. frame: (C,) index into detections.frame_stamps of this camera. label: (C,) index
+    into label_names of the rays. box: (C, 4) raw px.
+    """
+
+    camera: Ints
+    frame: Ints
+    label: Ints
+    box: Floats
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True)
 class Rays:
     """Bearing rays, one for each box. A ray runs from the camera at a keyframe through the undistorted centre of the box.
 
@@ -234,7 +251,8 @@ class Rays:
     of the error that all ranges of an object share. label: (R,) index into label_names. score: (R,). box: (R, 4) raw px.
     track_id: (R,) -1 if unknown. offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the
     origin. corners: (R, 4, 3) unit, in the camera frame, the directions to the corners of a square fiducial, NaN for another
-    object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes.
+    object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
+    the cut off boxes of the same images, None if they were not collected.
     """
 
     keyframe: Ints
@@ -251,6 +269,7 @@ class Rays:
     offset: Floats | None = None
     corners: Floats | None = None
     corner_sigma: Floats | None = None
+    cut: CutBoxes | None = None
 
     def __len__(self) -> int:
         return len(self.keyframe)

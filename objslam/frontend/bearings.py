@@ -7,7 +7,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
-from objslam.core.types import Detections, Keyframes, Log, Rays, label_table
+from objslam.core.types import CutBoxes, Detections, Keyframes, Log, Rays, label_table
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
 """The reason to drop a box that ends at the image's edge, because its centre is then wrong."""
@@ -21,11 +21,12 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     The ledger counts the other boxes. A box is not usable if its score is too low, if its centre is outside the image, or if
     the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
     rays.border is negative or the detections are `whole`. In each frame, the `MAX_OF_LABEL` boxes of a label with the
-    highest scores are used.
+    highest scores are used. `Rays.cut` has the boxes that only the image's edge made unusable.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}
     columns: list[tuple[Floats | Ints, ...]] = []
+    cut: list[tuple[Floats | Ints, ...]] = []
     for index, camera_log in enumerate(log.cameras):
         detections, camera = camera_log.detections, camera_log.camera
         if detections is None:
@@ -33,13 +34,15 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         keyframe_of_frame = np.full(len(detections.frame_stamps), -1)
         mine = np.flatnonzero(keyframes.camera == index)
         keyframe_of_frame[keyframes.frame[mine]] = mine
+        names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
         boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
         measured = boxes.boxes, boxes.scores, boxes.stamps
         kept, directions, angle_sigma = box_rays(*measured, camera, settings, ledger, boxes.whole)
+        off = boxes.take(_only_cut(boxes, camera, settings))
+        cut.append((np.full(len(off), index), off.frame, names[off.label], off.boxes))
         boxes = boxes.take(kept)
         few = surest(boxes.frame, boxes.label, boxes.scores, camera, ledger)
         boxes, directions, angle_sigma = boxes.take(few), directions[few], angle_sigma[few]
-        names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
         of_rays = (keyframe_of_frame[boxes.frame], directions, angle_sigma)
         corners, corner_sigma = _corner_rays(boxes, camera, settings, ledger)
         measures = boxes.depths, names[boxes.label], boxes.scores, boxes.boxes, boxes.track_ids
@@ -69,6 +72,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         label_names=label_names,
         corners=corners[order] if seen else None,
         corner_sigma=corner_sigma[order] if seen else None,
+        cut=CutBoxes(*(np.concatenate(c) for c in zip(*cut, strict=True))),
     )
 
 
@@ -131,23 +135,40 @@ def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Led
 def _usable(
     boxes: Floats, scores: Floats, stamps: Floats | float, camera: Camera, settings: Settings, ledger: Ledger, whole: bool
 ) -> Ints:
-    of, size = settings.rays, camera.size
-    low, high = boxes[:, :2], boxes[:, 2:]
-    centre = (low + high) / 2
-    wrong = {
-        f"boxes below rays.min_score {of.min_score:g}": ~(scores >= of.min_score),
-        "boxes with their centre outside the image": ~((centre >= 0) & (centre <= size)).all(axis=1),
-    }
-    if of.border >= 0 and not whole:
-        border = np.maximum(of.border, of.border_share * (high - low))
-        cut = (low <= border) | (high >= size - 1 - border)
-        wrong[CUT_OFF] = cut.any(axis=1)
+    wrong = _wrong(boxes, scores, camera, settings)
+    if settings.rays.border >= 0 and not whole:
+        wrong[CUT_OFF] = np.asarray(cut_edges(boxes, camera, settings).any(axis=1))
     left = np.ones(len(boxes), dtype=bool)
     for reason, bad in wrong.items():
         bad = left & bad
         ledger.drop(reason, int(bad.sum()), _where(camera, stamps, bad), of=len(boxes))
         left &= ~bad
     return np.flatnonzero(left)
+
+
+def _wrong(boxes: Floats, scores: Floats, camera: Camera, settings: Settings) -> dict[str, Bools]:
+    """Return which boxes (M, 4) are unusable, by the reason, whether or not the image's edge cuts them off."""
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    return {
+        f"boxes below rays.min_score {settings.rays.min_score:g}": ~(scores >= settings.rays.min_score),
+        "boxes with their centre outside the image": np.asarray(~((centre >= 0) & (centre <= camera.size)).all(axis=1)),
+    }
+
+
+def cut_edges(boxes: Floats, camera: Camera, settings: Settings) -> Bools:
+    """Return which edges (M, 4) of boxes (M, 4), px, are so near to the image's edge that the box may be cut off there."""
+    low, high = boxes[:, :2], boxes[:, 2:]
+    border = np.maximum(settings.rays.border, settings.rays.border_share * (high - low))
+    return np.concatenate([low <= border, high >= camera.size - 1 - border], axis=1)
+
+
+def _only_cut(boxes: Detections, camera: Camera, settings: Settings) -> Ints:
+    """Return the increasing indices of the boxes that are unusable only because the image's edge cuts them off."""
+    if settings.rays.border < 0 or boxes.whole:
+        return np.zeros(0, dtype=np.int64)
+    wrong = np.any(list(_wrong(boxes.boxes, boxes.scores, camera, settings).values()), axis=0)
+    found = np.flatnonzero(cut_edges(boxes.boxes, camera, settings).any(axis=1) & ~wrong)
+    return found[surest(boxes.frame[found], boxes.label[found], boxes.scores[found], camera, Ledger())]
 
 
 def _where(camera: Camera, stamps: Floats | float, bad: Bools) -> str | None:

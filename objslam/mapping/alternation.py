@@ -11,7 +11,7 @@ from objslam.core.trace import Trace
 from objslam.core.types import Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.centre_bearings import solve_to_centres, to_centres
+from objslam.mapping.bodies.centre_bearings import solve_to_centres, to_centres
 from objslam.mapping.checks.unexplained import warn_of_unexplained
 from objslam.mapping.fixed_poses import FixedPoses, calibrate_fixed
 from objslam.mapping.joint_alternation import JointState, solve_joint

@@ -18,7 +18,7 @@ from objslam.core.trace import Round
 from objslam.core.types import Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.bodies import with_bodies
+from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.describe import describe
 from objslam.mapping.solution import Solution
 

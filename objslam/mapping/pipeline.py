@@ -21,7 +21,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import solve
-from objslam.mapping.bodies import with_bodies
+from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.residuals import check_residuals

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from objslam.core.arrays import Floats
@@ -9,6 +11,7 @@ from objslam.core.camera import Camera, project
 from objslam.triangulation.bodies.ellipsoid import matrices
 
 _ANGLES = 90  # The number of points of an outline from which the search begins. More are slower.
+_POINTS = 720  # The number of points of an outline that is clipped. More are more exact and slower.
 _STEPS = 8  # The number of steps of the search for an extreme pixel. More are more exact and slower.
 _NEAREST = 0.05  # The least depth, m, of an outline. A larger value drops closer bodies.
 
@@ -31,6 +34,52 @@ def outline_box(camera: Camera, body: Floats, pose: Floats) -> Floats | None:
     exact for distorted lenses, and independent of `triangulation.bodies`. body: centre and half axes, m, and yaw, rad. pose:
     (4, 4) map_T_camera.
     """
+    pixels = _outline(camera, body, pose)
+    if pixels is None:
+        return None
+    angles = np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False)
+    rough = pixels(angles)
+    sides = []
+    for axis, pick in ((0, np.argmin), (1, np.argmin), (0, np.argmax), (1, np.argmax)):
+        best, step = angles[pick(rough[:, axis])], 2 * np.pi / _ANGLES
+        for _ in range(_STEPS):  # the vertex of a parabola through three points
+            before, at, after = pixels(best + step * np.array([-1, 0, 1]))[:, axis]
+            bend = before - 2 * at + after
+            best += np.clip(0.5 * step * (before - after) / bend, -step, step) if bend else 0.0
+            step = max(step / 4, 1e-4)
+        sides.append(pixels(np.array([best]))[0, axis])
+    return np.array(sides)
+
+
+def visible_box(camera: Camera, body: Floats, pose: Floats) -> Floats | None:
+    """Return the box (4,), px, around the part of an ellipsoid (7,) that is in the image of a pinhole camera.
+
+    The outline is clipped by the four edges of the image (Sutherland and Hodgman 1974). None if no part of it is in the
+    image, or if a part of it is behind the camera. Arguments: as of `outline_box`.
+    """
+    pixels = _outline(camera, body, pose)
+    if pixels is None:
+        return None
+    shown = pixels(np.linspace(0, 2 * np.pi, _POINTS, endpoint=False))
+    for axis, sign, limit in ((0, 1, 0), (1, 1, 0), (0, -1, camera.size[0] - 1), (1, -1, camera.size[1] - 1)):
+        off = sign * (shown[:, axis] - limit)
+        other, beyond = np.roll(shown, -1, axis=0), np.roll(off, -1)
+        crosses = (off >= 0) != (beyond >= 0)
+        share = (off[crosses] / (off - beyond)[crosses])[:, None]
+        crossing = shown[crosses] + share * (other - shown)[crosses]
+        # The order of points matters for the next edge, so each crossing follows the point before it.
+        place = np.concatenate([np.flatnonzero(off >= 0), np.flatnonzero(crosses) + 0.5])
+        shown = np.concatenate([shown[off >= 0], crossing])[np.argsort(place)]
+        if not len(shown):
+            return None
+    return np.concatenate([shown.min(axis=0), shown.max(axis=0)])
+
+
+def _outline(camera: Camera, body: Floats, pose: Floats) -> Callable[[Floats], Floats] | None:
+    """Return a function from angles (n,) around an ellipsoid (7,) to the pixels (n, 2) of its outline.
+
+    None if a part of it is behind the camera.
+    """
     root = np.linalg.cholesky(matrices(body[None])[0])
     seen = np.linalg.solve(root, pose[:3, 3] - body[:3])
     distance = np.linalg.norm(seen)
@@ -41,23 +90,11 @@ def outline_box(camera: Camera, body: Floats, pose: Floats) -> Floats | None:
     a /= np.linalg.norm(a)
     b = np.cross(seen, a)
 
-    def pixels(angle: Floats) -> tuple[Floats, float]:
+    def points(angle: Floats) -> Floats:
         ring = np.sqrt(1 - distance**-2) * (np.cos(angle)[:, None] * a + np.sin(angle)[:, None] * b)
-        points = body[:3] + (seen / distance + ring) @ root.T
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        return project(camera, local), float(local[:, 2].min())
+        on_body = body[:3] + (seen / distance + ring) @ root.T
+        return np.asarray((on_body - pose[:3, 3]) @ pose[:3, :3])
 
-    angles = np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False)
-    rough, nearest = pixels(angles)
-    if nearest < _NEAREST:
+    if points(np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False))[:, 2].min() < _NEAREST:
         return None
-    sides = []
-    for axis, pick in ((0, np.argmin), (1, np.argmin), (0, np.argmax), (1, np.argmax)):
-        best, step = angles[pick(rough[:, axis])], 2 * np.pi / _ANGLES
-        for _ in range(_STEPS):  # the vertex of a parabola through three points
-            before, at, after = pixels(best + step * np.array([-1, 0, 1]))[0][:, axis]
-            bend = before - 2 * at + after
-            best += np.clip(0.5 * step * (before - after) / bend, -step, step) if bend else 0.0
-            step = max(step / 4, 1e-4)
-        sides.append(pixels(np.array([best]))[0][0, axis])
-    return np.array(sides)
+    return lambda angle: project(camera, points(angle))

@@ -95,6 +95,26 @@ def test_two_close_objects_of_a_class_stay_two(distance):
         assert errors.max() < 0.03
 
 
+@pytest.mark.parametrize("sees_size", [True, False])
+def test_size_tells_a_small_thing_from_a_large_one_beside_it(sees_size):
+    """A small and a large thing, of which a frame often shows only one. Bearings alone confuse some of their boxes."""
+    points, size = np.array([[0.0, 0.0, 0.4], [0.08, 0.0, 0.4]]), (0.08, 0.4)
+    scenes = [
+        watch(points[[i]], circle(90, radius=2.5), pixel_sigma=4.0, missed=0.4, size=size[i], seed=i) for i in range(2)
+    ]
+    rays = join(*(one.rays for one in scenes))
+    camera = scenes[0].cameras[0]
+    large = (rays.box[:, 2] - rays.box[:, 0]) * 2.5 / camera.focal > 0.18  # The camera stays 2.4 to 2.6 m away.
+    scene = replace(scenes[0], rays=rays, cameras=(replace(camera, sees_size=sees_size),))
+    association = scene.associate()
+    assert association.count == 2
+    given = association.object >= 0
+    same = (association.object[given] == large[given]).mean()
+    wrong = min(same, 1 - same)
+    assert wrong < 0.02 if sees_size else wrong > 0.04, wrong
+    assert given.mean() > 0.95
+
+
 def test_one_object_with_noisy_boxes_stays_one():
     # three times the noise that was promised: residuals alone would rather have several points
     scene = watch(np.array([[0.1, 0.0, 0.4]]), circle(120), pixel_sigma=1.0)

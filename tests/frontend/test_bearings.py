@@ -150,6 +150,8 @@ def test_every_unusable_box_is_counted_once():
     scores = [0.9, 0.1, 0.9, 0.9, 0.9, 0.1, 0.9]
     rays, ledger = rays_of(log_of(seen(camera, boxes, scores=scores)), rays={"min_score": 0.5})
     assert len(rays) == 1
+    np.testing.assert_array_equal(rays.cut.box, boxes[2:4])
+    assert rays.cut.frame.tolist() == [0, 0]
     assert ledger.dropped == {
         "boxes below rays.min_score 0.5": 2,
         "boxes with their centre outside the image": 1,
@@ -169,6 +171,7 @@ def test_the_border_grows_with_the_box(border, share, kept):
     boxes = np.array([[489.0, 200, 589, 240], [535, 200, 635, 240], [539, 200, 639, 240]])
     rays, _ = rays_of(log_of(seen(lens("plumb_bob"), boxes)), rays={"border": border, "border_share": share})
     assert rays.track_id.tolist() == kept
+    np.testing.assert_array_equal(rays.cut.box, boxes[[] if border < 0 else [i for i in range(3) if i not in kept]])
 
 
 def test_of_a_label_in_a_frame_the_surest_thousand_are_looked_at():
@@ -189,6 +192,7 @@ def test_boxes_of_what_is_never_cut_off_hold_up_to_the_edge():
     camera_log = seen(lens("plumb_bob", np.zeros(5)), boxes)
     rays, ledger = rays_of(log_of(replace(camera_log, detections=replace(camera_log.detections, whole=True))))
     assert rays.track_id.tolist() == [0, 1]
+    assert len(rays.cut) == 0
     assert ledger.dropped == {"boxes with their centre outside the image": 1}
 
 
@@ -245,6 +249,18 @@ def test_cameras_share_one_label_table():
     assert rays.keyframe.tolist() == [0, 1, 2, 3, 4]
     np.testing.assert_allclose(project(right, rays.direction[[1, 3]]), CENTRES[:2], atol=1e-6)
     np.testing.assert_allclose(project(left, rays.direction[[0, 2, 4]]), CENTRES, atol=1e-6)
+
+
+def test_cut_off_boxes_of_several_cameras():
+    left, right = replace(lens("plumb_bob"), name="left"), replace(lens("plumb_bob"), name="right")
+    box = np.array([[0.0, 200, 60, 240], [300, 200, 340, 240]])
+    log = log_of(
+        seen(left, box, frame=[1, 2], names=("cup",)),
+        seen(right, box, stamps=(1.5, 2.5), frame=[1, 1], labels=[1, 0], names=("cup", "book")),
+    )
+    cut = rays_of(log)[0].cut
+    assert [part.tolist() for part in (cut.camera, cut.frame, cut.label)] == [[0, 1], [1, 1], [1, 0]]
+    np.testing.assert_array_equal(cut.box, box[[0, 0]])
 
 
 def test_frames_off_the_path_bring_no_rays():

@@ -1,7 +1,6 @@
 """Simulated drives between large objects, as logs with boxes and a truth."""
 
 import numpy as np
-from triangulation.true_boxes import outline_box
 
 from objslam.config import load_settings
 from objslam.core.camera import Camera
@@ -10,14 +9,19 @@ from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
+from objslam.simulation.outlines import outline_box, visible_box
 from objslam.triangulation.bodies.ellipsoid import from_axes, half_axes, heading
 
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.8], [0, 0, 0, 1]])
 """A camera that looks ahead, 0.8 m above the floor."""
 
 
-def drive(seed, frames=200, objects=8):
-    """A lap on an ellipse inside a ring of objects of 0.7 to 1.6 m, with boxes of 2 px noise and drifting odometry."""
+def drive(seed, frames=200, objects=8, short=None):
+    """A lap on an ellipse inside a ring of objects of 0.7 to 1.6 m, with boxes of 2 px noise and drifting odometry.
+
+    short: by which share of its size the detector ends a box short of the image's edge that cuts it off. Without it, there
+    are no cut off boxes.
+    """
     rng = np.random.default_rng(seed)
     camera = Camera("front", 640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]), base_T_camera=FORWARD)
     turn = np.linspace(0, 2 * np.pi, frames)
@@ -41,6 +45,10 @@ def drive(seed, frames=200, objects=8):
             box = outline_box(camera, bodies[j], pose)
             if box is not None and (box[:2] >= 2).all() and (box[2:] <= [637, 477]).all():
                 found.append((i, j, box + rng.normal(0, 2, 4)))
+            elif short is not None and box is not None:
+                shown = visible_box(camera, bodies[j], pose)
+                if shown is not None and (shown[2:] - shown[:2]).prod() > 0.25 * (box[2:] - box[:2]).prod():
+                    found.append((i, j, cut_box(shown, camera, short, rng)))
     frame, label, box = (np.array(column) for column in zip(*found, strict=True))
     names, count = tuple(f"thing {j}" for j in range(objects)), len(frame)
     unknown = np.full(count, np.nan), np.full(count, -1)
@@ -48,6 +56,17 @@ def drive(seed, frames=200, objects=8):
     things = zip(names, centre, 2 * half_axes(bodies), heading(bodies).tolist(), strict=True)
     truth = Truth(tuple(TruthObject(j, *thing) for j, thing in enumerate(things)), Trajectory(stamps, true))
     return Log("drive", (CameraLog(camera, detections),), Trajectory(stamps, np.array(odometry)), truth=truth)
+
+
+def cut_box(shown, camera, short, rng):
+    """A noisy box of the visible part of a body, which ends short of the image's edge by a random share of its size.
+
+    A detector clips its boxes, so an edge at the image's edge has no noise of its own.
+    """
+    size = np.tile(shown[2:] - shown[:2], 2)
+    at_edge = np.concatenate([shown[:2] <= 0, shown[2:] >= camera.size - 1])
+    inward = at_edge * short * rng.uniform(0, 1, 4) * size * [1, 1, -1, -1]
+    return np.clip(shown + inward + np.where(at_edge, 0, rng.normal(0, 2, 4)), 0, np.tile(camera.size - 1, 2))
 
 
 def scores(log, *changes):

@@ -18,7 +18,7 @@ from objslam.core.types import Association
 from objslam.live.calibration.collected import offline_rays
 from objslam.live.mapper.state import MapState
 from objslam.live.worker import Worker
-from objslam.mapping.bodies import FEWEST, with_bodies
+from objslam.mapping.bodies.fitting import FEWEST, with_bodies
 from objslam.mapping.solution import Solution
 
 _BOXES = 40

@@ -20,7 +20,7 @@ from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.mapping.alternation import solve
-from objslam.mapping.bodies import with_bodies
+from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise

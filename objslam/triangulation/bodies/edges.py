@@ -24,10 +24,10 @@ class BoxEdges:
 
     body: (B,) the object of each box. origin: (B, 3) m, the camera in map. normal: (B, 4, 3) unit, in map, away from the
     box. turn: (B, 4) rad per px, by how much a plane turns if its edge moves. sigma: (B,) px, the noise of an edge. shift:
-    (B,) px, noise that moves a whole box, such as pose noise. bound: (B, 4) whether an edge is at the image's border, so
-    that the object may reach farther. size: (B,) px, the geometric mean of the sides of each box. direction: (B, 3) unit, in
-    map, through the centre of the box. range: (B,) m along `direction` to the surface, NaN if unknown. range_sigma: (B,) m.
-    range_bias: (B,) m, the error that all ranges of a body share.
+    (B,) px, noise that moves a whole box, such as pose noise. bound: (B, 4) whether the object may reach farther than an
+    edge, because the image's border cuts it off there. size: (B,) px, the geometric mean of the sides of each box.
+    direction: (B, 3) unit, in map, through the centre of the box. range: (B,) m along `direction` to the surface, NaN if
+    unknown. range_sigma: (B,) m. range_bias: (B,) m, the error that all ranges of a body share.
     """
 
     body: Ints
@@ -50,6 +50,11 @@ class BoxEdges:
         """Select boxes by a mask or by indices."""
         selected: dict[str, Any] = {name: value[boxes] for name, value in vars(self).items()}
         return replace(self, **selected)
+
+    def joined(self, other: BoxEdges) -> BoxEdges:
+        """Return these boxes, and then those of `other`."""
+        both: dict[str, Any] = {name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()}
+        return replace(self, **both)
 
 
 def tangent_planes(

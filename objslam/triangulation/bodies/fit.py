@@ -93,7 +93,7 @@ def fit(
         moving = part[~rest]
     weight = _weight(now, weights)
     information, _, _ = _normal(edges.body, now, weight, prior, values)
-    return Fit(values, weight, now, information, prior.information)
+    return Fit(values, weight * now.use, now, information, prior.information)
 
 
 def _steps(
@@ -154,7 +154,8 @@ def grouped(group: Ints, rows: Floats, count: int) -> Floats:
 
 
 def _weight(now: Residuals, weights: Weights) -> Floats:
-    weight = now.use / weights.variance
+    weight = 1 / weights.variance
+    weight[:, -1] *= now.use[:, -1]  # A range whose ray begins to hit the body within a step does not count yet.
     if not weights.robust:
         return weight
     squared = now.use * (now.value / weights.spread) ** 2
@@ -165,7 +166,7 @@ def _weight(now: Residuals, weights: Weights) -> Floats:
 
 def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the information (N, 7, 7), the gradient (N, 7) and the cost (N,) of the bodies."""
-    weighted = now.by * weight[..., None]
+    weighted = now.by * (weight * now.use)[..., None]
     total = np.concatenate(
         [
             (np.swapaxes(weighted, 1, 2) @ now.by).reshape(len(body), -1),
@@ -181,7 +182,10 @@ def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Fl
 
 
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
-    """Return half the weighted sum of squares (N,) of each body, with its prior. The weights are fixed, also robust ones."""
+    """Return half the weighted sum of squares (N,) of each body, with its prior. The weights are fixed, also robust ones.
+
+    A bound that a step leaves begins to count at once, so that no step jumps back and forth across it.
+    """
     off = values - prior.mean
     own = np.bincount(body, (weight * now.use * now.value**2).sum(axis=1), len(values))
     return np.asarray(0.5 * own + 0.5 * np.einsum("ni,nij,nj->n", off, prior.information, off))

@@ -28,7 +28,8 @@ class Residuals:
 
     value: (B, 5), predicted minus measured: the shift in x and y (px), half of the width and of the height (px), and the
     range (m). If an edge of an axis is a bound, the two edges of this axis replace its shift and its size. by: (B, 5, 7)
-    derivatives of `value` by the parameters of the bodies. use: (B, 5) whether a residual counts.
+    derivatives of `value` by the parameters of the bodies. use: (B, 5) whether a residual counts. An edge that is a bound
+    counts only while the body does not reach it.
     """
 
     value: Floats
@@ -65,7 +66,7 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     for out, mixed in ((value, off), (jacobian, by)):
         low, high = mixed[:, :2], mixed[:, 2:]
         out[:, :2], out[:, 2:4] = (high - low) / 2, (high + low) / 2
-    row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
+    row, axis = _axes_with_bound(edges)
     for place in (axis, axis + 2):
         value[row, place], jacobian[row, place] = off[row, place], by[row, place]
         use[row, place] = ~(edges.bound[row, place] & (off[row, place] > 0))
@@ -74,14 +75,42 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
 
 
 def nominal_noise(edges: BoxEdges) -> Floats:
-    """Return the noise (B, 5) of the residuals by the settings, before it is estimated from the log."""
+    """Return the noise (B, 5) of shift, size and range by the settings, before it is estimated from the log."""
     edge, sigma = edges.sigma / np.sqrt(2), np.empty((len(edges), ROWS))
     sigma[:, :2], sigma[:, 2:4] = np.hypot(edge, edges.shift)[:, None], edge[:, None]
-    row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
-    for place in (axis, axis + 2):
-        sigma[row, place] = np.hypot(edges.sigma, edges.shift)[row]
     sigma[:, 4] = np.where(np.isfinite(edges.range), edges.range_sigma, 1.0)
     return sigma
+
+
+def at_edges(edges: BoxEdges, noise: Floats) -> Floats:
+    """Return the noise (B, 5) of the residuals, given that of shift, size and range (B, 5).
+
+    If an edge of an axis is a bound, the residuals of this axis are its two edges. An edge has the noise of shift and size
+    together.
+    """
+    row, axis = _axes_with_bound(edges)
+    both = np.hypot(noise[row, axis], noise[row, axis + 2])
+    noise = noise.copy()
+    noise[row, axis] = noise[row, axis + 2] = both
+    return noise
+
+
+def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
+    """Return how shift, size and range act, given how the residuals act (B, 5, ...).
+
+    If an edge of an axis is a bound, the residuals of this axis are its two edges. A shift acts on both with opposite signs,
+    a size with the same.
+    """
+    row, axis = _axes_with_bound(edges)
+    low, high = rows[row, axis], rows[row, axis + 2]
+    rows = rows.copy()
+    rows[row, axis], rows[row, axis + 2] = high - low, high + low
+    return rows
+
+
+def _axes_with_bound(edges: BoxEdges) -> tuple[Ints, Ints]:
+    row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
+    return row, axis
 
 
 def _ranges(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:

@@ -15,7 +15,7 @@ from objslam.core.geometry import evenly_spread
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, grouped
-from objslam.triangulation.bodies.residuals import ROWS, Residuals, nominal_noise
+from objslam.triangulation.bodies.residuals import ROWS, Residuals, at_edges, nominal_noise, on_shift_and_size
 
 SIDES = 103
 """The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All boxes from one side
@@ -41,8 +41,8 @@ nominal noise more weight."""
 class Sides:
     """The sides from which N bodies were seen. cell: (B,) the side of each box. owner: (C,) the body of each side.
 
-    alike: for each body, the correlation (c, c) between the errors of its c sides. number: (B,) how many boxes share the
-    error of each box, weighted by the correlation.
+    alike: for each body, the correlation (c, c) between the errors of its c sides. number: (B, 4) how many boxes share the
+    error of each shift and size, weighted by the correlation.
     """
 
     cell: Ints
@@ -51,14 +51,15 @@ class Sides:
     number: Floats
 
 
-def sides_of(edges: BoxEdges, centre: Floats) -> Sides:
-    """Return the sides of bodies with centres (N, 3) m in map."""
+def sides_of(edges: BoxEdges, centre: Floats, use: Floats | None = None) -> Sides:
+    """Return the sides of bodies with centres (N, 3) m in map. use: (B, 4) whether a residual counts, None if all do."""
     towards = centre[edges.body] - edges.origin
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     seen = edges.body * SIDES + (towards @ evenly_spread(SIDES).T).argmax(axis=1)
     seen, cell = np.unique(seen, return_inverse=True)
     owner = seen // SIDES
-    number = np.bincount(cell).astype(np.float64)
+    counted = np.ones((len(edges), ROWS - 1)) if use is None else use
+    number = np.stack([np.bincount(cell, part) for part in counted.T], axis=1).astype(np.float64)
     mean = np.stack([np.bincount(cell, part) for part in towards.T], axis=1)
     mean = mean / np.linalg.norm(mean, axis=1, keepdims=True)
     shared, alike = number.copy(), []
@@ -86,7 +87,7 @@ def white_factors(edges: BoxEdges, now: Residuals, sides: Sides, which: Bools) -
 
     which: (B,) the boxes that count.
     """
-    number, sigma = np.bincount(sides.cell), nominal_noise(edges)
+    number, sigma = np.bincount(sides.cell), at_edges(edges, nominal_noise(edges))
     free = np.sqrt(1 - 1 / number)[sides.cell]
     factors = np.ones(2)
     for kind, rows in enumerate((slice(0, 2), slice(2, 4))):
@@ -102,18 +103,20 @@ def white_factors(edges: BoxEdges, now: Residuals, sides: Sides, which: Bools) -
 
 def spread_of(edges: BoxEdges, factors: Floats, share: Floats) -> Floats:
     """Return the standard deviations (B, 5) of residuals, from their independent noise and their shared error."""
-    return np.sqrt(_white(nominal_noise(edges), factors) ** 2 + _scale(edges, share) ** 2)
+    return at_edges(edges, np.hypot(_white(edges, factors), _scale(edges, share)))
 
 
 def effective_variance(edges: BoxEdges, sides: Sides, factors: Floats, share: Floats) -> Floats:
     """Return the variances (B, 5) with which residuals count, so that the shared error of a side counts once."""
-    number = np.repeat(sides.number[:, None], ROWS, axis=1)
     ranged = np.bincount(edges.body, np.isfinite(edges.range))  # All ranges of a body share their error.
-    number[:, -1] = ranged[edges.body]
-    return np.asarray(_white(nominal_noise(edges), factors) ** 2 + number * _scale(edges, share) ** 2)
+    number = np.column_stack([sides.number, ranged[edges.body]])
+    own, shared = at_edges(edges, _white(edges, factors)), at_edges(edges, _scale(edges, share))
+    return np.asarray(own**2 + number * shared**2)
 
 
-def _white(sigma: Floats, factors: Floats) -> Floats:
+def _white(edges: BoxEdges, factors: Floats) -> Floats:
+    """Return the standard deviations (B, 5) of the independent errors of shift, size and range."""
+    sigma = nominal_noise(edges)
     return np.concatenate([sigma[:, :4] * np.repeat(factors, 2), sigma[:, 4:]], axis=1)
 
 
@@ -131,7 +134,7 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = np.tile(-0.5 * (shares / prior) ** 2, (2, 1))
-    white, size = _white(nominal_noise(edges), factors)[:, :4], edges.size / 2
+    white, size = at_edges(edges, _white(edges, factors))[:, :4], edges.size / 2
     weight = fit.weight[:, :4] > 0
     total = np.stack([np.bincount(sides.cell, w) for w in (weight / white**2).T], axis=1)
     total = np.maximum(total, 1e-12)
@@ -183,8 +186,8 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
     of the residuals, P the information of the prior, and A = J^T W J + P.
     """
     count = len(fit.values)
-    pulled = fit.found.by * fit.weight[..., None]
-    noisy = pulled * _white(nominal_noise(edges), factors)[..., None]
+    pulled = on_shift_and_size(edges, fit.found.by * fit.weight[..., None])
+    noisy = pulled * _white(edges, factors)[..., None]
     middle = grouped(edges.body, np.swapaxes(noisy, 1, 2) @ noisy, count) + fit.prior
     together = pulled * _scale(edges, share)[..., None]
     by_side = grouped(sides.cell, together, len(sides.owner))

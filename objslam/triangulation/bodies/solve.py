@@ -12,7 +12,7 @@ from objslam.triangulation.bodies.choice import log_evidence
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, Prior, Weights, fit
 from objslam.triangulation.bodies.prior import cuboid_prior, dot_prior, known_sizes, label_prior, sphere_prior, weak_prior
-from objslam.triangulation.bodies.residuals import Residuals, edge_gaps
+from objslam.triangulation.bodies.residuals import Residuals, edge_gaps, residuals
 from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
 from objslam.triangulation.bodies.shared import (
     Sides,
@@ -27,6 +27,8 @@ from objslam.triangulation.bodies.shared import (
 
 Measure = Callable[[Floats | None], BoxEdges]
 """The edges of the boxes, given the points (B, 4, 3) in map at which the bodies touch them. None means unknown points."""
+More = Callable[["Bodies"], "BoxEdges | None"]
+"""More edges, which are only found by the bodies, such as those of cut off boxes. None if there are none."""
 
 _POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
 _ROUNDS = 2
@@ -116,8 +118,12 @@ def solve_bodies(
     learn: bool = True,
     sizes: Mapping[str, tuple[float, float, float]] | None = None,
     bent: bool = True,
+    more: More | None = None,
 ) -> Bodies:
     """Return the bodies of objects at points (N, 3), m, with apparent half axes (N, 2), m, and labels.
+
+    The shapes, the noise and the sizes of labels come from the edges of `measure` alone. If `more` finds more edges, their
+    bodies are then fitted to all edges once more.
 
     names: the label of each object. side: (B,) px, half the length of the image. share: the prior of `Bodies.share`. learn:
     whether the share and the noise are estimated. sizes: known length, width and height, m, by label. bent: whether the
@@ -153,7 +159,9 @@ def solve_bodies(
         if bent:
             gaps = (edge_gaps(edges, one, kind)[2] for one, kind in ((now.cuboids[0], CUBOID), (now.rounds, ELLIPSOID)))
             edges = measure(_rows((now.shape == _CUBOID)[edges.body], *gaps))
-    return _finished(edges, sides, now)
+    bodies = _finished(edges, sides, now)
+    others = None if more is None else more(bodies)
+    return bodies if others is None else _refitted(edges, others, now, bodies)
 
 
 def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
@@ -186,6 +194,25 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
         best=best,
         covariance=covariance_of(edges, best, sides, now.factors, now.share),
     )
+
+
+def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> Bodies:
+    """Return the bodies from some edges, given those that `others` are of once more, from all edges."""
+    mine = np.unique(others.body)
+    at = np.flatnonzero(np.isin(edges.body, mine))
+    both = edges.take(at).joined(others)
+    both = replace(both, body=np.searchsorted(mine, both.body))
+    start = found.values[mine]
+    shape, prior = now.shape[mine], Prior(now.prior.mean[mine], now.prior.information[mine])
+    use = _rows((shape == _CUBOID)[both.body], *(residuals(both, start, kind).use[:, :4] for kind in (CUBOID, ELLIPSOID)))
+    state = replace(now, prior=prior, rounds=start, cuboids=(start,), balls=start, shape=shape)
+    again = _finished(both, sides_of(both, start[:, :3], use), state)
+    values, covariance, weight, to_centre = (
+        getattr(found, name).copy() for name in ("values", "covariance", "weight", "to_centre")
+    )
+    values[mine], covariance[mine] = again.values, again.covariance
+    weight[at], to_centre[at] = again.weight[: len(at)], again.to_centre[: len(at)]
+    return replace(found, values=values, covariance=covariance, weight=weight, to_centre=to_centre)
 
 
 def _finished(edges: BoxEdges, sides: Sides, now: _State) -> Bodies:

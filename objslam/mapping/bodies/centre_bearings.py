@@ -15,7 +15,7 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import grouped_median
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.mapping.bodies import with_bodies
+from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.solution import Solution, with_noise_of, without_errors
 
 if TYPE_CHECKING:

@@ -10,13 +10,14 @@ from objslam.association.observations import MIN_DEPTH, extents
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES, UNKNOWN_YAW, Body, PlacedBody
-from objslam.core.camera import Camera, undistort
+from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_median
 from objslam.frontend.up import up_axis
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
+from objslam.mapping.bodies.box_views import BoxViews
+from objslam.mapping.bodies.cut_boxes import cut_edges_of
 from objslam.mapping.solution import Solution
-from objslam.triangulation.bodies.edges import BoxEdges, contacts, tangent_planes
 from objslam.triangulation.bodies.prior import apparent_half_axes
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 
@@ -39,19 +40,21 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     views = _views(solution, cameras, settings)
     if not len(views.ray):
         return solution
+    boxes = views.boxes
     prior = settings.rays.box_sigma
     told = settings.noise.rays
     learn = prior == type(settings.rays)().box_sigma if told == "auto" else told
     found = solve_bodies(
-        views.edges,
-        views.points,
-        views.half,
+        boxes.edges,
+        boxes.points,
+        boxes.half,
         tuple(solution.rays.label_names[solution.association.label[j]] for j in views.objects),
-        side=views.side,
+        side=boxes.side,
         share=2 * prior,
         learn=learn,
         sizes=settings.bodies.sizes,
-        bent=views.bent,
+        bent=boxes.bent,
+        more=lambda bodies: cut_edges_of(bodies, boxes, views.objects, solution),
     )
     clear = _shifts_clearly(found, views)
     bodies: list[PlacedBody | None] = [None] * solution.association.count
@@ -60,87 +63,17 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
         if found.shape[at]:
             bodies[j] = _body(found, at, extra[at], clear=bool(clear[at]))
     to_centre = np.zeros((len(solution.rays), 3))
-    to_centre[views.ray] = np.einsum("bji,bj->bi", views.poses[:, :3, :3], found.to_centre)
+    to_centre[views.ray] = np.einsum("bji,bj->bi", boxes.poses[:, :3, :3], found.to_centre)
     return replace(solution, bodies=tuple(bodies), body_share=float(found.share[0]), to_centre=to_centre)
 
 
 @dataclass(frozen=True)
 class _Views:
-    """The boxes of objects with a point.
+    """The boxes of objects with a point. objects: (n,) the objects, ray: (B,) the used rays. boxes: of these rays."""
 
-    objects: (n,) the objects, ray: (B,) the used rays. body: (B,) the object of each box as an index into `objects`. points:
-    (n, 3) m. half: (n, 2) m, the apparent half axes across and upwards.
-    """
-
-    solution: Solution
-    cameras: tuple[Camera, ...]
-    settings: Settings
     objects: Ints
     ray: Ints
-    body: Ints
-    points: Floats
-    half: Floats
-
-    @property
-    def side(self) -> Floats:
-        """(B,) px, half the geometric mean of the sides of the image of each box."""
-        half = np.array([np.sqrt(c.size.prod()) / 2 for c in self.cameras])
-        return np.asarray(half[self._camera])
-
-    @property
-    def bent(self) -> bool:
-        """Whether any used camera distorts its image."""
-        return any(self.cameras[i].fisheye or self.cameras[i].distortion.any() for i in np.unique(self._camera))
-
-    @property
-    def _camera(self) -> Ints:
-        return self.solution.keyframes.camera[self.solution.rays.keyframe[self.ray]]
-
-    @property
-    def poses(self) -> Floats:
-        """(B, 4, 4) map_T_camera of each box."""
-        poses = self.solution.estimate.map_T_base @ self.solution.keyframes.base_T_camera
-        return np.asarray(poses[self.solution.rays.keyframe[self.ray]])
-
-    def edges(self, touched: Floats | None = None) -> BoxEdges:
-        """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch them, if known."""
-        rays, settings, poses = self.solution.rays.take(self.ray), self.settings, self.poses
-        count = len(self.ray)
-        normal, turn, bound = np.zeros((count, 4, 3)), np.ones((count, 4)), np.zeros((count, 4), dtype=bool)
-        direction = np.zeros((count, 3))  # The direction of a ray may already point to the centre of a body.
-        good = np.zeros(count, dtype=bool)
-        for i in np.unique(self._camera):
-            mine, camera = np.flatnonzero(self._camera == i), self.cameras[i]
-            box = rays.box[mine]
-            contact = None if touched is None else contacts(camera, box, poses[mine], touched[mine])
-            normal[mine], turn[mine], good[mine] = tangent_planes(camera, box, poses[mine], contact)
-            direction[mine], _ = undistort(camera, (box[:, :2] + box[:, 2:]) / 2)
-            border = max(settings.rays.border, 0.0)
-            bound[mine] = np.concatenate([box[:, :2] <= border, box[:, 2:] >= camera.size - 1 - border], axis=1)
-        turn[~good] = 1.0
-        bound[~good] = True  # A bound of a plane without a normal never counts.
-        own = self.points[self.body] - poses[:, :3, 3]
-        distance = np.maximum(np.linalg.norm(own, axis=1), MIN_DEPTH)
-        yaw, place = np.zeros(count), 0.0
-        if settings.mode != "joint":
-            angle, place = pose_noise(rays, self.solution.keyframes, settings)
-            yaw = np.sqrt(np.maximum(angle**2 - rays.sigma**2, 0.0))
-        size = np.sqrt(np.maximum(rays.box[:, 2:] - rays.box[:, :2], 0.0).prod(axis=1))
-        return BoxEdges(
-            body=self.body,
-            origin=poses[:, :3, 3],
-            normal=normal,
-            turn=turn,
-            sigma=np.full(count, np.sqrt(2) * settings.rays.pixel_sigma),
-            shift=np.hypot(yaw, place / distance) / turn.mean(axis=1),
-            bound=bound,
-            size=size,
-            direction=np.einsum("bij,bj->bi", poses[:, :3, :3], direction),
-            range=rays.range,
-            range_sigma=np.hypot(rays.range_sigma, place),
-            # A range may end on any part of the body, or behind it if the body has holes.
-            range_bias=np.where(np.isfinite(rays.range), np.hypot(rays.range_bias, self.half[self.body, 0]), 0.0),
-        )
+    boxes: BoxViews
 
 
 def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> _Views:
@@ -164,16 +97,13 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     objects = np.flatnonzero(fit & (number >= FEWEST))
     ray = ray[np.isin(association.object[ray], objects)]
     ray = ray[np.argsort(association.object[ray], kind="stable")]  # Sums over the boxes of a body are then fast.
-    return _Views(
-        solution,
-        cameras,
-        settings,
-        objects,
-        ray,
-        np.searchsorted(objects, association.object[ray]),
-        estimate.positions[objects],
-        apparent_half_axes(*sizes[objects].T),
-    )
+    body, used = np.searchsorted(objects, association.object[ray]), rays.take(ray)
+    points, half = estimate.positions[objects], apparent_half_axes(*sizes[objects].T)
+    border = max(settings.rays.border, 0.0)
+    size = np.array([c.size for c in cameras])[keyframes.camera[used.keyframe]]
+    bound = np.concatenate([used.box[:, :2] <= border, used.box[:, 2:] >= size - 1 - border], axis=1)
+    boxes = BoxViews(keyframes, used, cameras, settings, map_T_camera, body, points, half, bound)
+    return _Views(objects, ray, boxes)
 
 
 def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
@@ -182,10 +112,10 @@ def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
     If it is not, the rays through the centres of the boxes give the place at least as well, and the body gives only the
     size.
     """
-    edges = views.edges()
+    edges = views.boxes.edges()
     shared = found.share[0] * edges.size / 2 * edges.turn.mean(axis=1)
     ratio = np.linalg.norm(found.to_centre, axis=1) / np.maximum(shared, 1e-12)
-    return np.asarray(grouped_median(ratio, views.body, len(views.objects)) > _CLEAR)
+    return np.asarray(grouped_median(ratio, views.boxes.body, len(views.objects)) > _CLEAR)
 
 
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:

@@ -1,0 +1,185 @@
+"""The bodies of boxes that the image's edge cuts off.
+
+Such a box says less than a whole one. Where it is cut off, the body reaches at least to the edge of the box. The same holds
+for another edge that the body may touch outside the image. The other edges are those of the body. Detectors often end a cut
+off box short of the image's edge. So each bound is the edge of the box, which the body reaches in any case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.bodies.body import SHAPES
+from objslam.core.camera import undistort
+from objslam.core.statistics import NORMAL_MEDIAN
+from objslam.core.types import CutBoxes, Keyframes, Rays
+from objslam.frontend.bearings import cut_edges
+from objslam.mapping.bodies.box_views import BoxViews
+from objslam.mapping.solution import Solution
+from objslam.triangulation.bodies.edges import BoxEdges
+from objslam.triangulation.bodies.residuals import edge_gaps, residuals
+from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+from objslam.triangulation.bodies.shared import spread_of
+from objslam.triangulation.bodies.solve import Bodies
+
+_CHI2 = 13.28
+"""The largest squared deviation of a box from its predicted one, chi-squared of 4 degrees of freedom at 99 %. A larger value
+accepts boxes of other things."""
+_FEWEST = 2
+"""The least number of edges that are no bounds. With a larger number, fewer boxes are used. One edge alone agrees with too
+many bodies. In simulated drives, boxes with fewer such edges made centres a little worse."""
+_WITHIN = 0.1
+"""The share of the box, from where it is cut off, in which an edge may touch a body that it touches outside the image. A
+larger share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simulated drives."""
+
+
+def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution) -> BoxEdges | None:
+    """Return the edges of the cut off boxes that belong to bodies, None if there are none.
+
+    A box belongs to a body of its label if it is near the predicted box, and if no other body is near the box and no other
+    box of the image is near the body or belongs to it. bodies: n, of the objects (n,) in the association of the solution.
+    boxes: the whole boxes of the bodies.
+    """
+    cut = solution.rays.cut
+    if cut is None or not len(cut):
+        return None
+    cut = replace(cut, box=np.clip(cut.box, 0.0, np.tile(_sizes(cut, boxes) - 1, 2)))
+    keyframe = _keyframe_of(cut, solution.keyframes)
+    box, body = _candidates(cut, keyframe, bodies, boxes, objects, solution)
+    if not len(box):
+        return None
+    edges = _edges(cut, keyframe, box, body, bodies, boxes)
+    deviation, use = _deviations(edges, bodies)
+    near = np.flatnonzero((use * deviation**2).sum(axis=1) < _CHI2)
+    near = near[_single(box[near]) & _single(keyframe[box[near]] * len(objects) + body[near])]
+    near = near[(~edges.bound[near]).sum(axis=1) >= _FEWEST]
+    if not len(near):
+        return None
+    # A detector may know less about cut off things than about whole ones.
+    noisier = max(1.0, float(np.median(np.abs(deviation[near])[use[near] > 0]) / NORMAL_MEDIAN))
+    found = edges.take(near)
+    return replace(found, **{name: noisier * getattr(found, name) for name in ("sigma", "shift", "size")})
+
+
+def _sizes(cut: CutBoxes, boxes: BoxViews) -> Ints:
+    """Return the size (C, 2), px, of the image of each box."""
+    return np.array([one.size for one in boxes.cameras])[cut.camera]
+
+
+def _single(number: Ints) -> Bools:
+    """Return which numbers (P,) occur once."""
+    _, inverse, count = np.unique(number, return_inverse=True, return_counts=True)
+    return count[inverse.ravel()] == 1
+
+
+def _keyframe_of(cut: CutBoxes, keyframes: Keyframes) -> Ints:
+    """Return the keyframe (C,) of each box, -1 for an image that is no keyframe."""
+    wide = int(max(keyframes.frame.max(), cut.frame.max())) + 1
+    image, wanted = keyframes.camera * wide + keyframes.frame, cut.camera * wide + cut.frame
+    order = np.argsort(image)
+    at = order[np.clip(np.searchsorted(image[order], wanted), 0, len(image) - 1)]
+    return np.where(image[at] == wanted, at, -1)
+
+
+def _candidates(
+    cut: CutBoxes, keyframe: Ints, bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution
+) -> tuple[Ints, Ints]:
+    """Return pairs of boxes and bodies of one label whose directions are near, and whose body has no whole box in the image.
+
+    The first array has the boxes, the second the bodies.
+    """
+    association, held = solution.association, solution.association.object >= 0
+    whole = np.unique(solution.rays.keyframe[held] * association.count + association.object[held])
+    sees_size = np.array([c.sees_size for c in boxes.cameras])[cut.camera]
+    wide = (cut.box[:, 2:] > cut.box[:, :2]).all(axis=1)
+    usable = np.flatnonzero((keyframe >= 0) & sees_size & wide)
+    origin, axis, angle = _cones(cut, keyframe, usable, boxes)
+    found: list[tuple[Ints, Ints]] = []
+    for at in np.flatnonzero(bodies.shape > 0).tolist():
+        mine = np.flatnonzero(cut.label[usable] == association.label[objects[at]])
+        mine = mine[~np.isin(keyframe[usable[mine]] * association.count + objects[at], whole)]
+        towards = bodies.axes[at, :3] - origin[mine]
+        distance, reach = np.linalg.norm(towards, axis=1), np.linalg.norm(bodies.axes[at, 3:6])
+        outside = np.flatnonzero(distance > reach)
+        mine, towards, distance = mine[outside], towards[outside] / distance[outside, None], distance[outside]
+        off = np.arccos(np.clip((towards * axis[mine]).sum(axis=1), -1.0, 1.0))
+        near = mine[off < np.minimum(angle[mine] + np.arcsin(reach / distance), np.pi / 2)]
+        found.append((usable[near], np.full(len(near), at)))
+    box, body = (np.concatenate([np.zeros(0, dtype=np.int64), *part]) for part in zip(*found, strict=True))
+    return box, body
+
+
+def _cones(cut: CutBoxes, keyframe: Ints, usable: Ints, boxes: BoxViews) -> tuple[Floats, Floats, Floats]:
+    """Return origins (U, 3), m, axes (U, 3) in map and half angles (U,), rad, of cones around some boxes (U,).
+
+    A box where the lens model has no inverse gets a cone of the whole half space.
+    """
+    box, poses = cut.box[usable], boxes.map_T_camera[keyframe[usable]]
+    axis, angle = np.zeros((len(usable), 3)), np.full(len(usable), np.pi / 2)
+    pixel = np.stack([(box[:, :2] + box[:, 2:]) / 2, *(box[:, [i, j]] for i in (0, 2) for j in (1, 3))], axis=1)
+    for i in np.unique(cut.camera[usable]):
+        mine = np.flatnonzero(cut.camera[usable] == i)
+        ray, valid = undistort(boxes.cameras[i], pixel[mine].reshape(-1, 2))
+        ray = ray.reshape(-1, 5, 3)
+        widest = np.arccos(np.clip((ray[:, 1:] * ray[:, :1]).sum(axis=2).min(axis=1), -1.0, 1.0))
+        axis[mine] = ray[:, 0]
+        angle[mine] = np.where(valid.reshape(-1, 5).all(axis=1), widest, np.pi / 2)
+    return poses[:, :3, 3], np.einsum("bij,bj->bi", poses[:, :3, :3], axis), angle
+
+
+def _edges(cut: CutBoxes, keyframe: Ints, box: Ints, body: Ints, bodies: Bodies, boxes: BoxViews) -> BoxEdges:
+    """Return the edges of pairs (P,) of boxes and bodies, with their bounds."""
+    count, camera = len(box), cut.camera[box]
+    unknown, none = np.full(count, np.nan), np.zeros(count)
+    rays = Rays(
+        keyframe=keyframe[box],
+        direction=np.zeros((count, 3)),
+        sigma=none,
+        range=unknown,
+        range_sigma=none + 1,
+        range_bias=none,
+        label=cut.label[box],
+        score=none,
+        box=cut.box[box],
+        track_id=np.full(count, -1),
+        label_names=(),
+    )
+    bound = np.zeros((count, 4), dtype=bool)
+    for i in np.unique(camera):
+        mine = np.flatnonzero(camera == i)
+        bound[mine] = cut_edges(rays.box[mine], boxes.cameras[i], boxes.settings)
+    views = replace(boxes, rays=rays, body=body, bound=bound)
+    rough = views.edges()
+    kinds = [edge_gaps(rough, bodies.values, kind)[2] for kind in (CUBOID, ELLIPSOID)]
+    touched = np.where(_is_cuboid(rough, bodies)[:, None, None], *kinds)
+    return replace(views, bound=bound | _touches_outside(views, touched)).edges(touched)
+
+
+def _touches_outside(views: BoxViews, touched: Floats) -> Bools:
+    """Return which edges (B, 4) a body may touch outside the image, given the points (B, 4, 3), m, that it touches."""
+    pose, box, at = views.poses, views.rays.box, views.contacts(touched)
+    depth = ((touched - pose[:, None, :3, 3]) * pose[:, None, :3, 2]).sum(axis=2)
+    low, high = box[:, [1, 0, 1, 0]], box[:, [3, 2, 3, 2]]  # The ends of each edge.
+    margin = _WITHIN * (high - low)
+    before = views.bound[:, [1, 0, 1, 0]] & (at <= low + margin)
+    after = views.bound[:, [3, 2, 3, 2]] & (at >= high - margin)
+    return before | after | (depth <= 0)
+
+
+def _is_cuboid(edges: BoxEdges, bodies: Bodies) -> Bools:
+    return bodies.shape[edges.body] == SHAPES.index("cuboid")
+
+
+def _deviations(edges: BoxEdges, bodies: Bodies) -> tuple[Floats, Floats]:
+    """Return by how much boxes differ from the predicted boxes of their bodies (B, 4), and which differences (B, 4) count.
+
+    The differences are in standard deviations of boxes and bodies together.
+    """
+    cuboid = _is_cuboid(edges, bodies)
+    kinds = (vars(residuals(edges, bodies.values, kind)).values() for kind in (CUBOID, ELLIPSOID))
+    value, by, use = (np.where(cuboid.reshape(-1, *[1] * (a.ndim - 1)), a, b)[:, :4] for a, b in zip(*kinds, strict=True))
+    own = np.einsum("bri,bij,brj->br", by, bodies.covariance[edges.body], by)
+    return value / np.sqrt(own + spread_of(edges, bodies.factors, bodies.share)[:, :4] ** 2), use
