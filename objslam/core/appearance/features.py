@@ -1,0 +1,61 @@
+"""Appearance vectors of boxes, such as the embedding of a network: unit vectors that are compared by their cosine."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Array, Bools, Floats, Floats32
+
+MAX_FEATURES = 8192
+"""The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. No common image
+encoder has more than half of it."""
+_ROUNDING = 1e-6
+"""A vector stays unchanged, bit by bit, if its length differs from 1 by no more. A larger value leaves more vectors inexact.
+The length of a unit vector that was rounded to 32 bits differs by a tenth of this."""
+_UNIT = 1e-3  # How far the length of a stored vector may be from 1. A larger value accepts worse vectors.
+
+
+@dataclass(frozen=True)
+class FeatureTable:
+    """The appearance vectors of the boxes of a log. vectors: (V, D) unit. Rays refer to its rows, so a selection of rays
+    copies no vectors."""
+
+    vectors: Floats32
+
+
+def unit_vectors(values: Array) -> tuple[Floats32, Bools]:
+    """Return vectors (M, D) scaled to length 1, and which of the vectors (M,) can be scaled.
+
+    A vector that is zero, or has a number that is not finite, cannot. Its row is NaN.
+    """
+    given = np.asarray(values, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        largest = np.abs(given).max(axis=1, initial=0.0)
+    good = np.asarray(np.isfinite(largest) & (largest > 0))
+    largest = np.where(good, largest, np.nan)
+    scaled = given / largest[:, None]  # The square of a large number would be infinite.
+    length = np.linalg.norm(scaled, axis=1)
+    exact = np.abs(length * largest - 1) <= _ROUNDING
+    scaled = np.where(exact[:, None], given, scaled / length[:, None])
+    return scaled.astype(np.float32), good
+
+
+def are_unit_vectors(features: Floats32) -> bool:
+    """Return whether each row (M, D) is a unit vector, or NaN in all numbers."""
+    known = features[~np.isnan(features).all(axis=1)]
+    return bool((np.abs(np.linalg.norm(known, axis=1) - 1) < _UNIT).all())
+
+
+def ranked(vectors: Floats32, query: Array, count: int) -> list[tuple[int, float]]:
+    """Return the rows of `vectors` (N, D) with the largest cosines to a vector (D,), and these cosines, the largest first.
+
+    count: the most rows to return. ValueError if the query has another length than the rows, or cannot be scaled.
+    """
+    given = np.asarray(query, dtype=np.float64)
+    if given.ndim != 1 or (len(vectors) and given.shape != vectors.shape[1:]):
+        raise ValueError(f"the vector must have {vectors.shape[1]} numbers, got the shape {given.shape}")
+    (unit,), (good,) = unit_vectors(given[None])
+    if not good:
+        raise ValueError("the vector is zero or not finite")
+    cosine: Floats = vectors.astype(np.float64) @ unit.astype(np.float64)
+    return [(int(i), float(cosine[i])) for i in np.argsort(-cosine, kind="stable")[: max(count, 0)]]
