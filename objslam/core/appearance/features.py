@@ -1,6 +1,7 @@
 """Appearance vectors of boxes, such as the embedding of a network: unit vectors that are compared by their cosine."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -9,6 +10,11 @@ from objslam.core.arrays import Array, Bools, Floats, Floats32
 MAX_FEATURES = 8192
 """The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. No common image
 encoder has more than half of it."""
+_COMPACT = 64
+"""The number of numbers to which long vectors are shortened in association. A larger number keeps finer differences, and is
+slower."""
+_SAMPLE = 20_000
+"""The most vectors from which the directions of the shortened vectors are found. A larger number takes longer."""
 _ROUNDING = 1e-6
 """A vector stays unchanged, bit by bit, if its length differs from 1 by no more. A larger value leaves more vectors inexact.
 The length of a unit vector that was rounded to 32 bits differs by a tenth of this."""
@@ -21,6 +27,20 @@ class FeatureTable:
     copies no vectors."""
 
     vectors: Floats32
+
+    @cached_property
+    def compact(self) -> Floats32:
+        """(V, d) unit vectors with at most `_COMPACT` numbers, whose cosines are nearly those of the vectors.
+
+        These are the coordinates along the strongest directions (the largest eigenvalues of the second moments). Comparing
+        them takes less time and memory.
+        """
+        if self.vectors.shape[1] <= _COMPACT:
+            return self.vectors
+        some = self.vectors[:: -(-len(self.vectors) // _SAMPLE)]
+        _, directions = np.linalg.eigh(some.T @ some)
+        units, _ = unit_vectors(self.vectors @ directions[:, -_COMPACT:])
+        return np.nan_to_num(units)
 
 
 def unit_vectors(values: Array) -> tuple[Floats32, Bools]:
