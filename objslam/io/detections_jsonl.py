@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from objslam.core.arrays import Floats32
+from objslam.core.appearance.features import short_numbers
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import MAX_BOXES, Detections
 from objslam.errors import LogError
@@ -71,11 +71,6 @@ def write_detections(detections: Detections, path: Path) -> None:
             if features is not None:
                 frame["features"] = [short_numbers(vector) for vector in features[start:end]]
             file.write(json.dumps(frame, ensure_ascii=False, allow_nan=False) + "\n")
-
-
-def short_numbers(vector: Floats32) -> list[float] | None:
-    """Return a vector (D,) as the shortest decimal numbers that are read back as the same floats; None if it is NaN."""
-    return None if np.isnan(vector[0]) else [float(text) for text in vector.astype(str)]
 
 
 def parse_object(text: str | bytes) -> dict[str, Any]:

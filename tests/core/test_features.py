@@ -30,7 +30,7 @@ def test_the_ranking_is_that_of_the_angles() -> None:
     np.testing.assert_allclose([cosine for _, cosine in found], np.cos(np.radians([10.0, 30.0, 90.0])), atol=1e-6)
 
 
-@pytest.mark.parametrize("query", [[1.0], [[1.0, 0.0]], [0.0, 0.0], [np.nan, 1.0]])
+@pytest.mark.parametrize("query", [[1.0], [[1.0, 0.0]], [0.0, 0.0], [np.nan, 1.0], []])
 def test_a_query_that_cannot_be_compared_is_refused(query: list[float]) -> None:
     with pytest.raises(ValueError, match="the vector"):
-        ranked(np.eye(2, dtype=np.float32), np.array(query), 1)
+        ranked(np.eye(2, dtype=np.float32), query, 1)

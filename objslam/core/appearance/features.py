@@ -1,11 +1,14 @@
 """Appearance vectors of boxes, such as the embedding of a network: unit vectors that are compared by their cosine."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from objslam.core.arrays import Array, Bools, Floats, Floats32
+from objslam.core.arrays import Array, Bools, Floats32
 
 MAX_FEATURES = 8192
 """The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. No common image
@@ -66,16 +69,36 @@ def are_unit_vectors(features: Floats32) -> bool:
     return bool((np.abs(np.linalg.norm(known, axis=1) - 1) < _UNIT).all())
 
 
-def ranked(vectors: Floats32, query: Array, count: int) -> list[tuple[int, float]]:
-    """Return the rows of `vectors` (N, D) with the largest cosines to a vector (D,), and these cosines, the largest first.
+def short_numbers(vector: Floats32) -> list[float] | None:
+    """Return a vector (D,) as the shortest decimal numbers that are read back as the same floats; None if it is NaN."""
+    return None if np.isnan(vector[0]) else [float(text) for text in vector.astype(str)]
 
-    count: the most rows to return. ValueError if the query has another length than the rows, or cannot be scaled.
+
+def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
+    """Return the unit vector (D,) under the key `features` of a JSON object, None without one. ValueError if not."""
+    value = entry.get("features")
+    if value is None:
+        return None
+    numbers = isinstance(value, list) and all(type(x) in (int, float) and abs(x) < 2 for x in value)
+    if not numbers or not 0 < len(value) <= MAX_FEATURES or abs(np.linalg.norm(value) - 1) >= _UNIT:
+        raise ValueError("features must be a vector of length 1")
+    return np.array(value, dtype=np.float32)
+
+
+def ranked(vectors: Sequence[Floats32], query: ArrayLike, count: int) -> list[tuple[int, float]]:
+    """Return the indices of the vectors (D,) with the largest cosines to a vector, and these cosines, the largest first.
+
+    Vectors of another length than that of the query are left out. count: the most vectors to return. ValueError if the query
+    is no vector, cannot be scaled, or if no vector has its length.
     """
     given = np.asarray(query, dtype=np.float64)
-    if given.ndim != 1 or (len(vectors) and given.shape != vectors.shape[1:]):
-        raise ValueError(f"the vector must have {vectors.shape[1]} numbers, got the shape {given.shape}")
+    if given.ndim != 1 or not len(given):
+        raise ValueError(f"the vector must be (D,) numbers, got the shape {given.shape}")
     (unit,), (good,) = unit_vectors(given[None])
     if not good:
         raise ValueError("the vector is zero or not finite")
-    cosine: Floats = vectors.astype(np.float64) @ unit.astype(np.float64)
-    return [(int(i), float(cosine[i])) for i in np.argsort(-cosine, kind="stable")[: max(count, 0)]]
+    alike = [i for i, vector in enumerate(vectors) if len(vector) == len(given)]
+    if len(vectors) and not alike:
+        raise ValueError(f"the vector has {len(given)} numbers, but those of the objects have {len(vectors[0])}")
+    cosine = np.array([vectors[i] for i in alike], dtype=np.float64).reshape(-1, len(given)) @ unit.astype(np.float64)
+    return [(alike[i], float(cosine[i])) for i in np.argsort(-cosine, kind="stable")[: max(count, 0)].tolist()]
