@@ -271,13 +271,13 @@ def street_counts(scene: Street, points: Floats) -> tuple[Ints, set[int]]:
 def appearance(seeds: int) -> None:
     """Print the F1 of clusters of one label without and with appearance vectors, and the share of the missing F1 gained.
 
-    Objects are found within 0.25 m. Joint runs take about ten times as long, so they get a quarter of the seeds.
+    Objects are found within 0.25 m. Joint runs take about ten times as long, so they get half of the seeds.
     """
     print(f"{'vectors that confuse 20 %':<30}{'F1':>13}{'gained':>8}{'F1 of pairs':>16}{'gained':>8}{'CPU s':>14}")
     for name, pixels, odometry, some in (
         ("coarse bearings, 15 px", 15.0, None, seeds),
         ("coarse bearings, 25 px", 25.0, None, seeds),
-        ("noisy odometry, joint", 3.0, ROUGH, max(seeds // 4, 1)),
+        ("noisy odometry, joint", 3.0, ROUGH, max(seeds // 2, 1)),
     ):
         rows = []
         for seed in range(some):

@@ -69,6 +69,14 @@ Radius = Annotated[
     float, typer.Option("--radius", min=0.0, help="Maximum distance in m between a map object and its match in the truth.")
 ]
 DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
+EncoderModel = Annotated[
+    Path | None,
+    typer.Option(
+        "--embed",
+        metavar="MODEL",
+        help="ONNX image encoder. It makes an appearance vector of each box from the rgb images.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print warnings and errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs in place of text.")]
 CalibrationFile = Annotated[
