@@ -150,7 +150,8 @@ def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
         objects = json.loads(file.read_text())
         written |= {key for o in objects["objects"] for key in o}
     assert written <= fields
-    assert fields - written <= {"ray", "ray_point", "tag"}  # No object was unresolved, moved to its body, or a fiducial.
+    # No object was unresolved, moved to its body, or a fiducial, and no box had an appearance vector.
+    assert fields - written <= {"ray", "ray_point", "tag", "features"}
     results = {file.name for name in ("demo_boxes/joint", "my_map") for file in (played / name).iterdir()}
     for name in results:
         assert f"`{name}`" in PAGES["docs/results.md"], name

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 
 from objslam.api.array_input import as_boxes, as_camera, as_poses, as_stamps, per_box
 from objslam.core import types
+from objslam.core.appearance.features import MAX_FEATURES, unit_vectors
+from objslam.core.arrays import Floats32
 from objslam.core.camera import Camera
 from objslam.core.geometry import quaternion
 from objslam.core.validity import box_rules, is_name, valid_depths
@@ -67,13 +69,16 @@ class Detections(types.Detections):
         *,
         depths: Sequence[ArrayLike] | None = None,
         track_ids: Sequence[ArrayLike] | None = None,
+        features: Sequence[ArrayLike] | None = None,
         whole: bool = False,
     ) -> Self:
         """Make detections from one list for each of F frames. A frame without a box has empty lists.
 
         stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names.
         scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z in m, NaN where unknown.
-        track_ids: for each frame B integers, -1 where unknown. whole: True if boxes are not cut off at the image's edge.
+        track_ids: for each frame B integers, -1 where unknown. features: for each frame (B, D) appearance vectors of any
+        length but 0, such as the embedding of a network, a row of NaN where unknown. whole: True if boxes are not cut off at
+        the image's edge.
         ValueError names what is wrong.
         """
         frames = [as_boxes(one, f"frame {k}") for k, one in enumerate(boxes)]
@@ -99,7 +104,8 @@ class Detections(types.Detections):
                 raise ValueError(f"frame {frame[np.argmin(good)]}: {reason}")
         table, label = types.label_table(names)
         tracks = np.maximum(per_box(track_ids, counts, -1, "track_ids"), -1).astype(np.int64)
-        return cls(times, frame, corners, label, score, depth, tracks, table, whole)
+        given = None if features is None else _unit_features(features, counts)
+        return cls(times, frame, corners, label, score, depth, tracks, table, whole, features=given)
 
     def __repr__(self) -> str:
         return f"Detections: {len(self)} boxes of {len(self.label_names)} labels in {len(self.frame_stamps)} frames"
@@ -150,6 +156,29 @@ class Log(types.Log):
 
     def _paths(self) -> dict[str, types.Trajectory | None]:
         return {"odometry": self.odometry, "localisation": self.localization}
+
+
+def _unit_features(features: Sequence[ArrayLike], counts: list[int]) -> Floats32:
+    """Return the unit appearance vectors (M, D) of all boxes, NaN where unknown. ValueError names a wrong frame.
+
+    counts: the number of boxes of each frame.
+    """
+    if len(features) != len(counts):
+        raise ValueError(f"features needs one list for each frame, got {len(features)} for {len(counts)}")
+    frames = [np.asarray(one, dtype=np.float64) for one in features]
+    length = next((one.shape[1] for one in frames if one.ndim == 2), 1)
+    for k, (one, count) in enumerate(zip(frames, counts, strict=True)):
+        if one.shape != (count, length) and (count or one.size):
+            raise ValueError(f"frame {k}: features are ({count}, {length}), got the shape {one.shape}")
+    if not 0 < length <= MAX_FEATURES:
+        raise ValueError(f"features have 1 to {MAX_FEATURES} numbers each, got {length}")
+    values = np.concatenate([np.zeros((0, length)), *(one.reshape(-1, length) for one in frames)])
+    units, good = unit_vectors(values)
+    wrong = np.flatnonzero(~good & ~np.isnan(values).all(axis=1))
+    if len(wrong):
+        frame = np.repeat(np.arange(len(counts)), counts)[wrong[0]]
+        raise ValueError(f"frame {frame}: features that are zero or not finite")
+    return units
 
 
 def _path(given: tuple[ArrayLike, ArrayLike] | types.Trajectory | None) -> types.Trajectory | None:

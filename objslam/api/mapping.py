@@ -54,6 +54,7 @@ def run(
     settings: Given = None,
     *,
     detector: str | PathLike[str] | None = None,
+    embed: str | PathLike[str] | None = None,
     map: ObjectMap | str | PathLike[str] | None = None,
     progress: Progress = lambda stage, done, total: None,
     **changes: Any,
@@ -65,6 +66,7 @@ def run(
         settings: a `Settings`, changes of the defaults such as {"mode": "joint", "rays.pixel_sigma": 2}, a YAML file, or the
             name of ready settings such as "odometry".
         detector: an ONNX model that finds the boxes in the log's images. They replace the boxes of the log.
+        embed: an ONNX image encoder that makes an appearance vector of each box, from the log's images.
         map: the map of another day, or its file or result folder. If the drive is found in this map, the result is in the
             frame of the map, and the objects of the map count as priors. `Result.localised` says whether it was found.
         progress: is called with the stage's name, the work done, and the total work, 0 if the total is unknown.
@@ -80,10 +82,10 @@ def run(
     if log.reading is not None:
         ledger.add(log.reading)
         told = ledger.lines()
-    model = None if detector is None else Path(detector)
-    mapped, log = map_log(log, chosen, ledger, model, progress, None if map is None else prior_map(map))
+    model, encoder = (None if given is None else Path(given) for given in (detector, embed))
+    mapped, log = map_log(log, chosen, ledger, model, progress, None if map is None else prior_map(map), encoder)
     _tell(line for line in ledger.lines() if line not in told)
-    return Result.of(mapped, log, detected=model is not None)
+    return Result.of(mapped, log, detected=model is not None or encoder is not None)
 
 
 def prior_map(given: ObjectMap | str | PathLike[str]) -> PriorMap:
@@ -102,15 +104,23 @@ def map_log(
     detector: Path | None,
     progress: Progress,
     known: PriorMap | None = None,
+    encoder: Path | None = None,
 ) -> tuple[RunResult, types.Log]:
     """Return the result of a run, and the log. A `detector` replaces the boxes of this log.
 
-    known: the map of another day, in which the drive is searched for.
+    known: the map of another day, in which the drive is searched for. encoder: gives the boxes their appearance vectors.
     """
     from objslam.mapping import pipeline
 
+    looks = None
+    if encoder is not None:
+        from objslam.detection import embed_log, load_encoder
+
+        looks = load_encoder(encoder, settings)  # A wrong model fails before the detector runs.
     if detector is not None:
         log = find_boxes(log, detector, settings, ledger, progress)
+    if looks is not None:
+        log = embed_log(log, looks, ledger, progress)
     return pipeline.run(log, settings, ledger, progress, known), log
 
 

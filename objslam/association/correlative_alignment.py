@@ -16,13 +16,24 @@ _AT_ONCE = 2_000_000  # The most distances computed together. A larger value nee
 _MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared deviations. Some ranges are wrong.
 
 
-def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, spread: Floats) -> Floats:
+def align(
+    rays: Rays,
+    positions: Floats,
+    labels: Ints,
+    map_T_camera: Floats,
+    centre: Floats,
+    spread: Floats,
+    alike: Floats | None = None,
+) -> Floats:
     """Return the planar correction (4, 4) in map of the camera poses that best aligns the rays with the landmarks.
 
     The cost of a ray is its squared deviation from the best landmark of its label, at most `STRAY_RAY`. positions, labels:
     (N, 3) m and (N,) of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,) standard
-    deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid.
+    deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid. alike: (R, N) the log
+    odds that each ray shows each landmark, from its appearance. None if this is not known.
     """
+    if alike is None:
+        alike = np.zeros((len(rays), len(positions)))
     steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
     grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
     cost = ((grid / np.maximum(spread, 1e-6)) ** 2).sum(axis=1)
@@ -32,16 +43,24 @@ def align(rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, cen
         some = rays.take(np.arange(first, min(first + few, len(rays))))
         for begin in range(0, len(grid), size):
             part = slice(begin, begin + size)
-            cost[part] += _misfit(some, positions, labels, map_T_camera, centre, grid[part])
+            gain = 2 * alike[first : first + few]
+            cost[part] += _misfit(some, positions, labels, map_T_camera, centre, grid[part], gain)
     correction = lift_se2(grid[np.argmin(cost)])
     correction[:3, 3] += centre - correction[:3, :3] @ centre
     return correction
 
 
 def _misfit(
-    rays: Rays, positions: Floats, labels: Ints, map_T_camera: Floats, centre: Floats, corrections: Floats
+    rays: Rays,
+    positions: Floats,
+    labels: Ints,
+    map_T_camera: Floats,
+    centre: Floats,
+    corrections: Floats,
+    gain: Floats,
 ) -> Floats:
-    """Return the cost (H,) of all rays together under each of the corrections (H, 3)."""
+    """Return the cost (H,) of all rays together under each of the corrections (H, 3). gain: (R, N) lowers the cost of each
+    ray at each landmark."""
     origin, direction = rays.in_map(map_T_camera)
     offset, level = origin - centre, np.hypot(direction[:, 0], direction[:, 1])
     cos, sin = np.cos(corrections[:, 2, None]), np.sin(corrections[:, 2, None])
@@ -55,7 +74,7 @@ def _misfit(
     deviation = angle**2 / (sigma**2 + (_LANDMARK_SIGMA / distance) ** 2)
     miss = (distance - (rays.range * level)[:, None]) ** 2 / (rays.range_sigma**2 + _LANDMARK_SIGMA**2)[:, None]
     deviation += np.where(np.isfinite(rays.range)[:, None], np.minimum(miss, _MOST_RANGE_COST), 0.0)
-    cost = np.where(rays.label[:, None] == labels, deviation, STRAY_RAY)
+    cost = np.where(rays.label[:, None] == labels, deviation - gain, STRAY_RAY)
     return np.asarray(cost.min(axis=2, initial=STRAY_RAY).sum(axis=1))
 
 

@@ -250,6 +250,14 @@ def size_costs(state: State, edges: Edges) -> Floats:
     return np.where(told, np.clip(squared - _SIZE_FREE, 0.0, SIZE_LOSS), 0.0)
 
 
+def _appearance_gain(state: State, edges: Edges) -> Floats | float:
+    """Return the amount (E,) by which each edge costs less because the ray looks like its landmark. 0 without vectors."""
+    if state.looks is None:
+        return 0.0
+    own = state.matched[edges.ray] == edges.landmark
+    return 2 * state.looks.ray_odds(state.obs, edges.ray, edges.landmark, own)
+
+
 def gate_limit(share: float) -> float:
     """Return the squared deviation (chi-squared, 2 degrees of freedom) below which a `share` of correct matches lies."""
     return float(-2 * np.log1p(-share))
@@ -271,18 +279,26 @@ def alternate(
         obs, old, before = state.obs, state.landmarks, state.matched
         edges = gated_edges(obs, old, gate)
         most = gate
-        cost = edges.cost - track_bonus(edges, obs.track, before)
+        cost = edges.cost - track_bonus(edges, obs.track, before) - _appearance_gain(state, edges)
         if unmatched is not None:
             cost, most = cost - unmatched(state, edges), 0.0
         matched = best_assignment(edges, cost, obs.frame, most)
         held = np.flatnonzero(matched >= 0)
         position = refine(obs, held, matched[held], old.position, old.noise)
-        state = State(obs, state.view, replace(old, position=position), matched)
+        state = replace(state, landmarks=replace(old, position=position), matched=matched)
         stays = plausible(state)
         state = replace(state, landmarks=replace(state.landmarks, noise=state.noise)).keep(stays)
         if np.array_equal(matched, before):
             break
     return state
+
+
+def explained(state: State, gate: float) -> Floats:
+    """Return for each label (L,) by how much its landmarks lower the cost of its rays, against rays without a landmark."""
+    edges = gated_edges(state.obs, state.landmarks, gate)
+    own = state.matched[edges.ray] == edges.landmark
+    gain = gate - edges.cost + _appearance_gain(state, edges)
+    return np.asarray(np.bincount(state.obs.label[edges.ray[own]], gain[own], state.landmarks.accepts.shape[1]), dtype=float)
 
 
 def near(state: State) -> Bools:

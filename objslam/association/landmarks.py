@@ -8,6 +8,8 @@ from typing import Self
 
 import numpy as np
 
+from objslam.association.appearance.cosine_ratio import CosineRatio
+from objslam.association.appearance.evidence import Looks
 from objslam.association.observations import Observations
 from objslam.association.refinement import BEHIND, normalised_residuals, variance
 from objslam.association.visibility import CameraFrames, DetectionHistory, detection_history
@@ -61,6 +63,7 @@ class PredictedLandmarks:
 @dataclass(frozen=True)
 class State:
     """Landmarks and their observations. matched: (R,) the landmark of each observation, or -1. view: the observed frames.
+    ratio: what the appearance of boxes says, None without appearance vectors.
 
     Properties are computed on first use and cached. R is the number of rays, P the number of rays with a landmark.
     """
@@ -69,6 +72,7 @@ class State:
     view: CameraFrames
     landmarks: Landmarks
     matched: Ints
+    ratio: CosineRatio | None = None
 
     @cached_property
     def count(self) -> int:
@@ -156,6 +160,11 @@ class State:
         """Detections and missed detections of the landmarks."""
         return detection_history(self.obs, self.matched, self.landmarks.position, self.label, self.view)
 
+    @cached_property
+    def looks(self) -> Looks | None:
+        """What the landmarks look like, None if this was not learnt."""
+        return None if self.ratio is None else Looks.of(self.obs, self.matched, self.count, self.ratio)
+
     def keep(self, which: Bools) -> State:
         """Keep the landmarks in the mask `which` (N,), and unassign the rays of all others."""
         if which.all():
@@ -163,6 +172,12 @@ class State:
         number = np.append(np.cumsum(which) - 1, -1)
         matched = np.where(np.append(which, False)[self.matched], number[self.matched], -1)
         return replace(self, landmarks=self.landmarks.take(which), matched=matched)
+
+    def joined(self, other: State) -> State:
+        """Return the landmarks of this state, followed by those of another state with the same rays. A ray of both keeps its
+        landmark of this state."""
+        matched = np.where((self.matched < 0) & (other.matched >= 0), other.matched + self.count, self.matched)
+        return replace(self, landmarks=self.landmarks.and_also(other.landmarks), matched=matched)
 
     def merge(self, target: Ints) -> State:
         """Merge each landmark into the landmark `target` (N,). A landmark whose target is its own index stays."""

@@ -8,7 +8,7 @@ from objslam.association.existence import detection_rates
 from objslam.association.gating import gated_edges
 from objslam.association.label_fusion import SIZE_RATIO
 from objslam.association.landmarks import State
-from objslam.association.observations import Observations
+from objslam.association.observations import Observations, overlap
 from objslam.association.refinement import BEHIND, normalised_residuals, range_costs, refine, squared_offsets, variance
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
@@ -115,8 +115,8 @@ def _with_rays(a: Ints, b: Ints, state: State) -> _Pairs:
 def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expected: Ints) -> Floats:
     """Return the decrease (P,) of -2 ln likelihood by one object instead of two.
 
-    It counts the fit of the rays, second boxes in one frame, missed detections, and the number of objects. both_seen,
-    both_expected: (P,) the numbers of frames in which both landmarks are detected, and in which both should be.
+    It counts the fit of the rays, second boxes in one frame, missed detections, the appearance, and the number of objects.
+    both_seen, both_expected: (P,) the numbers of frames in which both landmarks are detected, and in which both should be.
     """
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise
@@ -136,6 +136,8 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
     one[second] = np.where(duplicate, 0.0, gate)
     two[second] = np.where(duplicate, 0.0, two[second])
     saved = np.bincount(pairs.pair, two - one, count) + _OBJECT_COST + 3 * np.log(number[a] + number[b])
+    if state.looks is not None:
+        saved += 2 * state.looks.landmark_odds(a, b, state.label[a])
     rates = detection_rates(history, state.label, len(state.unassigned))
     misses = rates.cost(history.seen, history.expected, state.label)
     stronger = np.where(number[a] >= number[b], state.label[a], state.label[b])
@@ -172,11 +174,3 @@ def _seen_apart(obs: Observations, pairs: _Pairs, matched: Ints) -> Ints:
     both = np.flatnonzero((np.diff(pair) == 0) & (np.diff(obs.frame[ray]) == 0))
     different = overlap(obs.box[ray[both]], obs.box[ray[both + 1]]) < _DUPLICATE_OVERLAP
     return np.bincount(pair[both[different]], minlength=len(pairs.a))
-
-
-def overlap(one: Floats, two: Floats) -> Floats:
-    """Return the intersection over union of boxes (..., 4), for shapes that fit together."""
-    low, high = np.maximum(one[..., :2], two[..., :2]), np.minimum(one[..., 2:], two[..., 2:])
-    common = np.maximum(high - low, 0.0).prod(axis=-1)
-    total = (one[..., 2:] - one[..., :2]).prod(axis=-1) + (two[..., 2:] - two[..., :2]).prod(axis=-1) - common
-    return np.asarray(common / np.maximum(total, 1e-12))

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from objslam.association.appearance.evidence import Looks
 from objslam.association.gating import best_assignment, gate_limit, gated_edges
 from objslam.association.landmarks import Landmarks
 from objslam.association.observations import Observations
@@ -20,6 +21,7 @@ def assign(
     *,
     pose_covariance: Floats | None = None,
     gate: float = 0.999,
+    looks: Looks | None = None,
 ) -> Ints:
     """Return the most likely landmark (R,) of each ray, -1 for none. A landmark gets at most one ray per frame.
 
@@ -31,6 +33,7 @@ def assign(
         map_T_camera: (K, 4, 4) of the rays' keyframes. sigma: (R,) rad, noise of the rays.
         pose_covariance: (K, 6, 6) of the cameras, in camera coordinates, rotation first, as in GTSAM's marginals.
         gate: the share of correct matches that the bearing gate accepts.
+        looks: what the landmarks look like, None if this is not known.
     """
     origin, direction = rays.in_map(map_T_camera)
     obs = Observations.of_lines(origin, direction, sigma, rays.range, rays.range_sigma, rays.label)
@@ -44,7 +47,11 @@ def assign(
     limit = gate_limit(gate)
     edges = gated_edges(obs, landmarks, limit, pose)
     unmatched = limit + RANGE_LOSS + float(edges.vague.max(initial=0.0)) + 1e-9
-    chosen = best_assignment(edges, edges.cost, rays.keyframe, unmatched)
+    cost = edges.cost
+    if looks is not None:
+        mine = np.zeros(len(cost), dtype=bool)
+        cost = cost - 2 * looks.ray_odds(rays, edges.ray, known[edges.landmark], mine)
+    chosen = best_assignment(edges, cost, rays.keyframe, unmatched)
     return np.where(chosen >= 0, known[chosen], -1) if len(known) else chosen
 
 

@@ -6,6 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from objslam.core.appearance.features import FeatureTable
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_median
@@ -21,7 +22,8 @@ class Observations:
     effect. frame: (R,) index of the frame in time order. label: (R,). origin: (R, 3) m in map. direction: (R, 3) unit in
     map. sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if
     unknown. range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px.
-    track: (R,) id of the track, -1 if unknown."""
+    track: (R,) id of the track, -1 if unknown. feature: (R,) the row of the box's appearance vector in feature_table, -1
+    without one. Both are None if no box has one."""
 
     frame: Ints
     label: Ints
@@ -34,6 +36,8 @@ class Observations:
     size: Floats
     box: Floats
     track: Ints
+    feature: Ints | None = None
+    feature_table: FeatureTable | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -98,6 +102,7 @@ def observe(
     lines = Observations.of_lines(origin, direction, sigma[ray], range_, range_sigma, rays.label)
     size = size_per_metre(rays, keyframes, cameras)
     obs = replace(lines, frame=frame, position_sigma=position_sigma, size=size, box=rays.box, track=rays.track_id)
+    obs = replace(obs, feature=rays.feature, feature_table=rays.feature_table)
     return obs, ray, keyframe
 
 
@@ -130,3 +135,11 @@ def extents(
     size = size_per_metre(rays.take(held), keyframes, cameras) * distance[:, None]
     size[~np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[held]]]] = np.nan
     return grouped_median(size, index, len(association.label))
+
+
+def overlap(one: Floats, two: Floats) -> Floats:
+    """Return the intersection over union of boxes (..., 4), for shapes that fit together."""
+    low, high = np.maximum(one[..., :2], two[..., :2]), np.minimum(one[..., 2:], two[..., 2:])
+    common = np.maximum(high - low, 0.0).prod(axis=-1)
+    total = (one[..., 2:] - one[..., :2]).prod(axis=-1) + (two[..., 2:] - two[..., :2]).prod(axis=-1) - common
+    return np.asarray(common / np.maximum(total, 1e-12))

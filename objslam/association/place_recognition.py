@@ -75,13 +75,19 @@ class Recognition:
 
 
 def recognise_place(
-    here: Constellation, there: Constellation, pivot: Floats, prior: Floats, density: Floats, possible: Bools
+    here: Constellation,
+    there: Constellation,
+    pivot: Floats,
+    prior: Floats,
+    density: Floats,
+    possible: Bools,
+    alike: Floats | float = 0.0,
 ) -> Recognition | None:
     """Find the correction within the drift that moves landmarks `here` (N) onto landmarks `there` (M). None if none fits.
 
     pivot: (2,) m, the point about which the correction turns. prior: (3, 3) covariance of the correction in x, y (m) and yaw
     (rad), with mean zero. density: (N,) number of landmarks `there` per m^2 that have the label of each landmark `here`.
-    possible: (N, M) which pairs may be the same landmark.
+    possible: (N, M) which pairs may be the same landmark. alike: (N, M) the log odds of each pair from its appearance.
     """
     centre = np.append(pivot, 0.0)
     total = here.covariance[:, None] + there.covariance
@@ -91,7 +97,7 @@ def recognise_place(
         target=there.position - centre,
         information=np.asarray(np.linalg.inv(total)),
         spread=np.sqrt(np.trace(planar, axis1=2, axis2=3) / 2),
-        peak=-np.log(2 * np.pi) - 0.5 * np.log(np.linalg.det(planar)) - np.log(density)[:, None],
+        peak=-np.log(2 * np.pi) - 0.5 * np.log(np.linalg.det(planar)) - np.log(density)[:, None] + alike,
         prior=prior,
         weight=np.asarray(np.linalg.inv(prior)),
         possible=possible,

@@ -8,20 +8,21 @@ from typing import Annotated
 import typer
 
 from objslam.cli.console import say
-from objslam.cli.options import ClassNames, Config, Json, Set, settings_of
+from objslam.cli.options import ClassNames, Config, EncoderModel, Json, Set, settings_of
 
 
 def detect(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="An ONNX detector.")],
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="A photo: PNG, JPEG, ...")],
     out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG file for the photo with the boxes drawn.")] = None,
+    embed: EncoderModel = None,
     config: Config = None,
     set_: Set = None,
     names: ClassNames = None,
     json: Json = False,
 ) -> None:
     """Try a detector on one photo: say how the model is read, and which boxes it finds. No log is needed."""
-    from objslam.detection import load_detector
+    from objslam.detection import load_detector, load_encoder
     from objslam.errors import LogError
     from objslam.io.atomic_files import write_file
     from objslam.io.images import decode_colour
@@ -34,6 +35,7 @@ def detect(
     if pixels is None:
         raise LogError("this is no image, or it is too large", where=str(image))
     detector = load_detector(model, settings.detector)
+    encoder = None if embed is None else load_encoder(embed, settings)
     (found,) = detector.detect([pixels])
     for warning in detector.warnings:
         say(f"warning: {warning}", stderr=True)
@@ -44,6 +46,9 @@ def detect(
         {"box": box, "label": label, "score": score}
         for box, label, score in zip(found.boxes.tolist(), found.labels, found.scores.tolist(), strict=True)
     ]
+    vectors = None if encoder is None or not rows else encoder.encode(pixels, found.boxes)
+    if vectors is not None:
+        rows = [{**row, "features": vector} for row, vector in zip(rows, vectors.tolist(), strict=True)]
     if json:
         say(dump_json({"layout": recipe.layout, "image": [width, height], "boxes": rows}), end="")
         return
@@ -52,6 +57,8 @@ def detect(
     for row in rows:
         x1, y1, x2, y2 = row["box"]
         say(f"  {row['label']} {row['score']:.2f}: x {x1:.0f} to {x2:.0f}, y {y1:.0f} to {y2:.0f} px")
+    if vectors is not None:
+        say(f"{embed}: an appearance vector of {vectors.shape[1]} numbers for each box")
     if not rows:
         say("nothing was found: try --set detector.min_score=0.1, or a photo of a thing that the model knows")
     if out is not None:

@@ -70,6 +70,14 @@ Radius = Annotated[
 ]
 DetectorModel = Annotated[Path | None, typer.Option(DETECTOR.flag, help=DETECTOR.help)]
 ClassNames = Annotated[str | None, typer.Option(NAMES.flag, metavar=NAMES.metavar, help=NAMES.help)]
+EncoderModel = Annotated[
+    Path | None,
+    typer.Option(
+        "--embed",
+        metavar="MODEL",
+        help="ONNX image encoder. It makes an appearance vector of each box from the rgb images.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Print warnings and errors only.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs in place of text.")]
 CalibrationFile = Annotated[

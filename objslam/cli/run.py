@@ -14,6 +14,7 @@ from objslam.cli.options import (
     CalibrationFile,
     Config,
     DetectorModel,
+    EncoderModel,
     Json,
     Mode,
     Out,
@@ -76,6 +77,7 @@ def run(
     *,
     options: SourceOptions,
     detector: DetectorModel = None,
+    embed: EncoderModel = None,
     calibration: CalibrationFile = None,
     map_: PriorMapPath = None,
     quiet: Quiet = False,
@@ -94,7 +96,7 @@ def run(
     with output_folder(out):
         tell = _say_nothing if quiet else _say_json if json else say_result
         known = None if map_ is None else prior_map(map_)
-        result = run_log(read(log, ledger, options), settings, ledger, out, detector, tell, known)
+        result = run_log(read(log, ledger, options), settings, ledger, out, detector, tell, known, embed)
     if known is not None and not result.summary["localisation"]["localised"]:
         raise typer.Exit(NOT_LOCALISED)
 
@@ -107,10 +109,12 @@ def run_log(
     detector: Path | None = None,
     tell: Callable[[RunResult, str, Path, tuple[str, ...]], None] | None = None,
     known: PriorMap | None = None,
+    embed: Path | None = None,
 ) -> RunResult:
     """Map the objects of a log, write the result folder, and print a summary. A `detector` replaces the boxes of the log.
 
     tell: prints the summary; `say_result` by default. known: the map of another day in which the drive is to be found.
+    embed: the encoder that gives the boxes their appearance vectors.
     """
     import time
 
@@ -118,10 +122,11 @@ def run_log(
     from objslam.output.result_folder import write_result
 
     with progress_bar() as show:
-        result, log = map_log(log, settings, ledger, detector, show, known)
+        result, log = map_log(log, settings, ledger, detector, show, known, embed)
         show("writing", 0, 0)
         begin = time.perf_counter()
-        removed = write_result(result, out, log.truth, detected=log.cameras if detector is not None else ())
+        made = detector is not None or embed is not None
+        removed = write_result(result, out, log.truth, detected=log.cameras if made else ())
         seconds = {**result.summary["seconds"], "write": time.perf_counter() - begin}
     report(ledger)
     times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())

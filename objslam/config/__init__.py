@@ -3,6 +3,7 @@ describe objects, rooms or robots are settings. Values that only a method needs 
 
 from objslam.config.calibration import CalibrationSettings
 from objslam.config.detector import Detector
+from objslam.config.encoder import Encoder
 from objslam.config.mapping import AssociationSettings, Live, Loss, Odometry, Output, Reconstruction, Triangulation
 from objslam.config.noise import Noise
 from objslam.config.section import Device, NotNegative, Positive, Section
@@ -13,6 +14,7 @@ __all__ = [
     "CalibrationSettings",
     "Detector",
     "Device",
+    "Encoder",
     "Live",
     "Loss",
     "Noise",

@@ -12,6 +12,7 @@ from objslam.config import mapping
 from objslam.config.calibration import CalibrationSettings
 from objslam.config.checks import Checks
 from objslam.config.detector import Detector
+from objslam.config.encoder import Encoder
 from objslam.config.noise import Noise
 from objslam.config.section import Section
 from objslam.config.tags import Tags
@@ -29,6 +30,7 @@ class Settings(Section):
     with a localisation, else joint. fixed leaves the drift of odometry out of the covariances."""
     seed: Annotated[int, Field(ge=0)] = 0
     detector: Detector = Detector()
+    encoder: Encoder = Encoder()
     poses: mapping.Poses = mapping.Poses()
     rays: mapping.RayNoise = mapping.RayNoise()
     depth: mapping.Depth = mapping.Depth()

@@ -9,7 +9,8 @@ from typing import Any, Literal, Self, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.appearance.features import ranked
+from objslam.core.arrays import Bools, Floats, Floats32
 from objslam.core.bodies.body import Body, surer_body
 from objslam.core.bodies.body_entry import BODY_COLUMNS, body_row
 from objslam.core.bodies.tag_pose import TAG_COLUMNS, TagPose, tag_row
@@ -86,7 +87,8 @@ class MapObject:
     label as one object. seen_from: from where it was detected, None if unknown. life: its history over several sessions,
     None in the map of a single run. tag: the rotation and size of a fiducial, None for another object. body: its size and
     heading around the position, None for a point. ray_point: (3,) m, where the rays through the centres of its boxes meet,
-    None if that is the position itself.
+    None if that is the position itself. features: (D,) the unit appearance vector of its best view, which is its largest box
+    that lies inside the image. None if its boxes have none.
     """
 
     id: int
@@ -109,6 +111,7 @@ class MapObject:
     body: Body | None = None
     ray_point: Floats | None = None
     tag: TagPose | None = None
+    features: Floats32 | None = None
 
     @property
     def sigma(self) -> float | None:
@@ -223,6 +226,15 @@ class ObjectMap:
         inside = ((positions[:, : len(lower)] >= lower) & (positions[:, : len(lower)] <= upper)).all(axis=1)
         return tuple(objects[i] for i in np.flatnonzero(inside))
 
+    def search(self, vector: ArrayLike, k: int = 5) -> tuple[tuple[MapObject, float], ...]:
+        """Return the k objects that look most like an appearance vector (D,), and their cosines to it, the largest first.
+
+        Unresolved objects are found too, objects without a vector are not. The vector must come from the encoder that made
+        those of the map. ValueError if it has another length, or is zero or not finite.
+        """
+        seen = [(o, o.features) for o in self.objects if o.features is not None]
+        return tuple((seen[i][0], cosine) for i, cosine in ranked([look for _, look in seen], vector, k))
+
     def merge(self, other: ObjectMap) -> Self:
         """Merge another map into this one, and fuse the objects that both maps have.
 
@@ -316,4 +328,5 @@ def _fuse(a: MapObject, b: MapObject) -> MapObject:
         existence=None if a.existence is None or b.existence is None else float(np.fmax(a.existence, b.existence)),
         body=surer_body(a.body, b.body),
         ray_point=None,
+        features=b.features if a.features is None else a.features,
     )

@@ -12,7 +12,8 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.appearance.features import FeatureTable, are_unit_vectors
+from objslam.core.arrays import Bools, Floats, Floats32, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 
@@ -63,7 +64,8 @@ class Detections:
     the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge,
     as with fiducials, of which a detector needs all corners. Then box centres are valid up to the edge. corners: (M, 4, 2)
     px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if no box has corners.
-    ValueError if a shape, an index or the order is wrong.
+    features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box has one. ValueError if a
+    shape, an index or the order is wrong.
     """
 
     frame_stamps: Floats
@@ -76,6 +78,7 @@ class Detections:
     label_names: tuple[str, ...]
     whole: bool = False
     corners: Floats | None = None
+    features: Floats32 | None = None
 
     def __post_init__(self) -> None:
         m = len(self.frame)
@@ -83,6 +86,11 @@ class Detections:
         for name in _BOX_COLUMNS:
             _need(getattr(self, name).shape == (m,), f"{name} must be (M,) like the boxes")
         _need(self.corners is None or self.corners.shape == (m, 4, 2), "corners must be (M, 4, 2) like the boxes")
+        if self.features is not None:
+            _need(self.features.ndim == 2 and len(self.features) == m, "features must be (M, D) like the boxes")
+            _need(
+                self.features.dtype == np.float32 and are_unit_vectors(self.features), "features must be unit float32 rows"
+            )
         _need((np.diff(self.frame_stamps) > 0).all(), "the stamps of the frames must increase")
         _need((np.diff(self.frame) >= 0).all(), "boxes must come in the order of their frames")
         if m:
@@ -100,7 +108,8 @@ class Detections:
     def take(self, boxes: Bools | Ints) -> Self:
         """Select boxes by a mask or increasing indices. All frames stay."""
         values: dict[str, Any] = {name: getattr(self, name)[boxes] for name in ("boxes", *_BOX_COLUMNS)}
-        return replace(self, **values, corners=None if self.corners is None else self.corners[boxes])
+        values |= {name: given[boxes] for name in ("corners", "features") if (given := getattr(self, name)) is not None}
+        return replace(self, **values)
 
 
 @dataclass(frozen=True)
@@ -252,7 +261,8 @@ class Rays:
     track_id: (R,) -1 if unknown. offset: (R, 3) m, where each ray begins in the frame of its direction. None means at the
     origin. corners: (R, 4, 3) unit, in the camera frame, the directions to the corners of a square fiducial, NaN for another
     object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
-    the cut off boxes of the same images, None if they were not collected.
+    the cut off boxes of the same images, None if they were not collected. feature: (R,) the row of each ray's appearance
+    vector in feature_table, -1 without one. Both are None if no ray has one.
     """
 
     keyframe: Ints
@@ -270,6 +280,8 @@ class Rays:
     corners: Floats | None = None
     corner_sigma: Floats | None = None
     cut: CutBoxes | None = None
+    feature: Ints | None = None
+    feature_table: FeatureTable | None = None
 
     def __len__(self) -> int:
         return len(self.keyframe)

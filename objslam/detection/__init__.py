@@ -1,7 +1,9 @@
-"""Run a CNN detector, which may be any ONNX model, on the images of a log. Only this folder imports onnxruntime."""
+"""Run a CNN detector and an image encoder, any ONNX models, on the images of a log. Only this folder imports onnxruntime."""
 
 from objslam.detection.cache import default_cache
 from objslam.detection.detect_log import detect_log
 from objslam.detection.detector import Boxes, Detector, load_detector
+from objslam.detection.embed_log import embed_log
+from objslam.detection.encoder import Encoder, load_encoder
 
-__all__ = ["Boxes", "Detector", "default_cache", "detect_log", "load_detector"]
+__all__ = ["Boxes", "Detector", "Encoder", "default_cache", "detect_log", "embed_log", "load_detector", "load_encoder"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.core.arrays import Array, Floats
-from objslam.detection.recipe import Recipe
+from objslam.detection.recipe import EncoderRecipe, Recipe
 from objslam.errors import ConfigError
 
 
@@ -52,7 +52,7 @@ def fit(recipe: Recipe, width: int, height: int) -> Fit:
     return Fit(width, height, input_width, input_height, left, top, content_width, content_height)
 
 
-def fill(recipe: Recipe, images: Sequence[Array], where: Fit, count: int) -> Array:
+def fill(recipe: Recipe | EncoderRecipe, images: Sequence[Array], where: Fit, count: int) -> Array:
     """Convert images (H, W, 3), uint8 BGR, of one size to the network input (count, 3, H, W). If there are fewer images than
     `count`, the rest of the input is grey."""
     import cv2

@@ -28,7 +28,8 @@ class Habits:
 
 _YOLO = Habits("letterbox", "rgb", 255.0, "cxcywh", "pixels", nms=True)
 _YOLOX = Habits("corner", "bgr", 1.0, "cxcywh", "pixels", nms=True)
-_IMAGENET: tuple[Three, Three] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # The mean and std of ImageNet's channels.
+IMAGENET: tuple[Three, Three] = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""The mean and the standard deviation of the channels of ImageNet, red first."""
 HABITS: dict[Layout, Habits] = {
     "ssd": Habits("stretch", "rgb", 255.0, "xyxy", None, nms=False),
     "yolov8": _YOLO,
@@ -36,7 +37,7 @@ HABITS: dict[Layout, Habits] = {
     "end_to_end": Habits("letterbox", "rgb", 255.0, "xyxy", "pixels", nms=False),
     "yolox": _YOLOX,
     "yolox_decoded": _YOLOX,
-    "detr": Habits("stretch", "rgb", 255.0, "cxcywh", "fractions", False, "sigmoid", *_IMAGENET),
+    "detr": Habits("stretch", "rgb", 255.0, "cxcywh", "fractions", False, "sigmoid", *IMAGENET),
 }
 
 
@@ -72,3 +73,17 @@ class Recipe(Habits):
     def as_text(self) -> str:
         """Return the recipe as text. Equal recipes have equal texts."""
         return json.dumps(asdict(self), sort_keys=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncoderRecipe:
+    """The encoder settings of a model, with every value determined. A crop is stretched to width and height, px."""
+
+    colour: Colour
+    divide_by: float
+    mean: Three
+    std: Three
+    width: int
+    height: int
+    margin: float  # The part of a box's width and height that is added on each side.
+    pad: int = 0  # A stretched crop has no padding.

@@ -3,7 +3,8 @@
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.appearance.features import FeatureTable
+from objslam.core.arrays import Bools, Floats, Floats32, Ints
 from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
@@ -27,6 +28,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     place = {name: i for i, name in enumerate(label_names)}
     columns: list[tuple[Floats | Ints, ...]] = []
     cut: list[tuple[Floats | Ints, ...]] = []
+    features: list[Floats32 | None] = []
     for index, camera_log in enumerate(log.cameras):
         detections, camera = camera_log.detections, camera_log.camera
         if detections is None:
@@ -47,6 +49,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         corners, corner_sigma = _corner_rays(boxes, camera, settings, ledger)
         measures = boxes.depths, names[boxes.label], boxes.scores, boxes.boxes, boxes.track_ids
         columns.append((*of_rays, *measures, corners, corner_sigma))
+        features.append(_features(boxes, features, camera, ledger))
     keyframe, direction, sigma, depth, label, score, box, track_id, corners, corner_sigma = (
         np.concatenate(c) for c in zip(*columns, strict=True)
     )
@@ -55,6 +58,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     if not settings.depth.use:
         depth = np.full(len(depth), np.nan)
     ranges = (depth / direction[:, 2])[order]
+    feature, table = _table(features, [len(column[0]) for column in columns])
     range_sigma, range_bias = range_noise(
         ranges, keyframes.camera[keyframe[order]], [one.camera for one in log.cameras], settings
     )
@@ -73,6 +77,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         corners=corners[order] if seen else None,
         corner_sigma=corner_sigma[order] if seen else None,
         cut=CutBoxes(*(np.concatenate(c) for c in zip(*cut, strict=True))),
+        feature=None if feature is None else feature[order],
+        feature_table=table,
     )
 
 
@@ -112,6 +118,36 @@ def _corner_rays(boxes: Detections, camera: Camera, settings: Settings, ledger: 
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     sigma[known[whole]] = _radians(camera, middle, np.full(len(middle), settings.tags.corner_sigma))
     return directions, sigma
+
+
+def _features(boxes: Detections, before: list[Floats32 | None], camera: Camera, ledger: Ledger) -> Floats32 | None:
+    """Return the appearance vectors (M, D) of boxes, None if they have none.
+
+    Vectors of another length than those of the cameras before cannot be compared with them. The ledger counts them.
+    """
+    if boxes.features is None:
+        return None
+    length = next((one.shape[1] for one in before if one is not None), boxes.features.shape[1])
+    if boxes.features.shape[1] == length:
+        return boxes.features
+    reason = "features of another length than those of the first camera (the boxes stay without)"
+    ledger.drop(reason, int((~np.isnan(boxes.features[:, 0])).sum()), spoken_name(camera.name))
+    return None
+
+
+def _table(features: list[Floats32 | None], counts: list[int]) -> tuple[Ints | None, FeatureTable | None]:
+    """Return the row of each ray (R,) in a table of all vectors, -1 without a vector, and the table. None without vectors.
+
+    features: the vectors of the boxes of each camera. counts: the numbers of these boxes.
+    """
+    row, rows, at = np.full(sum(counts), -1, dtype=np.int64), list[Floats32](), 0
+    for vectors, count in zip(features, counts, strict=True):
+        if vectors is not None:
+            known = np.flatnonzero(~np.isnan(vectors[:, 0]))
+            row[at + known] = sum(map(len, rows)) + np.arange(len(known))
+            rows.append(vectors[known])
+        at += count
+    return (row, FeatureTable(np.concatenate(rows))) if (row >= 0).any() else (None, None)
 
 
 def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Ledger) -> Ints:

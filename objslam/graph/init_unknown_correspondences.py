@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from objslam.association.appearance.cosine_ratio import CosineRatio
+from objslam.association.appearance.evidence import Looks, learn_ratio
 from objslam.association.correlative_alignment import align
 from objslam.association.global_association import associate_globally
 from objslam.association.nearest_neighbour import assign
@@ -47,6 +49,9 @@ starts farther from its optimum, so it needs more. Larger numbers are slower."""
 _STRAIN = 200.0
 """A loop closure may raise the cost (a sum of squared deviations) by this amount for each joined landmark. A larger amount
 closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for each landmark, wrong ones by 240 or more."""
+_LESSON = 50
+"""Half the number of rays with a landmark from which the likelihood ratio of appearances is learnt first. It is learnt again
+each time the number has doubled. A larger number learns later."""
 _PAIRS = 150
 """The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
 next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.
@@ -79,6 +84,8 @@ def initialize_unknown(
     known = Landmarks.none()
     refused: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
     none, pairs_left = np.zeros(0, dtype=np.int64), 0
+    ratio: CosineRatio | None = None
+    taught = _LESSON  # The number of rays with a landmark from which the ratio was learnt last.
     graph = build_graph(measured.factors(owner, none, none, known.position, end=1))
     for begin in range(1, len(keyframes), settings.joint.explore_step):
         end = min(begin + settings.joint.explore_step, len(keyframes))
@@ -86,8 +93,9 @@ def initialize_unknown(
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
 
         new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
+        looks = None if ratio is None else Looks.of(rays, owner, len(known), ratio)
         owner[new], map_T_camera = _recognise(
-            rays, new, known, _active(known, heading, begin), keyframes, map_T_camera, begin, end
+            rays, new, known, _active(known, heading, begin), keyframes, map_T_camera, begin, end, looks
         )
         fresh = new[owner[new] >= 0]
         stretch = max(0, end - _STRETCH, int(np.searchsorted(heading, heading[end - 1] - HORIZON**2)))
@@ -101,11 +109,14 @@ def initialize_unknown(
             map_T_camera[:end] = read_poses(values)
             known.position = read_points(values)
             known.covariance = _covariances(rays, owner, known.position, map_T_camera)
+        if (held := int((owner >= 0).sum())) >= 2 * taught:
+            ratio, taught = learn_ratio(rays, rays.keyframe, rays.track_id, owner, len(rays.label_names)), held
         pairs_left += _PAIRS * (end - begin)
         if len(known) and pairs_left > 0:
             active, now = _active(known, heading, end - 1), end - 1
             of = settings.association
-            found, compared = find_closure(known, active, rays, owner, graph, values, map_T_camera, now, of)
+            looks = None if ratio is None else Looks.of(rays, owner, len(known), ratio)
+            found, compared = find_closure(known, active, rays, owner, graph, values, map_T_camera, now, of, looks)
             pairs_left -= compared
             if found is not None and (pairs := (tuple(found.now), tuple(found.before))) not in refused:
                 closed = _close(found, known, measured, owner, map_T_camera[:end], heading)
@@ -161,7 +172,15 @@ def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
 
 
 def _recognise(
-    rays: Rays, new: Ints, known: Landmarks, active: Bools, keyframes: Keyframes, map_T_camera: Floats, begin: int, end: int
+    rays: Rays,
+    new: Ints,
+    known: Landmarks,
+    active: Bools,
+    keyframes: Keyframes,
+    map_T_camera: Floats,
+    begin: int,
+    end: int,
+    looks: Looks | None,
 ) -> tuple[Ints, Floats]:
     """Return the active landmark of each new ray (n,), or -1, and the poses (K, 4, 4) with `begin` to `end` - 1 aligned."""
     if len(new) == 0 or not active.any():
@@ -170,7 +189,11 @@ def _recognise(
     drift = _drifted(keyframes, begin - 1)
     centre, spread = map_T_camera[begin, :3, 3], _planar_sigmas(drift[end - 1], map_T_camera[end - 1])
     # The whole step is aligned first, because the heading may err by more than the angle between two landmarks.
-    correction = align(some, known.position[which], known.label[which], map_T_camera, centre, spread)
+    alike = None
+    if looks is not None:
+        each = np.repeat(np.arange(len(some)), len(which)), np.tile(which, len(some))
+        alike = looks.ray_odds(some, *each, np.zeros(len(each[0]), dtype=bool)).reshape(len(some), len(which))
+    correction = align(some, known.position[which], known.label[which], map_T_camera, centre, spread, alike)
     poses = map_T_camera.copy()
     poses[begin:end] = correction @ poses[begin:end]
     left = _LEFT * drift + np.diag([_TURN] * 3 + [_SHIFT] * 3) ** 2
@@ -182,6 +205,7 @@ def _recognise(
         poses,
         some.sigma,
         pose_covariance=left,
+        looks=looks,
     )
     origins, _ = some.in_map(poses)
     distance = np.linalg.norm(known.position[owner] - origins, axis=1)

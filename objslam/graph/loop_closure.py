@@ -6,6 +6,7 @@ from typing import Self
 import gtsam
 import numpy as np
 
+from objslam.association.appearance.evidence import Looks
 from objslam.association.place_recognition import MIN_LANDMARKS, POSE_FLOOR, label_densities, neighbourhood, recognise_place
 from objslam.config import AssociationSettings
 from objslam.core.arrays import Bools, Floats, Ints
@@ -68,6 +69,7 @@ def find_closure(
     map_T_camera: Floats,
     now: int,
     settings: AssociationSettings,
+    looks: Looks | None = None,
 ) -> tuple[Closure | None, int]:
     """Return the loop with the most evidence, None if no loop is certain, and the number of compared pairs.
 
@@ -77,7 +79,7 @@ def find_closure(
     A pair is a recent and an old landmark of one label. It counts once for each tried drift.
 
     owner: (R,) the landmark of each ray, or -1. graph, values: solved. map_T_camera: (K, 4, 4) the solved poses. now: the
-    newest keyframe.
+    newest keyframe. looks: what the landmarks look like, None if this is not known.
     """
     together = seen_together(rays.keyframe, owner, len(landmarks))
     density = label_densities(landmarks.position, landmarks.label)
@@ -102,9 +104,13 @@ def find_closure(
             neighbourhood(landmarks.position[which], landmarks.covariance[which], landmarks.label[which], pivot)
             for which in (one, two)
         )
+        alike: Floats | float = 0.0
+        if looks is not None:
+            each = np.repeat(one, len(two)), np.tile(two, len(one))
+            alike = looks.landmark_odds(*each, landmarks.label[each[0]]).reshape(len(one), len(two))
         for prior in relative_covariances(marginals, map_T_camera, anchors, now):
             compared += int(possible.sum())
-            found = recognise_place(a, b, pivot, prior, density[one], possible[np.ix_(one, two)])
+            found = recognise_place(a, b, pivot, prior, density[one], possible[np.ix_(one, two)], alike)
             if found is not None and found.is_sure(settings) and (best is None or found.evidence > best.evidence):
                 best = Closure(found.correction, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.evidence)
     return best, compared

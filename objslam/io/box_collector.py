@@ -4,18 +4,22 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.appearance.features import MAX_FEATURES, unit_vectors
+from objslam.core.arrays import Array, Bools, Floats, Floats32
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, label_table
 from objslam.core.validity import box_rules, is_name, valid_corners, valid_depths
 from objslam.io.text import drop_rows, in_order
 
+UNUSABLE_FEATURES = "features of a box that are zero, not finite, or of another length than most (the box stays without)"
+"""The reason to leave out the appearance vector of a box."""
+
 
 @dataclass
 class BoxCollector:
     """Camera frames (images) and their boxes. An unknown depth is NaN, and an unknown track id is -1. The corners of
-    fiducials are stored by the index of their box. Each frame and box has a place, such as file:line. The ledger shows the
-    place if the frame or box is dropped."""
+    fiducials and the appearance vectors are stored by the index of their box. Each frame and box has a place, such as
+    file:line. The ledger shows the place if the frame or box is dropped."""
 
     stamps: list[float] = field(default_factory=list)
     frame_places: list[str] = field(default_factory=list)
@@ -27,6 +31,7 @@ class BoxCollector:
     track_ids: list[int] = field(default_factory=list)
     box_places: list[str] = field(default_factory=list)
     corners: dict[int, list[list[float]]] = field(default_factory=dict)
+    features: dict[int, Array] = field(default_factory=dict)
 
     def add_frame(self, stamp: float, place: str) -> None:
         """Start a frame. The next boxes belong to it."""
@@ -42,8 +47,12 @@ class BoxCollector:
         depth: float = np.nan,
         track_id: int = -1,
         corners: list[list[float]] | None = None,
+        features: list[float] | None = None,
     ) -> None:
-        """Add a box x1, y1, x2, y2 (px) to the last frame. corners: the four corners x, y (px) of a square fiducial."""
+        """Add a box x1, y1, x2, y2 (px) to the last frame. corners: the four corners x, y (px) of a square fiducial.
+        features: its appearance vector, of any length above zero."""
+        if features is not None:
+            self.features[len(self.boxes)] = np.array(features)
         if corners is not None:
             self.corners[len(self.boxes)] = corners
         self.frame.append(len(self.stamps) - 1)
@@ -56,7 +65,8 @@ class BoxCollector:
 
     def checked(self, ledger: Ledger) -> Detections:
         """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted. A depth that is
-        not above zero or too large becomes unknown and is counted, and so do corners that are not those of a square."""
+        not above zero or too large becomes unknown and is counted, and so do corners that are not those of a square, and
+        appearance vectors that cannot be compared."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)
         drop_rows("detection frame with a stamp that repeats or goes back", ~forward, self.frame_places, ledger)
@@ -75,6 +85,7 @@ class BoxCollector:
         )
         depths[wrong] = np.nan
         corners = self._valid_corners(good, ledger) if self.corners else None
+        features = self._valid_features(good, ledger) if self.features else None
         label_names, label = label_table([self.labels[i] for i in np.flatnonzero(good)])
         return Detections(
             frame_stamps=stamps[forward],
@@ -86,6 +97,7 @@ class BoxCollector:
             track_ids=np.array(self.track_ids, dtype=np.int64)[good],
             label_names=label_names,
             corners=None if corners is None else corners[good],
+            features=None if features is None else features[good],
         )
 
     def _valid_corners(self, good: Bools, ledger: Ledger) -> Floats:
@@ -97,3 +109,23 @@ class BoxCollector:
         drop_rows(reason, good & wrong, self.box_places, ledger)
         corners[wrong] = np.nan
         return corners
+
+    def _valid_features(self, good: Bools, ledger: Ledger) -> Floats32 | None:
+        """Return the unit appearance vectors (M, D) of all boxes, NaN for a box without a valid one. None if all are wrong.
+
+        A log has vectors of one length: the most frequent one, and of two such lengths the one that comes first.
+        """
+        boxes = np.array(list(self.features), dtype=np.int64)
+        lengths = np.array([vector.size for vector in self.features.values()])
+        known, first, count = np.unique(lengths, return_index=True, return_counts=True)
+        possible = (known > 0) & (known <= MAX_FEATURES)
+        length = int(known[np.lexsort((first, -count, ~possible))[0]]) if possible.any() else 1
+        mine = lengths == length
+        features = np.full((len(self.boxes), length), np.nan, dtype=np.float32)
+        scaled = np.zeros(len(self.boxes), dtype=bool)
+        if mine.any():
+            vectors = np.stack([vector for vector, fits in zip(self.features.values(), mine, strict=True) if fits])
+            features[boxes[mine]], scaled[boxes[mine]] = unit_vectors(vectors)
+        wrong = np.isin(np.arange(len(scaled)), boxes) & ~scaled
+        drop_rows(UNUSABLE_FEATURES, good & wrong, self.box_places, ledger)
+        return features if scaled.any() else None

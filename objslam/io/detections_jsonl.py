@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from objslam.core.appearance.features import short_numbers
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import MAX_BOXES, Detections
 from objslam.errors import LogError
@@ -62,10 +63,13 @@ def write_detections(detections: Detections, path: Path) -> None:
         columns["track_ids"] = [None if track_id < 0 else track_id for track_id in detections.track_ids.tolist()]
     if detections.corners is not None and not np.isnan(detections.corners).all():
         columns["corners"] = [None if math.isnan(c[0][0]) else c for c in detections.corners.tolist()]
+    features = detections.features if detections.features is not None and not np.isnan(detections.features).all() else None
     whole = {"whole": True} if detections.whole else {}
     with path.open("w", encoding="utf-8") as file:
         for stamp, start, end in zip(detections.frame_stamps.tolist(), bounds[:-1], bounds[1:], strict=True):
             frame = {"stamp": stamp} | {name: column[start:end] for name, column in columns.items()} | whole
+            if features is not None:
+                frame["features"] = [short_numbers(vector) for vector in features[start:end]]
             file.write(json.dumps(frame, ensure_ascii=False, allow_nan=False) + "\n")
 
 
@@ -103,6 +107,7 @@ def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> boo
     depths = [_depth(depth) for depth in _list(frame, "depths", unknown)]
     track_ids = [_track_id(track_id) for track_id in _list(frame, "track_ids", unknown)]
     corners = [_corners(four) for four in _list(frame, "corners", unknown)]
+    features = [_features(vector) for vector in _list(frame, "features", unknown)]
     if any(type(label) is not str for label in labels):
         raise Malformed("a label is not a string")
     if any(len(box) != 4 for box in boxes):
@@ -111,13 +116,15 @@ def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> boo
         raise Malformed("boxes, labels, scores, depths and track_ids differ in length")
     if len(corners) != len(boxes):
         raise Malformed("boxes and corners differ in length")
+    if len(features) != len(boxes):
+        raise Malformed("boxes and features differ in length")
     whole = frame.get("whole", False)
     if type(whole) is not bool:
         raise Malformed("whole is neither true nor false")
     collector.add_frame(stamp, place)
-    columns = (boxes, labels, scores, depths, track_ids, corners)
-    for box, label, score, depth, track_id, four in zip(*columns, strict=True):
-        collector.add_box(box, label, score, place, depth, track_id, four)
+    columns = (boxes, labels, scores, depths, track_ids, corners, features)
+    for box, label, score, depth, track_id, four, vector in zip(*columns, strict=True):
+        collector.add_box(box, label, score, place, depth, track_id, four, vector)
     return whole
 
 
@@ -154,6 +161,12 @@ def _corners(value: Any) -> list[list[float]] | None:
     if any(len(point) != 2 for point in corners):
         raise Malformed("a corner is not 2 numbers")
     return corners
+
+
+def _features(value: Any) -> list[float] | None:
+    if value is None:
+        return None
+    return read_numbers(value, "features")
 
 
 def _track_id(value: Any) -> int:

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from objslam.core.appearance.features import short_numbers, vector_of_entry
 from objslam.core.arrays import Floats
 from objslam.core.bodies.body_entry import body_entry, body_of_entry, size_of
 from objslam.core.bodies.tag_pose import TagPose, tag_entry
@@ -132,6 +133,7 @@ def _entry(o: MapObject) -> dict[str, Any]:
         entry["ray_point"] = o.ray_point.tolist()
     if o.tag is not None:
         entry["tag"] = tag_entry(o.tag)
+    entry |= {} if o.features is None else {"features": short_numbers(o.features)}
     if o.ray is not None:
         entry["ray"] = {name: part.tolist() for name, part in zip(("origin", "direction"), o.ray, strict=True)}
     return entry
@@ -184,7 +186,7 @@ def _stamp(entry: dict[str, Any], name: str) -> float:
 def _truth_object(entry: dict[str, Any]) -> TruthObject | None:
     if entry.get("status") == "unresolved":
         return None
-    size = None if entry.get("size") is None else _of_body(lambda: size_of(entry, "size"))
+    size = None if entry.get("size") is None else _converted(lambda: size_of(entry, "size"))
     yaw = None if entry.get("yaw") is None else _number(entry["yaw"], "yaw")
     place = _vector(entry.get("position"), "position")
     tag: Any = entry.get("tag")
@@ -199,8 +201,6 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
     if status not in ("ok", "unresolved"):
         raise _Malformed(f'status must be "ok" or "unresolved", got {status!r}')
     covariance, extent, ray, labels = (entry.get(name) for name in ("covariance", "extent", "ray", "labels"))
-    if covariance is not None:
-        covariance = _covariance(covariance, "covariance")
     if extent is not None:
         extent = tuple(_vector(extent, "extent", 2).tolist())
         if not all(0 <= side < MAX_POSITION for side in extent):
@@ -222,7 +222,7 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         id=_integer(entry, "id"),
         label=_text(entry.get("label"), "label"),
         position=position,
-        covariance=covariance,
+        covariance=None if covariance is None else _covariance(covariance, "covariance"),
         status=status,
         rays=_integer(entry, "rays"),
         frames=_integer(entry, "frames"),
@@ -236,13 +236,14 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         existence=None if entry.get("existence") is None else _number(entry["existence"], "existence"),
         seen_from=None if entry.get("seen_from") is None else _seen_from(entry["seen_from"]),
         life=None if entry.get("life") is None else _life(entry["life"]),
-        body=_of_body(lambda: body_of_entry(entry)),
+        body=_converted(lambda: body_of_entry(entry)),
         ray_point=None if entry.get("ray_point") is None else _vector(entry["ray_point"], "ray_point"),
         tag=None if entry.get("tag") is None else _tag(entry["tag"]),
+        features=_converted(lambda: vector_of_entry(entry)),
     )
 
 
-def _of_body(read: Callable[[], _T]) -> _T:
+def _converted(read: Callable[[], _T]) -> _T:
     try:
         return read()
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Read and write rays.parquet, the file with the rays of a result."""
+"""Read and write rays.parquet, the rays of a result, and features.parquet, the appearance vectors of these rays."""
 
 import io
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.appearance.features import are_unit_vectors
+from objslam.core.arrays import Floats, Floats32, Ints
 from objslam.core.validity import MAX_POSITION, box_rules, valid_depths, valid_positions, valid_stamps
 from objslam.errors import OutputError, first_line
 from objslam.io.atomic_files import encode
@@ -151,3 +152,39 @@ def _fault(rays: RaysTable) -> str | None:
         *boxes,
     )
     return next((fault for fine, fault in rules if not fine.all()), None)
+
+
+@dataclass(frozen=True, eq=False)
+class RayFeatures:
+    """The appearance vectors of rays. ray: (V,) the row of each ray in rays.parquet, increasing. vectors: (V, D) unit."""
+
+    ray: Ints
+    vectors: Floats32
+
+
+def dump_features(features: RayFeatures) -> bytes:
+    """Return the content of features.parquet, with one row per vector."""
+    import pyarrow.parquet as pq
+
+    buffer = io.BytesIO()
+    pq.write_table(arrow_table({"ray": features.ray, "features": features.vectors}), buffer)
+    return buffer.getvalue()
+
+
+def read_features(file: Path) -> RayFeatures:
+    """Read a features.parquet. Raises OutputError for any other content."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(file, columns=["ray", "features"], partitioning=None)
+        ray, column = np.asarray(table["ray"].to_numpy(), dtype=np.int64), table["features"].combine_chunks()
+        flat = np.asarray(column.flatten().to_numpy(zero_copy_only=False))
+        vectors = flat.reshape(len(ray), column.type.list_size)
+        if flat.dtype != np.float32 or not (np.isfinite(flat).all() and are_unit_vectors(vectors)):
+            raise ValueError("a vector does not have the length 1")
+        if (np.diff(ray, prepend=-1) <= 0).any():
+            raise ValueError("the rays do not increase")
+    except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError) as error:
+        raise OutputError(f"not what a run writes: {str(error).splitlines()[0][:100]}", where=str(file)) from error
+    return RayFeatures(ray, vectors)

@@ -11,7 +11,7 @@ import numpy as np
 from objslam.association.observations import extents
 from objslam.association.visibility import seen_from
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Floats32, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
@@ -20,7 +20,7 @@ from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
-from objslam.core.types import Association
+from objslam.core.types import Association, Rays
 from objslam.frontend.up import up_axis
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
@@ -74,6 +74,7 @@ def describe(
     held = association.object >= 0
     residual[held] = angles_off(origins[held], directions[held], estimate.positions[association.object[held]])
     sizes = extents(rays, association, estimate.positions, map_T_camera, keyframes, cameras)
+    sizes_of_images = np.array([camera.size for camera in cameras])[keyframes.camera[rays.keyframe]]
     order = np.argsort(association.object, kind="stable")
     bounds = np.searchsorted(association.object[order], np.arange(association.count + 1))
     objects = []
@@ -117,9 +118,25 @@ def describe(
                 body=placed.body if placed is not None and known else None,
                 ray_point=None if placed is None or placed.centre is None or not known else estimate.positions[j],
                 tag=estimate.tags.get(j) if known else None,
+                features=_best_view(rays, kept, sizes_of_images),
             )
         )
     return ObjectMap(tuple(objects), shared_covariance=_shared(objects, estimate)), residual
+
+
+def _best_view(rays: Rays, mine: Ints, image: Floats) -> Floats32 | None:
+    """Return the appearance vector (D,) of the best of the rays `mine`, None if they have none.
+
+    The best view is the largest box that lies inside its image, or the largest box if none does. A mean of vectors would be
+    that of no view. image: (R, 2) width and height of the image of each ray, px.
+    """
+    if rays.feature is None or rays.feature_table is None or not (rays.feature[mine] >= 0).any():
+        return None
+    mine = mine[rays.feature[mine] >= 0]
+    low, high = rays.box[mine, :2], rays.box[mine, 2:]
+    inside = ((low > 0) & (high < image[mine] - 1)).all(axis=1)
+    best = mine[np.lexsort((-(high - low).prod(axis=1), ~inside))[0]]
+    return rays.feature_table.vectors[rays.feature[best]]
 
 
 def _shared(objects: list[MapObject], estimate: Estimate) -> Floats | None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.association.appearance.evidence import Looks, learn_ratio
 from objslam.association.duplicates import near_pairs, seen_as_two
 from objslam.core.statistics import SAME_POINT
 from objslam.core.types import Association, Rays
@@ -18,14 +19,19 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
     """Merge pairs of objects of one label whose positions agree within their covariances, and that share no frame.
 
     Each of the two copies fits the drifted poses of its visit, so a new association at these poses keeps both. The merge
-    closes the loop. The nearest pairs by Mahalanobis distance merge first. An object merges at most once in one call.
-    farthest: the largest distance (m) of a pair.
+    closes the loop. The nearest pairs by Mahalanobis distance merge first. An object merges at most once in one call. A pair
+    whose boxes look alike may lie further apart, and a pair whose boxes differ must lie nearer. farthest: the largest
+    distance (m) of a pair.
     """
     position, covariance = estimate.positions, estimate.covariance
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]) & np.isfinite(position[:, 0]))
     a, b, apart = near_pairs(position[known], association.label[known], farthest)
     a, b = known[a], known[b]
     squared = np.einsum("pi,pi->p", apart, np.linalg.solve(covariance[a] + covariance[b], apart[..., None])[..., 0])
+    ratio = learn_ratio(rays, rays.keyframe, rays.track_id, association.object, len(rays.label_names))
+    if ratio is not None:
+        looks = Looks.of(rays, association.object, association.count, ratio)
+        squared = squared - 2 * looks.landmark_odds(a, b, association.label[a])
     order = np.argsort(squared, kind="stable")
     order = order[squared[order] < SAME_POINT]
     held = association.object >= 0

@@ -22,7 +22,7 @@ from objslam.io.folders import no_empty_folders
 from objslam.io.objects_json import dump_objects, dump_truth_objects
 from objslam.io.odometry_parquet import dump_motions
 from objslam.io.ply import write_cloud, write_mesh
-from objslam.io.rays_parquet import RaysTable, dump_rays
+from objslam.io.rays_parquet import RayFeatures, RaysTable, dump_features, dump_rays
 from objslam.io.tum_trajectory import write_trajectory
 from objslam.io.views_parquet import Views, dump_views
 from objslam.mapping.measured_motions import motions_of
@@ -118,6 +118,11 @@ def _writers(result: RunResult, truth: Truth | None, detected: tuple[CameraLog, 
         files.DOUBTS: lambda file: file.write_bytes(encode(dump_doubts(result.doubts))),
         files.SUMMARY: lambda file: file.write_bytes(encode(dump_json(result.summary))),
     }
+    index, table = result.rays.feature, result.rays.feature_table
+    if index is not None and table is not None:
+        known = np.flatnonzero(index >= 0)
+        features = RayFeatures(known, table.vectors[index[known]])
+        writers[files.FEATURES] = lambda file: file.write_bytes(dump_features(features))
     motions = motions_of(result)
     if motions is not None:
         writers[files.MOTIONS] = lambda file: file.write_bytes(dump_motions(motions))

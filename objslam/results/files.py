@@ -14,6 +14,7 @@ OBJECTS = "objects.json"  # The map of objects.
 TRAJECTORY = "trajectory.txt"  # The pose map_T_base of each keyframe.
 PATH = "path.txt"  # The pose map_T_base at each pose of the recorded path.
 RAYS = "rays.parquet"  # Each ray with its object.
+FEATURES = "features.parquet"  # The appearance vectors of the rays that have one.
 MOTIONS = "motions.parquet"  # The odometry between the poses of a joint run.
 VIEWS = "views.parquet"  # The pose of each camera frame. It shows which objects the camera could have seen.
 CONFIG = "config.yaml"  # All settings of the run.
@@ -34,7 +35,7 @@ GROUNDTRUTH = "groundtruth"  # The folder in a log that has the ground truth, in
 
 PARTS = (
     *(OBJECTS, TRAJECTORY, PATH, RAYS, CONFIG, TRUTH_OBJECTS, TRUTH_TRAJECTORY, DETECTIONS, PICTURE, RECORDING),
-    *(SURFACE, SURFACE_BEFORE, CLOUD, MOTIONS, VIEWS, DOUBTS, EVALUATION, REPORT),
+    *(SURFACE, SURFACE_BEFORE, CLOUD, FEATURES, MOTIONS, VIEWS, DOUBTS, EVALUATION, REPORT),
 )
 """The files of a result, including the files of later commands. SUMMARY and exported files are not included."""
 

@@ -2,16 +2,37 @@
 objects and each noise have their own random generators, so a change of one noise leaves the others unchanged.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from objslam.core.geometry import lift_se2
 from objslam.core.types import CameraLog, Log, Trajectory, Truth, TruthObject
-from objslam.simulation.detector import Boxes, detect, detections, imagine, views
+from objslam.simulation.detector import Boxes, detect, detections, imagine, order_of, views, with_features
 from objslam.simulation.scene import furnish, roam
-from objslam.simulation.settings import PRESETS, DepthNoise, DriveSettings, PoseNoise, make_camera, pair, preset
+from objslam.simulation.settings import (
+    PRESETS,
+    AppearanceNoise,
+    DepthNoise,
+    DriveSettings,
+    PoseNoise,
+    make_camera,
+    pair,
+    preset,
+)
 from objslam.simulation.trajectory import Path, frame_stamps, localization, odometry
 
-__all__ = ["PRESETS", "DepthNoise", "DriveSettings", "PoseNoise", "make_camera", "pair", "preset", "simulate"]
+__all__ = [
+    "PRESETS",
+    "AppearanceNoise",
+    "DepthNoise",
+    "DriveSettings",
+    "PoseNoise",
+    "make_camera",
+    "pair",
+    "preset",
+    "simulate",
+]
 
 
 def simulate(settings: DriveSettings, seed: int) -> Log:
@@ -26,7 +47,7 @@ def simulate(settings: DriveSettings, seed: int) -> Log:
     fired = frame_stamps(settings)
     scene = furnish(settings, path, fired, scene_rng)
     roamers = roam(settings, scene, roam_rng)
-    logs = []
+    logs, objects = [], []
     for camera, stamps, seed_of_camera in zip(settings.cameras, fired.T, seeds[5].spawn(len(settings.cameras)), strict=True):
         map_T_camera = lift_se2(path.at(stamps)) @ camera.base_T_camera
         standing = views(settings, camera, map_T_camera, scene.position, scene.extent)
@@ -38,6 +59,10 @@ def simulate(settings: DriveSettings, seed: int) -> Log:
             imagine(settings, camera, len(scene.classes), false_seed),
         )
         logs.append(CameraLog(camera, detections(settings, boxes, stamps, scene.classes)))
+        objects.append(boxes.object[order_of(boxes)])
+    if settings.appearance is not None:
+        seen = with_features([c.detections for c in logs if c.detections is not None], objects, settings.appearance, seed)
+        logs = [replace(c, detections=found) for c, found in zip(logs, seen, strict=True)]
     labelled = zip(scene.label, scene.position, strict=True)
     stamps = np.unique(fired)
     return Log(

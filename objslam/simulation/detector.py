@@ -1,17 +1,20 @@
 """Simulate the views of the cameras, and the boxes of their detector."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
 
+from objslam.core.appearance.features import unit_vectors
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.geometry import inverse
 from objslam.core.types import Detections
-from objslam.simulation.settings import DriveSettings
+from objslam.simulation.settings import AppearanceNoise, DriveSettings
 
 FALSE_SIZES = (20.0, 120.0)  # The least and largest side of a false box, px.
+_MOST_NOISE = 20.0  # The largest tried noise of an appearance vector, in lengths of the vector.
+_HALVINGS = 30  # The number of halvings of the range of tried noise. A larger number is more exact.
 TRACK_PATIENCE = 1.0  # The time without a box after which a tracker loses an object, s.
 
 
@@ -117,11 +120,57 @@ def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> 
     return np.where(rng.random(count) < noise.missing, np.nan, depth)
 
 
+def order_of(boxes: Boxes) -> Ints:
+    """Return the order (M,) of boxes in detections: by frame, and in a frame the box with the highest score first."""
+    return np.lexsort((-boxes.score, boxes.frame))
+
+
 def detections(settings: DriveSettings, boxes: Boxes, frame_stamps: Floats, classes: tuple[str, ...]) -> Detections:
     """Turn boxes into detections. They are sorted by frame, and within a frame the box with the highest score is first."""
-    order = np.lexsort((-boxes.score, boxes.frame))
+    order = order_of(boxes)
     b, tracks = boxes.take(order), _tracks(settings, boxes)[order]
     return Detections(frame_stamps, b.frame, b.box, b.label, b.score, b.depth, tracks, classes)
+
+
+def with_features(cameras: list[Detections], objects: list[Ints], noise: AppearanceNoise, seed: int) -> list[Detections]:
+    """Return the detections of all cameras with appearance vectors. objects: the ids (M,) of the objects in their boxes, -1
+    for a false box, which has a vector of its own."""
+    rng = np.random.default_rng(seed)
+    label, whose = np.concatenate([one.label for one in cameras]), np.concatenate(objects)
+    whose = np.where(whose < 0, whose.max(initial=-1) + 1 + np.arange(len(whose)), whose)
+    _, first, whose = np.unique(whose, return_index=True, return_inverse=True)
+    kind = label[first]  # The label of each object.
+    of_label, own = (
+        unit_vectors(rng.normal(size=(count, noise.numbers)))[0].astype(np.float64)
+        for count in (int(label.max(initial=-1)) + 1, len(first))
+    )
+    prototype = np.sqrt(noise.common) * of_label[kind] + np.sqrt(1 - noise.common) * own
+    error = rng.normal(size=(len(whose), noise.numbers)) / np.sqrt(noise.numbers)
+    standing = np.bincount(whose) > 1
+    features, _ = unit_vectors(prototype[whose] + _scale(prototype, kind, standing, whose, error, noise.confusion) * error)
+    ends = np.cumsum([len(one) for one in cameras])[:-1]
+    return [replace(one, features=part) for one, part in zip(cameras, np.split(features, ends), strict=True)]
+
+
+def _scale(prototype: Floats, kind: Ints, standing: Bools, whose: Ints, error: Floats, confusion: float) -> float:
+    """Return the factor on the errors (M, D) with which a share of the boxes is nearer to another object of its label.
+
+    prototype: (N, D) the vectors of objects. kind, standing: (N,) their labels, and which have more than one box. whose:
+    (M,) the object of each box.
+    """
+    low, high = 0.0, _MOST_NOISE
+    for _ in range(_HALVINGS):
+        middle, wrong = (low + high) / 2, list[Bools]()
+        for label in np.unique(kind):
+            rivals = np.flatnonzero((kind == label) & standing)
+            mine = np.flatnonzero((kind[whose] == label) & standing[whose])
+            if len(rivals) > 1:
+                near = (prototype[whose[mine]] + middle * error[mine]) @ prototype[rivals].T
+                wrong.append(rivals[near.argmax(axis=1)] != whose[mine])
+        if not wrong:
+            return 1.0
+        low, high = (low, middle) if np.concatenate(wrong).mean() > confusion else (middle, high)
+    return low
 
 
 def _tracks(settings: DriveSettings, boxes: Boxes) -> Ints:

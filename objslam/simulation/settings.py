@@ -55,6 +55,18 @@ class DepthNoise(Section):
     wrong: Probability = 0.0  # The share of boxes with a wrong depth, which is random from 0.3 m to max_range.
 
 
+class AppearanceNoise(Section):
+    """The appearance vectors of boxes, and how often they confuse objects.
+
+    A vector is that of its object plus noise. It confuses its object if it is nearer to the vector of another object of the
+    label. The noise is as large as the share of confused boxes demands.
+    """
+
+    confusion: Probability = 0.2  # The share of boxes that are confused, among those of labels with two objects or more.
+    numbers: Annotated[int, Field(ge=2)] = 64  # The number of numbers in a vector.
+    common: Probability = 0.6  # The share of the squared length of a vector that all objects of a label have in common.
+
+
 class CourseSettings(Section):
     """The path of the robot, and the errors of its odometry and its localisation."""
 
@@ -102,6 +114,7 @@ class DriveSettings(CourseSettings):
     missed: Probability = 0.0  # The share of visible objects without a box.
     false: Probability = 0.0  # The probability of a false box, in each frame for each class.
     depth: DepthNoise | None = None  # The errors of depths. None: boxes have no depths.
+    appearance: AppearanceNoise | None = None  # The appearance vectors of boxes. None: boxes have none.
     tracks: Literal["none", "broken", "perfect"] = "none"
     """The track ids of boxes. With `perfect`, boxes have the ids of their objects in the ground truth, and moving objects
     have the next ids. With `broken`, an object gets a new id after one second without a box. False boxes have no id."""

@@ -19,9 +19,8 @@ from objslam.association.existence import (
     size_odds,
 )
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.merging import overlap
 from objslam.association.nearest_neighbour import associate_by_label
-from objslam.association.observations import extents, observe
+from objslam.association.observations import extents, observe, overlap
 from objslam.association.visibility import CameraFrames, DetectionHistory, _hidden, detection_history
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Association

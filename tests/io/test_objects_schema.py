@@ -28,6 +28,7 @@ FULL = replace(
     seen_from=SeenFrom(0.5, 3.0, np.eye(3)),
     life=LIFE,
     tag=TAG,
+    features=np.array([0.6, -0.8, 0.0], dtype=np.float32),
 )
 LOST = replace(
     PLAIN, id=2, status="unresolved", covariance=None, position=np.full(3, np.nan), ray=(np.zeros(3), np.eye(3)[0])
@@ -51,6 +52,9 @@ def test_what_is_written_fits_the_schema_and_is_read_back(objects):
         assert (one.seen_from is None) == (other.seen_from is None)
         assert (one.life is None) == (other.life is None)
         assert (one.tag is None) == (other.tag is None)
+        assert (one.features is None) == (other.features is None)
+        if one.features is not None:
+            np.testing.assert_array_equal(other.features, one.features, strict=True)
         if one.tag is not None and other.tag is not None:
             np.testing.assert_array_equal(other.tag.rotation, one.tag.rotation)
             np.testing.assert_array_equal(other.tag.other, one.tag.other)
@@ -91,6 +95,10 @@ WRONG = [
     (("objects", 1, "life", "looks"), 0.5),
     (("objects", 1, "life", "moved_from"), [0.0]),
     (("gone", 0, "rays"), "many"),
+    (("objects", 1, "features"), []),
+    (("objects", 1, "features"), [2.0, 0.0]),
+    (("objects", 1, "features"), ["a"]),
+    (("objects", 1, "features"), 1.0),
 ]
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam import config
+from objslam.association.appearance.evidence import learn_ratio
 from objslam.association.existence import detection_rates, static_odds
 from objslam.association.few_rays.chance import Strays, chance_odds, unmatched_costs
 from objslam.association.few_rays.sparse_search import SparseSearch, discover_sparse
@@ -57,7 +58,8 @@ def add_few_ray_objects(
     labels = len(rays.label_names)
     held = Landmarks.new(positions[known], np.ones(known.sum()), association.label[known], labels)
     state = State(obs, view, held, np.append(np.where(known, np.cumsum(known) - 1, -1), -1)[association.object[ray]])
-    state = replace(state, landmarks=replace(held, noise=state.noise))
+    ratio = learn_ratio(obs, obs.frame, obs.track, association.object[ray], labels)
+    state = replace(state, landmarks=replace(held, noise=state.noise), ratio=ratio)
     free = association.object[ray] < 0
     if association.refuted is not None:
         free &= ~association.refuted[ray]
@@ -93,7 +95,7 @@ class _Few:
         """Return the landmarks of the free rays whose probability to exist is not below `least`."""
         labels, obs = len(self.known.unassigned), self.known.obs.take(self.free)
         nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), labels)
-        found = State(obs, self.known.view, nothing, np.full(len(obs), -1, dtype=np.int64))
+        found = State(obs, self.known.view, nothing, np.full(len(obs), -1, dtype=np.int64), self.known.ratio)
         for turn in range(_TURNS):
             before = found.count
             found = self.settled(self.discover(found, np.random.default_rng([seed, turn])), 2)
@@ -163,7 +165,7 @@ class _Few:
 
         every = self.joined(found)
         rates = detection_rates(every.history, every.label, len(every.unassigned))
-        odds = chance_odds(every, self.gate, self.strays, rates)
+        odds = chance_odds(every, self.gate, self.strays, rates) + _alike_odds(every)
         return np.asarray(expit(static_odds(every, fitted=_MOVING)) * expit(_POWER * odds))[self.known.count :]
 
     def joined(self, found: State) -> State:
@@ -171,6 +173,16 @@ class _Few:
         matched = self.known.matched.copy()
         matched[self.free] = np.where(found.matched < 0, -1, found.matched + self.known.count)
         return replace(self.known, landmarks=self.known.landmarks.and_also(found.landmarks), matched=matched)
+
+
+def _alike_odds(state: State) -> Floats:
+    """Return the log odds (N,) that the rays of each landmark show one object, from their appearance. 0 without vectors."""
+    if state.looks is None:
+        return np.zeros(state.count)
+    each = state.looks.ray_odds(state.obs, state.assigned, state.owner, np.ones(len(state.owner), dtype=bool))
+    number = np.maximum(state.looks.number, 1)
+    # The first ray has no other one to look like. In the sum over the rays, each is compared with all others.
+    return np.asarray(np.bincount(state.owner, each, state.count) * (number - 1) / number)
 
 
 def _plausible(state: State) -> Bools:

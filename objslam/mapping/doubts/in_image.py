@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from objslam.association.merging import overlap
+from objslam.association.observations import overlap
 from objslam.core.arrays import Ints
 from objslam.mapping.doubts.chance import LEAST_LOG_ODDS, crowded
 from objslam.mapping.doubts.evidence import Evidence
