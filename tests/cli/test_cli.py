@@ -8,18 +8,18 @@ import signal
 import subprocess
 import sys
 import sysconfig
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from commands import Call
 from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
 
 from objslam import __version__
-from objslam.cli import main
 from objslam.config import Odometry, Settings
 from objslam.core.calibration import Calibration
 from objslam.io.calibration_yaml import dump_calibration, load_calibration
@@ -33,40 +33,6 @@ from objslam.sources.log_folder import write_log_folder
 LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
 MODES = ("fixed", "joint")
 SCRIPT = Path(sysconfig.get_path("scripts")) / "objslam"
-
-
-@dataclass(frozen=True)
-class Call:
-    code: int
-    out: str
-    err: str
-
-    def says(self, *words: str) -> None:
-        """One line on stderr with all the words, no traceback."""
-        assert len(self.err.strip().splitlines()) == 1, self.err
-        self.says_somewhere(*words)
-
-    def says_somewhere(self, *words: str) -> None:
-        assert "Traceback" not in self.err
-        assert "internal error" not in self.err
-        assert "Warning" not in self.err
-        for word in words:
-            assert word in self.err, self.err
-
-
-@pytest.fixture
-def objslam(capsys, monkeypatch):
-    """The entry point of the console script, in this process."""
-
-    def call(*arguments) -> Call:
-        monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        captured = capsys.readouterr()
-        return Call(exit_.value.code, captured.out, captured.err)
-
-    return call
 
 
 @pytest.fixture(scope="session")
