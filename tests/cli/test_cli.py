@@ -182,40 +182,6 @@ def test_config_dump_is_what_config_reads(objslam, tmp_path):
     assert Settings.model_validate(yaml.safe_load(objslam("config", "dump").out)) == Settings()
 
 
-def test_demo(objslam, log_folder, tmp_path):
-    shutil.copytree(log_folder, tmp_path / "demo" / "log")
-    (tmp_path / "demo" / ".objslam-demo").touch()  # The log of an older demo may be replaced.
-    demo = objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1)
-    assert demo.code == 0, demo.err
-    assert demo.out.count("position RMSE") == 2
-    for mode in MODES:
-        out = tmp_path / "demo" / mode
-        assert (out / "map.png").is_file()
-        found = json.loads((out / "evaluation.json").read_text())
-        assert found["recall"] > 0.8
-        assert found["position_median"] < 0.1
-    assert objslam("run", tmp_path / "demo" / "log", "-o", tmp_path / "again", *LEAN).code == 0
-
-
-def test_a_demo_replaces_no_log_of_others(objslam, log_folder, tmp_path):
-    shutil.copytree(log_folder, tmp_path / "log")
-    demo = objslam("demo", "-o", tmp_path, "--boxes")
-    assert demo.code == 1
-    demo.says("not from a demo", "-o")
-    assert (tmp_path / "log" / "camera.yaml").read_bytes() == (log_folder / "camera.yaml").read_bytes()
-
-
-def test_demo_from_images(objslam, tmp_path):
-    """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises."""
-    demo = objslam("demo", "-o", tmp_path / "demo")
-    assert demo.code == 0, demo.err
-    for mode, bar in (("fixed", 0.05), ("joint", 0.10)):
-        found = json.loads((tmp_path / "demo" / mode / "evaluation.json").read_text())
-        assert (found["matched"], found["missed"], found["false"]) == (7, 0, 0)
-        assert found["position_rmse"] <= bar
-        assert (tmp_path / "demo" / mode / "detections.jsonl").is_file()
-
-
 def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_path):
     assert objslam("run", log_folder, "-o", tmp_path, *LEAN).code == 0
     values = []
