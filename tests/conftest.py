@@ -1,7 +1,11 @@
 """What holds for all tests."""
 
 import os
+import sys
+from collections.abc import Callable
 
+import pytest
+from commands import Call
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -11,3 +15,20 @@ settings.register_profile(
     derandomize="OBJSLAM_FUZZ_SEED" not in os.environ,  # The same examples in every run. tools/fuzz.sh looks for new ones.
 )
 settings.load_profile("objslam")
+
+
+@pytest.fixture
+def objslam(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Call]:
+    """The entry point of the console script, in this process. A process of its own pays a second for its imports."""
+    from objslam.cli import main
+
+    def call(*arguments: object) -> Call:
+        monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        captured = capsys.readouterr()
+        assert isinstance(exit_.value.code, int)
+        return Call(exit_.value.code, captured.out, captured.err)
+
+    return call

@@ -88,8 +88,27 @@ def rigid_poses(poses: Floats) -> tuple[Floats, Bools]:
 
 def rigid_pose(pose: Floats) -> Floats | None:
     """Return a rigid pose (4, 4) with an exact rotation, as `rigid_poses` does; None if the pose is not rigid."""
+    if _is_exact(pose):
+        return pose.copy()
     exact, good = rigid_poses(pose[None])
     return exact[0] if good[0] else None
+
+
+def _is_exact(pose: Floats) -> bool:
+    """Return whether a pose (4, 4) is rigid, and its rotation exact up to rounding.
+
+    A session asks for every pose, and nearly all are. This function avoids numpy, and takes a tenth of the time of
+    `rigid_poses`.
+    """
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = pose.tolist()
+    inside = abs(x) < MAX_POSITION and abs(y) < MAX_POSITION and abs(z) < MAX_POSITION
+    if not inside or last != [0.0, 0.0, 0.0, 1.0] or not a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0:
+        return False
+    products = (
+        *(a * a + d * d + g * g - 1, b * b + e * e + h * h - 1, c * c + f * f + i * i - 1),
+        *(a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i),
+    )
+    return all(abs(product) <= _ROUNDING for product in products)
 
 
 def covariance_fault(covariance: Floats) -> str | None:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ Reals = NDArray[np.floating]
 
 NEAR = 0.05  # The least depth of an object's points, m. An object with a nearer point counts as partly behind the camera.
 _NOISE = 64  # The grid points of the 3D noise along each axis. With a larger value, the noise repeats less often.
+_STRIP = 32
+"""The number of rows that are shaded at a time. The arrays of such a strip fit into a processor's cache. A larger number is
+slower: with whole images of 640 x 480 px, rendering takes a fifth more time."""
 _PATTERNS = {"plain": 0, "noise": 1, "stripes": 2, "checks": 3}
 
 
@@ -32,6 +35,10 @@ class Cast:
     part: Ints
     normal: Reals
     point: Reals
+
+    def rows(self, chosen: slice) -> Self:
+        """Return the chosen rows of the image."""
+        return type(self)(self.depth[chosen], self.part[chosen], self.normal[chosen], self.point[chosen])
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,14 @@ class Caster:
         return [_scene(self.room, np.flatnonzero(self.room.owner == i)) for i in range(len(self.room.labels))]
 
     @cached_property
+    def _materials(self) -> tuple[NDArray[Any], ...]:
+        """The two colours (P, 3), the gloss (P,), the scale (P,) and the number of the pattern (P,) of the room's parts."""
+        materials = [part.material for part in self.room.parts]
+        names = ("colour", "second", "gloss", "scale")
+        columns = [np.array([getattr(material, name) for material in materials], dtype=np.float32) for name in names]
+        return (*columns, np.array([_PATTERNS[material.pattern] for material in materials]))
+
+    @cached_property
     def _grain(self) -> Reals:
         """Smooth periodic noise in [0, 1] on a cube of _NOISE^3 points, flattened."""
         from scipy.ndimage import gaussian_filter
@@ -69,7 +84,7 @@ class Caster:
 
     def prepare(self) -> None:
         """Build the cached data. Afterwards, several threads may use the caster at the same time."""
-        _ = self.directions, self._scene, self._alone, self._grain
+        _ = self.directions, self._scene, self._alone, self._materials, self._grain
 
     def cast(self, map_T_camera: Floats) -> Cast:
         """Find the first surface on the ray of every pixel of a camera at map_T_camera (4, 4)."""
@@ -120,15 +135,22 @@ class Caster:
             return None
         flat = local[:, :2] / local[:, 2:]
         low, high = flat.min(axis=0), flat.max(axis=0)
-        inside = ((self.directions[..., :2] >= low) & (self.directions[..., :2] <= high)).all(axis=-1)
+        x, y = self.directions[..., 0], self.directions[..., 1]
+        inside = (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
         rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
         return (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else None
 
     def shade(self, cast: Cast, eye: Floats) -> Reals:
         """Compute the linear RGB colour (H, W, 3), with reflections and shadows. eye: (3,) the camera position in map, m."""
+        starts = range(0, len(cast.depth), _STRIP)
+        return np.concatenate([self._shade_strip(cast.rows(slice(start, start + _STRIP)), eye) for start in starts])
+
+    def _shade_strip(self, cast: Cast, eye: Floats) -> Reals:
         albedo, gloss = self._albedo(cast)
         view = _unit(eye.astype(np.float32) - cast.point)
-        normal = np.where(_dot(cast.normal, view)[..., None] < 0, -cast.normal, cast.normal)
+        facing = _dot(cast.normal, view)
+        normal = cast.normal * np.where(facing < 0, np.float32(-1), np.float32(1))[..., None]
+        facing = np.abs(facing)
         light = self.room.ambient.astype(np.float32) * (0.8 + 0.2 * normal[..., 2:])
         shine = np.zeros_like(albedo)
         start = cast.point + np.float32(2e-3) * normal
@@ -136,22 +158,24 @@ class Caster:
             to = lamp.position.astype(np.float32) - start
             rays = np.concatenate([start, to], axis=-1)
             dark = self._scene.test_occlusions(_tensor(rays), 0.0, 1.0, 1).numpy()
-            towards = _unit(to)
-            power = np.where(dark, 0.0, 1.0 / (0.4 + 0.3 * _dot(to, to))).astype(np.float32)
-            glint = (np.maximum(_dot(_unit(towards + view), normal), 0.0) ** 4) ** 4
+            squared = _dot(to, to)
+            power = np.where(dark, np.float32(0), 1 / (np.float32(0.4) + np.float32(0.3) * squared))
+            near = 1 / np.sqrt(squared + np.float32(1e-12))
+            slope, ahead = _dot(to, normal) * near, _dot(to, view) * near
+            # The half vector is the sum of the unit vectors to the lamp and to the eye. 2 + 2 ahead is its squared length.
+            half = (slope + facing) / np.sqrt(np.maximum(2 + 2 * ahead, np.float32(1e-12)))
+            glint = np.maximum(half, 0) ** 2
+            glint *= glint
+            glint *= glint
+            glint *= glint
             colour = lamp.power.astype(np.float32)
-            light = light + (power * np.maximum(_dot(towards, normal), 0.0))[..., None] * colour
+            light += (power * np.maximum(slope, 0))[..., None] * colour
             shine += (power * glint**2 * gloss)[..., None] * colour
-        return np.asarray(np.where(cast.part[..., None] >= 0, albedo * light + shine, 0.0), dtype=np.float32)
+        return np.where(cast.part[..., None] >= 0, albedo * light + shine, np.float32(0))
 
     def _albedo(self, cast: Cast) -> tuple[Reals, Reals]:
         """Return the colour (H, W, 3) and the gloss (H, W) of the surface at each pixel."""
-        materials = [part.material for part in self.room.parts]
-        first, second, gloss, scale = (
-            np.array([getattr(material, name) for material in materials], dtype=np.float32)[cast.part]
-            for name in ("colour", "second", "gloss", "scale")
-        )
-        pattern = np.array([_PATTERNS[material.pattern] for material in materials])[cast.part]
+        first, second, gloss, scale, pattern = (column.take(cast.part, axis=0) for column in self._materials)
         share = np.zeros(cast.part.shape, dtype=np.float32)
         for kind in (1, 2, 3):
             chosen = pattern == kind
@@ -176,7 +200,7 @@ def _rays(directions: Reals, map_T_camera: Floats) -> Reals:
 
 
 def _dot(a: Reals, b: Reals) -> Reals:
-    return np.asarray(np.einsum("hwc,hwc->hw", a, b))
+    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
 
 
 def _unit(v: Reals) -> Reals:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
+import runpy
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 from small_log import small_log
-from waiting import LIMIT
 
 from objslam.sources.log_folder import write_log_folder
 
+Play = Callable[..., str]
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
@@ -41,11 +42,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return at
 
 
-def play(name: str, *arguments: Path) -> str:
-    words = [sys.executable, str(EXAMPLES / f"{name}.py"), *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def play(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Play:
+    """Run a script as Python does, but in this process. Return what it prints."""
+
+    def run(name: str, *arguments: Path) -> str:
+        script = str(EXAMPLES / f"{name}.py")
+        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+        capsys.readouterr()
+        runpy.run_path(script, run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
 
 
 def test_every_example_is_played_here() -> None:
@@ -56,7 +64,7 @@ def test_every_example_is_played_here() -> None:
         assert f'play("{name}"' in text
 
 
-def test_a_folder_becomes_a_result_that_answers(folder: Path) -> None:
+def test_a_folder_becomes_a_result_that_answers(play: Play, folder: Path) -> None:
     said = play("map_folder", folder / "log", folder / "out")
     assert "ObjectMap of 4 objects (0 unresolved)" in said
     answers = play("query_result", folder / "out")
@@ -64,22 +72,22 @@ def test_a_folder_becomes_a_result_that_answers(folder: Path) -> None:
     assert "cov_xy" in answers
 
 
-def test_arrays_become_the_cup_of_the_readme() -> None:
+def test_arrays_become_the_cup_of_the_readme(play: Play) -> None:
     assert "cup #0 at (2.510, 0.503, 0.400) m, sigma 0.398 m, 5 rays" in play("from_arrays")
 
 
-def test_pushed_data_become_a_map(folder: Path) -> None:
+def test_pushed_data_become_a_map(play: Play, folder: Path) -> None:
     assert "ObjectMap of 4 objects (0 unresolved)" in play("live_session", folder / "log")
 
 
-def test_boxes_of_another_detector_become_a_map(folder: Path) -> None:
+def test_boxes_of_another_detector_become_a_map(play: Play, folder: Path) -> None:
     said = play("own_detector", folder / "red")
     assert "ObjectMap of 1 object " in said
     place: Any = [float(x) for x in said.split("at (")[1].split(")")[0].split(",")]
     np.testing.assert_allclose(place, (1.0, 0.5, 0.5), atol=0.05)
 
 
-def test_shared_errors_go_from_one_run_to_the_next(folder: Path) -> None:
+def test_shared_errors_go_from_one_run_to_the_next(play: Play, folder: Path) -> None:
     said = play("settings_and_calibration", folder / "log", folder / "calibrated")
     assert "odometry.scale: " in said
     assert "ObjectMap of 4 objects (0 unresolved)" in said

@@ -8,18 +8,18 @@ import signal
 import subprocess
 import sys
 import sysconfig
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from commands import Call
 from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
 
 from objslam import __version__
-from objslam.cli import main
 from objslam.config import Odometry, Settings
 from objslam.core.calibration import Calibration
 from objslam.io.calibration_yaml import dump_calibration, load_calibration
@@ -33,40 +33,6 @@ from objslam.sources.log_folder import write_log_folder
 LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
 MODES = ("fixed", "joint")
 SCRIPT = Path(sysconfig.get_path("scripts")) / "objslam"
-
-
-@dataclass(frozen=True)
-class Call:
-    code: int
-    out: str
-    err: str
-
-    def says(self, *words: str) -> None:
-        """One line on stderr with all the words, no traceback."""
-        assert len(self.err.strip().splitlines()) == 1, self.err
-        self.says_somewhere(*words)
-
-    def says_somewhere(self, *words: str) -> None:
-        assert "Traceback" not in self.err
-        assert "internal error" not in self.err
-        assert "Warning" not in self.err
-        for word in words:
-            assert word in self.err, self.err
-
-
-@pytest.fixture
-def objslam(capsys, monkeypatch):
-    """The entry point of the console script, in this process."""
-
-    def call(*arguments) -> Call:
-        monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        captured = capsys.readouterr()
-        return Call(exit_.value.code, captured.out, captured.err)
-
-    return call
 
 
 @pytest.fixture(scope="session")
@@ -214,40 +180,6 @@ def test_config_dump_is_what_config_reads(objslam, tmp_path):
     told = yaml.safe_load(dumped.out)
     assert (told["joint"]["loss"], told["poses"]["max_gap"]) == ("l1", 3.0)
     assert Settings.model_validate(yaml.safe_load(objslam("config", "dump").out)) == Settings()
-
-
-def test_demo(objslam, log_folder, tmp_path):
-    shutil.copytree(log_folder, tmp_path / "demo" / "log")
-    (tmp_path / "demo" / ".objslam-demo").touch()  # The log of an older demo may be replaced.
-    demo = objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1)
-    assert demo.code == 0, demo.err
-    assert demo.out.count("position RMSE") == 2
-    for mode in MODES:
-        out = tmp_path / "demo" / mode
-        assert (out / "map.png").is_file()
-        found = json.loads((out / "evaluation.json").read_text())
-        assert found["recall"] > 0.8
-        assert found["position_median"] < 0.1
-    assert objslam("run", tmp_path / "demo" / "log", "-o", tmp_path / "again", *LEAN).code == 0
-
-
-def test_a_demo_replaces_no_log_of_others(objslam, log_folder, tmp_path):
-    shutil.copytree(log_folder, tmp_path / "log")
-    demo = objslam("demo", "-o", tmp_path, "--boxes")
-    assert demo.code == 1
-    demo.says("not from a demo", "-o")
-    assert (tmp_path / "log" / "camera.yaml").read_bytes() == (log_folder / "camera.yaml").read_bytes()
-
-
-def test_demo_from_images(objslam, tmp_path):
-    """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises."""
-    demo = objslam("demo", "-o", tmp_path / "demo")
-    assert demo.code == 0, demo.err
-    for mode, bar in (("fixed", 0.05), ("joint", 0.10)):
-        found = json.loads((tmp_path / "demo" / mode / "evaluation.json").read_text())
-        assert (found["matched"], found["missed"], found["false"]) == (7, 0, 0)
-        assert found["position_rmse"] <= bar
-        assert (tmp_path / "demo" / mode / "detections.jsonl").is_file()
 
 
 def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_path):

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import Call
 from small_log import small_log
-from waiting import LIMIT
 
 from objslam.sources.log_folder import write_log_folder
 
+Objslam = Callable[..., Call]
 LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
 
 
@@ -25,104 +25,101 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-    words = [sys.executable, "-m", "objslam", *map(str, arguments)]
-    return subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, check=False)
-
-
-def test_a_run_in_json_is_its_files(log: Path, tmp_path: Path) -> None:
-    done = call("run", log, "-o", tmp_path / "out", "--json", *LEAN)
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
+def test_a_run_in_json_is_its_files(objslam: Objslam, log: Path, tmp_path: Path) -> None:
+    done = objslam("run", log, "-o", tmp_path / "out", "--json", *LEAN)
+    assert done.code == 0, done.err
+    told = json.loads(done.out)
     assert told["objects"] == json.loads((tmp_path / "out" / "objects.json").read_text())["objects"]
     written = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert told["summary"] == written
     assert told["out"] == str(tmp_path / "out")
 
 
-def test_a_quiet_run_prints_warnings_only(log: Path, tmp_path: Path) -> None:
-    done = call("run", log, "-o", tmp_path / "out", "--quiet", *LEAN, "--set", "rays.border=100")
-    assert (done.returncode, done.stdout) == (0, "")
-    assert "warning: dropped" in done.stderr
-    assert "camera left, stamp 1700000" in done.stderr
+def test_a_quiet_run_prints_warnings_only(objslam: Objslam, log: Path, tmp_path: Path) -> None:
+    done = objslam("run", log, "-o", tmp_path / "out", "--quiet", *LEAN, "--set", "rays.border=100")
+    assert (done.code, done.out) == (0, "")
+    assert "warning: dropped" in done.err
+    assert "camera left, stamp 1700000" in done.err
     assert (tmp_path / "out" / "summary.json").is_file()
 
 
-def test_a_run_ends_with_its_verdict(log: Path, tmp_path: Path) -> None:
-    lines = call("run", log, "-o", tmp_path / "out", *LEAN).stdout.splitlines()
+def test_a_run_ends_with_its_verdict(objslam: Objslam, log: Path, tmp_path: Path) -> None:
+    lines = objslam("run", log, "-o", tmp_path / "out", *LEAN).out.splitlines()
     assert lines[-2].startswith("verdict: good. 4 objects")
     assert lines[-1] == f"wrote {tmp_path / 'out'}"
 
 
-def test_an_evaluation_in_json_is_its_file(log: Path, tmp_path: Path) -> None:
-    assert call("run", log, "-o", tmp_path / "out", "--quiet", *LEAN).returncode == 0
-    told = json.loads(call("eval", tmp_path / "out", "--json").stdout)
+def test_an_evaluation_in_json_is_its_file(objslam: Objslam, log: Path, tmp_path: Path) -> None:
+    assert objslam("run", log, "-o", tmp_path / "out", "--quiet", *LEAN).code == 0
+    told = json.loads(objslam("eval", tmp_path / "out", "--json").out)
     assert told == json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert told["matched"] == 4
 
 
-def test_a_quiet_session_prints_warnings_only(log: Path, tmp_path: Path) -> None:
-    done = call("live", log, "-o", tmp_path / "out", "--speed", "0", "--quiet", *LEAN, "--set", "rays.border=100")
-    assert (done.returncode, done.stdout) == (0, "")
-    assert all(line.startswith("warning: ") for line in done.stderr.splitlines())
-    assert "warning: dropped" in done.stderr
+def test_a_quiet_session_prints_warnings_only(objslam: Objslam, log: Path, tmp_path: Path) -> None:
+    done = objslam("live", log, "-o", tmp_path / "out", "--speed", "0", "--quiet", *LEAN, "--set", "rays.border=100")
+    assert (done.code, done.out) == (0, "")
+    assert all(line.startswith("warning: ") for line in done.err.splitlines())
+    assert "warning: dropped" in done.err
     assert (tmp_path / "out" / "summary.json").is_file()
 
 
-def test_help_is_a_word_too() -> None:
+def test_help_is_a_word_too(objslam: Objslam) -> None:
     for words in ((), ("run",), ("config", "dump")):
-        assert call("help", *words).stdout == call(*words, "--help").stdout != ""
+        assert objslam("help", *words).out == objslam(*words, "--help").out != ""
 
 
-def test_a_log_that_tells_no_shared_error_has_no_table_of_them(log: Path, tmp_path: Path) -> None:
-    told = call("run", log, "-o", tmp_path / "out", *LEAN).stdout
+def test_a_log_that_tells_no_shared_error_has_no_table_of_them(objslam: Objslam, log: Path, tmp_path: Path) -> None:
+    told = objslam("run", log, "-o", tmp_path / "out", *LEAN).out
     assert "prior sigma" in told
     assert "its priors count" not in told
     few = tmp_path / "few"
     shutil.copytree(log, few)
     frames = (log / "detections.jsonl").read_text().splitlines()
     (few / "detections.jsonl").write_text("\n".join(frames[:4]) + "\n")
-    told = call("run", few, "-o", tmp_path / "out", *LEAN).stdout
+    told = objslam("run", few, "-o", tmp_path / "out", *LEAN).out
     assert "prior sigma" not in told
     assert "this log tells none of them, so their priors count" in told
 
 
-def test_doctor_shows_an_unusual_calibration_if_there_are_too_few_boxes_to_judge_it(log: Path, tmp_path: Path) -> None:
+def test_doctor_shows_an_unusual_calibration_if_there_are_too_few_boxes_to_judge_it(
+    objslam: Objslam, log: Path, tmp_path: Path
+) -> None:
     few = tmp_path / "few"
     shutil.copytree(log, few)
     frames = (log / "detections.jsonl").read_text().splitlines()
     (few / "detections.jsonl").write_text("\n".join(frames[:4]) + "\n")
-    assert call("doctor", few).stdout.splitlines()[-1] == "nothing wrong was found"
+    assert objslam("doctor", few).out.splitlines()[-1] == "nothing wrong was found"
     camera = (few / "camera.yaml").read_text()
     camera = re.sub(r"rotation_xyzw: .*", "rotation_xyzw: [0, 0, 0, 1]", camera)
     (few / "camera.yaml").write_text(camera)
-    last = call("doctor", few).stdout.splitlines()[-1]
+    last = objslam("doctor", few).out.splitlines()[-1]
     assert last.startswith("check: ")
     assert "base_T_camera has no rotation" in last
 
 
-def test_info_tells_in_words_and_in_json(log: Path) -> None:
-    words = call("info", log).stdout
+def test_info_tells_in_words_and_in_json(objslam: Objslam, log: Path) -> None:
+    words = objslam("info", log).out
     assert "The robot drives 16.3 m in 15.8 s, by odometry and localization." in words
     assert "The camera left has 284 boxes of 4 labels in 80 frames." in words
-    told = json.loads(call("info", log, "--json").stdout)
+    told = json.loads(objslam("info", log, "--json").out)
     assert told["kind"] == "log"
     assert told["missing"] == []
     assert told["cameras"][0]["width"] == 640
     assert {stream["role"]: stream["timing"]["count"] for stream in told["streams"]}["detections"] == 80
 
 
-def test_info_sees_boxes_that_are_fractions(log: Path, tmp_path: Path) -> None:
+def test_info_sees_boxes_that_are_fractions(objslam: Objslam, log: Path, tmp_path: Path) -> None:
     write_log_folder(small_log(), tmp_path / "log")
     frames = [json.loads(line) for line in (log / "detections.jsonl").read_text().splitlines()]
     for frame in frames:
         frame["boxes"] = [[x1 / 640, y1 / 480, x2 / 640, y2 / 480] for x1, y1, x2, y2 in frame["boxes"]]
     (tmp_path / "log" / "detections.jsonl").write_text("".join(json.dumps(frame) + "\n" for frame in frames))
-    assert "they are probably shares of the image, not px" in call("info", tmp_path / "log").stderr
+    assert "they are probably shares of the image, not px" in objslam("info", tmp_path / "log").err
 
 
 @pytest.mark.parametrize("factor", [1e3, 1e9])
-def test_info_describes_a_log_whose_stamps_are_not_in_seconds(tmp_path: Path, factor: float) -> None:
+def test_info_describes_a_log_whose_stamps_are_not_in_seconds(objslam: Objslam, tmp_path: Path, factor: float) -> None:
     poses = "".join(f"{factor * (1.7e9 + 0.1 * i):.0f} {0.05 * i} 0 0\n" for i in range(30))
     write_log_folder(small_log(), tmp_path / "log")
     (tmp_path / "log" / "odometry.txt").unlink()
@@ -132,7 +129,7 @@ def test_info_describes_a_log_whose_stamps_are_not_in_seconds(tmp_path: Path, fa
         for i in range(30)
     )
     (tmp_path / "log" / "detections.jsonl").write_text(frames)
-    assert "all stamps are probably in" in call("info", tmp_path / "log").stderr
+    assert "all stamps are probably in" in objslam("info", tmp_path / "log").err
 
 
 @pytest.mark.parametrize(
@@ -143,10 +140,10 @@ def test_info_describes_a_log_whose_stamps_are_not_in_seconds(tmp_path: Path, fa
         (("run", "LOG", "--mode", "x"), ""),
     ],
 )
-def test_a_mistyped_choice_says_what_is_meant(arguments: tuple[str, ...], meant: str) -> None:
-    done = call(*arguments)
-    assert done.returncode == 2
-    said = " ".join(done.stderr.replace("│", " ").split())
+def test_a_mistyped_choice_says_what_is_meant(objslam: Objslam, arguments: tuple[str, ...], meant: str) -> None:
+    done = objslam(*arguments)
+    assert done.code == 2
+    said = " ".join(done.err.replace("│", " ").split())
     assert "is none of" in said
     assert "Value error" not in said
     assert ("did you mean" in said) == bool(meant)

@@ -51,6 +51,25 @@ def test_no_array_is_rigid_that_is_no_rotation(poses):
     assert np.abs(exact[:, :3, 3]).max() < 1e7
 
 
+@given(
+    npst.arrays(np.float64, 3, elements=st.floats(-3, 3)),
+    st.sampled_from([0.0, 1e-15, 1e-13, 1e-9, 1e-4, 1e-2]),
+    st.sampled_from([(0, 0, 1.0), (0, 0, -1.0), (3, 3, 2.0), (3, 0, 1.0), (1, 3, 1e7), (1, 3, np.nan), (2, 2, np.nan)]),
+    st.integers(0, 99),
+)
+def test_one_pose_is_judged_as_many_are(vector, noise, change, seed):
+    row, column, factor = change
+    pose = make_pose(Rotation.from_rotvec(vector).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    pose[:3, :3] += noise * np.random.default_rng(seed).uniform(-1, 1, (3, 3))
+    pose[row, column] = pose[row, column] * factor if pose[row, column] else factor
+    (expected,), (good,) = rigid_poses(pose[None])
+    found = rigid_pose(pose)
+    assert (found is not None) == good
+    if found is not None:
+        np.testing.assert_array_equal(found, expected)
+        assert not np.shares_memory(found, pose)
+
+
 def test_rows_that_are_no_poses():
     rows = np.tile([1.0, 2, 3, 0, 0, 0, 1], (6, 1))
     rows[1, 0], rows[2, 6], rows[3, 6], rows[4, 3], rows[5, 2] = np.inf, 0.0, 1e-7, np.nan, -1e7

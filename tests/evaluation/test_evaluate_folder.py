@@ -83,7 +83,7 @@ def test_auto_aligns_what_has_a_frame_of_its_own(tmp_path: Path, said: dict[str,
     ("poses", "tilted", "kind"), [("localization", 0, "none"), ("odometry", 0, "se2"), ("odometry", 1, "se3")]
 )
 def test_a_run_says_in_which_frame_its_map_is(tmp_path: Path, poses: str, tilted: int, kind: str) -> None:
-    log = simulate(preset("demo"), 0)
+    log = simulate(preset("demo", frames=100, objects=6, classes=6), 0)
     assert log.odometry is not None
     angles = 0.01 * tilted * np.sin(log.odometry.stamps)
     rocking = make_pose(Rotation.from_euler("y", angles[:, None]).as_matrix(), np.zeros((1, 3)))

@@ -34,11 +34,13 @@ def settings_of(*more):
     return load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "output.recording=false", *noise, *more))
 
 
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
+@pytest.fixture(autouse=True, scope="module")
+def patience():
     """Snapshots are whole, and are waited for, however slow the machine is."""
-    monkeypatch.setattr("objslam.live.session.session._PATIENCE", LIMIT)
-    monkeypatch.setattr("objslam.live.session.snapshots._BUDGET", LIMIT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("objslam.live.session.session._PATIENCE", LIMIT)
+        patch.setattr("objslam.live.session.snapshots._BUDGET", LIMIT)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -103,15 +105,22 @@ def test_errors_are_found_while_the_robot_drives_and_the_map_is_better_for_it(lo
     assert set(result.summary["calibration"]["parameters"]) >= set(ERRORS)
 
 
-@pytest.mark.parametrize("killed_at", ["before it takes effect", "after it took effect"])
-def test_a_session_killed_around_a_calibration_goes_on_to_the_same_map(log, tmp_path, killed_at):
-    settings = settings_of("live.calibrate_from=80")
-    whole = drive(log, settings, journal=tmp_path / "whole")
-    expected = whole.snapshot()
+@pytest.fixture(scope="module")
+def expected(log, patience, tmp_path_factory):
+    """The last snapshot of a session that calibrates, and that nothing kills."""
+    whole = drive(log, settings_of("live.calibrate_from=80"), journal=tmp_path_factory.mktemp("whole") / "journal")
+    snapshot = whole.snapshot()
     whole.abort()
+    return snapshot
+
+
+@pytest.mark.parametrize("killed_at", ["before it takes effect", "after it took effect"])
+def test_a_session_killed_around_a_calibration_goes_on_to_the_same_map(log, expected, tmp_path, killed_at):
+    settings = settings_of("live.calibrate_from=80")
     session = Session(settings, tmp_path / "killed", patient=True).start()
-    for number, _ in enumerate(list(events(log))):
-        feed(session, log, number, number + 1)
+    pushes = list(events(log))
+    for number, push in enumerate(pushes):
+        feed(session, log, number, pushes=[push])
         m = session._mapper.state
         if m.errors if killed_at.startswith("after") else m.next_id.keyframe >= 83:
             break
@@ -119,7 +128,7 @@ def test_a_session_killed_around_a_calibration_goes_on_to_the_same_map(log, tmp_
     session.abort()
     again = Session(settings, tmp_path / "killed", resume=True, patient=True).start()
     assert again._mapper.state.errors == m.errors
-    feed(again, log, number + 1)
+    feed(again, log, number + 1, pushes=pushes[number + 1 :])
     snapshot = again.snapshot()
     again.abort()
     assert snapshot.counters["calibrations"] == expected.counters["calibrations"]

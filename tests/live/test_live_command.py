@@ -35,8 +35,13 @@ def log(tmp_path_factory):
     return folder
 
 
+def words(log, out, *more):
+    return ["live", str(log), "-o", str(out), *QUIET, *more]
+
+
 def command(log, out, *more):
-    return [sys.executable, "-m", "objslam", "live", str(log), "-o", str(out), *QUIET, *more]
+    """The words that start a process, for what is killed, interrupted, or reads its standard input."""
+    return [sys.executable, "-m", "objslam", *words(log, out, *more)]
 
 
 def journal_in(out):
@@ -48,10 +53,10 @@ def journal_in(out):
     return (out / "journal.objslam").read_bytes()
 
 
-def test_killed_resumed_and_mapped_from_the_journal(log, tmp_path):
+def test_killed_resumed_and_mapped_from_the_journal(objslam, log, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
-    done = subprocess.run(command(log, whole, "--speed", "0"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
+    done = objslam(*words(log, whole, "--speed", "0"))
+    assert done.code == 0, done.err
     process = subprocess.Popen(command(log, out, "--speed", "5", "--interval", "0.2"), stderr=subprocess.DEVNULL)
     file = out / "journal.objslam"
     wait_for(lambda: file.exists() and file.stat().st_size > 30_000 and (out / "objects.json").exists())
@@ -60,8 +65,8 @@ def test_killed_resumed_and_mapped_from_the_journal(log, tmp_path):
     accepted = sum(1 for _ in messages(out, Ledger()))
     json.loads((out / "objects.json").read_text())  # whole, whenever it was killed
 
-    done = subprocess.run(command(log, out, "--speed", "0", "--resume"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
+    done = objslam(*words(log, out, "--speed", "0", "--resume"))
+    assert done.code == 0, done.err
     assert sum(1 for _ in messages(out, Ledger())) >= accepted
     one, other = load_map(out).objects, load_map(whole).objects
     assert [o.label for o in one] == [o.label for o in other]
@@ -73,17 +78,16 @@ def test_killed_resumed_and_mapped_from_the_journal(log, tmp_path):
 
 
 @pytest.mark.parametrize(("objects", "code", "line"), [(12, 0, "localised in"), (0, 3, "not localised in")])
-def test_a_session_in_the_map_of_another_day(log, tmp_path, objects, code, line):
+def test_a_session_in_the_map_of_another_day(objslam, log, tmp_path, objects, code, line):
     """The same room, and an empty map."""
     known = simulate(preset("demo", frames=150, classes=12, false=0.0), 0).truth.objects[:objects]
     noise = 0.02**2 * np.eye(3)
     made = tuple(MapObject(i, o.label, o.position, noise, "ok", 9, 9, 30.0, 0.1, 0.0, 1.0) for i, o in enumerate(known))
     (tmp_path / "objects.json").write_text(dump_objects(ObjectMap(made)))
     out = tmp_path / "out"
-    run = command(log, out, "--speed", "0", "--no-journal", "--map", str(tmp_path / "objects.json"))
-    done = subprocess.run(run, capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == code, done.stderr
-    assert line in done.stderr + done.stdout
+    done = objslam(*words(log, out, "--speed", "0", "--no-journal", "--map", tmp_path / "objects.json"))
+    assert done.code == code, done.err
+    assert line in done.err + done.out
     told = json.loads((out / "summary.json").read_text())["localisation"]
     assert told["localised"] == (code == 0)
 
@@ -102,10 +106,10 @@ def test_ctrl_c_ends_with_a_whole_result(log, tmp_path):
     assert not (tmp_path / "out" / "journal.objslam").exists()
 
 
-def test_a_session_does_not_stand_beside_an_older_result(log, tmp_path):
+def test_a_session_does_not_stand_beside_an_older_result(objslam, log, tmp_path):
     out = tmp_path / "out"
-    done = subprocess.run(command(log, out, "--speed", "0", "--no-journal"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
+    done = objslam(*words(log, out, "--speed", "0", "--no-journal"))
+    assert done.code == 0, done.err
     older = {f.name for f in out.iterdir()}
     (out / "mine.txt").touch()
     before = (out / "objects.json").stat().st_mtime_ns
@@ -118,39 +122,36 @@ def test_a_session_does_not_stand_beside_an_older_result(log, tmp_path):
     whole = {f.name for f in out.iterdir() if not f.name.startswith(".")}  # it may have been about to write another one
     assert whole == {"objects.json", "mine.txt"}
     assert all(name in told.decode() for name in older - {"objects.json"})
-    done = subprocess.run(command(log, out, "--speed", "0", "--no-journal"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
+    done = objslam(*words(log, out, "--speed", "0", "--no-journal"))
+    assert done.code == 0, done.err
     assert older <= {f.name for f in out.iterdir()}
 
 
-def test_a_session_started_again_keeps_the_journal_that_was_there(log, tmp_path):
+def test_a_session_started_again_keeps_the_journal_that_was_there(objslam, log, tmp_path):
     out = tmp_path / "out"
     kept = journal_in(out)
-    done = subprocess.run(command(log, out, "--speed", "0"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
-    assert "--resume" in done.stderr
+    done = objslam(*words(log, out, "--speed", "0"))
+    assert done.code == 0, done.err
+    assert "--resume" in done.err
     assert (out / "journal.1.objslam").read_bytes() == kept
-    assert "update p50" in done.stdout
-    done = subprocess.run(command(log, out, "--speed", "0", "--resume"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
-    assert "update p50" not in done.stdout  # all was in the journal: nothing was measured
+    assert "update p50" in done.out
+    done = objslam(*words(log, out, "--speed", "0", "--resume"))
+    assert done.code == 0, done.err
+    assert "update p50" not in done.out  # all was in the journal: nothing was measured
     newest = (out / "journal.objslam").read_bytes()
     assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
-    own = command(out, out, "--speed", "0")  # a session from the journal that it is about to write
-    done = subprocess.run(own, capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
+    done = objslam(*words(out, out, "--speed", "0"))  # a session from the journal that it is about to write
+    assert done.code == 0, done.err
     assert (out / "journal.2.objslam").read_bytes() == newest
     assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
 
 
-def test_a_live_recording_is_not_where_the_result_puts_its_own(log, tmp_path):
+def test_a_live_recording_is_not_where_the_result_puts_its_own(objslam, log, tmp_path):
     out = tmp_path / "out"
-    failed = subprocess.run(
-        command(log, out, "--view", str(out / "recording.rrd")), capture_output=True, text=True, timeout=LIMIT
-    )
-    assert failed.returncode == 1
-    assert "this file is the recording of the result" in failed.stderr
-    assert len(failed.stderr.strip().splitlines()) == 1
+    failed = objslam(*words(log, out, "--view", out / "recording.rrd"))
+    assert failed.code == 1
+    assert "this file is the recording of the result" in failed.err
+    assert len(failed.err.strip().splitlines()) == 1
     assert not out.exists()
 
 
@@ -182,10 +183,10 @@ def test_no_frame_of_recorded_lines_is_too_old(log, tmp_path, piped):
     assert not any("waited too long" in reason for reason in told["dropped"])
 
 
-def test_nothing_to_go_on_with(log, tmp_path):
-    done = subprocess.run(command(log, tmp_path / "out", "--resume"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 1
-    assert "no journal to resume" in done.stderr
+def test_nothing_to_go_on_with(objslam, log, tmp_path):
+    done = objslam(*words(log, tmp_path / "out", "--resume"))
+    assert done.code == 1
+    assert "no journal to resume" in done.err
     assert not (tmp_path / "out").exists()
 
 
@@ -214,46 +215,45 @@ def test_a_start_killed_before_its_first_message_costs_no_journal(log, tmp_path,
     assert {f.name: f.read_bytes() for f in out.iterdir()} == {"journal.objslam": kept}
 
 
-def test_a_session_starts_from_a_calibration(log, tmp_path):
+def test_a_session_starts_from_a_calibration(objslam, log, tmp_path):
     found = Calibration(("odometry.scale", "front.yaw"), np.array([0.01, 0.02]), np.diag([1e-4, 4e-6]), np.full(2, 0.03))
     file = tmp_path / "robot.yaml"
     file.write_text(dump_calibration(found))
     more = ("--speed", "0", "--no-journal", "--calibration", str(file))
-    done = subprocess.run(command(log, tmp_path / "out", *more), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 0, done.stderr
+    done = objslam(*words(log, tmp_path / "out", *more))
+    assert done.code == 0, done.err
     parameters = json.loads((tmp_path / "out" / "summary.json").read_text())["calibration"]["parameters"]
     assert parameters["odometry.scale"]["prior_sigma"] == pytest.approx(0.01)
     assert parameters["front.yaw"]["prior_sigma"] == pytest.approx(0.002)
     assert parameters["front.yaw"]["value"] == pytest.approx(0.02, abs=0.01)  # of a camera that is right: the file holds it
-    assert "errors that all measurements share" in done.stdout
+    assert "errors that all measurements share" in done.out
     file.write_text("parameters: 3")
-    failed = subprocess.run(command(log, tmp_path / "other", *more), capture_output=True, text=True, timeout=LIMIT)
-    assert failed.returncode == 2  # as for any setting
-    assert "write it with objslam calibrate" in " ".join(failed.stderr.split())
-    assert "Traceback" not in failed.stderr
+    failed = objslam(*words(log, tmp_path / "other", *more))
+    assert failed.code == 2  # as for any setting
+    assert "write it with objslam calibrate" in " ".join(failed.err.split())
+    assert "Traceback" not in failed.err
     assert not (tmp_path / "other" / "objects.json").exists()
 
 
 @pytest.mark.parametrize(
     ("more", "fault"), [((), "this file is not a journal"), (("--resume",), "cannot resume: this file is not a journal")]
 )
-def test_a_file_that_is_no_journal_stays_as_it_is(log, tmp_path, more, fault):
+def test_a_file_that_is_no_journal_stays_as_it_is(objslam, log, tmp_path, more, fault):
     out = tmp_path / "out"
     out.mkdir()
     (out / "journal.objslam").write_text("my notes about journals")
-    done = subprocess.run(command(log, out, "--speed", "0", *more), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 1
-    assert fault in " ".join(done.stderr.split())
+    done = objslam(*words(log, out, "--speed", "0", *more))
+    assert done.code == 1
+    assert fault in " ".join(done.err.split())
     assert (out / "journal.objslam").read_text() == "my notes about journals"
     assert len(list(out.iterdir())) == 1
 
 
-def test_what_a_source_cannot_be_and_what_an_option_cannot_do(log, tmp_path):
-    done = subprocess.run(command("dsd", tmp_path / "a"), capture_output=True, text=True, timeout=LIMIT)
-    assert done.returncode == 1
-    assert "SOURCE is dds, rclpy, stdin" in done.stderr
-    both = command(log, tmp_path / "a", "--resume", "--no-journal")
-    assert "--no-journal" in subprocess.run(both, capture_output=True, text=True, timeout=LIMIT).stderr
+def test_what_a_source_cannot_be_and_what_an_option_cannot_do(objslam, log, tmp_path):
+    done = objslam(*words("dsd", tmp_path / "a"))
+    assert done.code == 1
+    assert "SOURCE is dds, rclpy, stdin" in done.err
+    assert "--no-journal" in objslam(*words(log, tmp_path / "a", "--resume", "--no-journal")).err
     assert not (tmp_path / "a").exists()
     more = ("--detector", "none.onnx", "--topic", "odometry=/odom", "--domain", "0", "--speed", "2", "--robot", "1", "--raw")
     done = subprocess.run(command("stdin", tmp_path / "b", *more), input="", capture_output=True, text=True, timeout=LIMIT)

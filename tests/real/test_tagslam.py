@@ -126,14 +126,14 @@ def test_the_rays_point_at_the_surveyed_tags(log, survey, reference):
 
 
 def _tags(reference):
-    """The poses of the tags in TagSLAM's optimum, by label."""
+    """The poses of the tags in TagSLAM's optimum, by label. The last of its messages has all."""
+    *_, (connection, _, data) = read_messages(reference, lambda c: c.topic == "/tf", [])
     poses = {}
-    for connection, _, data in read_messages(reference, lambda c: c.topic == "/tf", []):
-        for found in _decoder(connection)(data).transforms:
-            if found.child_frame_id.startswith("tag_"):
-                at, turn = found.transform.translation, found.transform.rotation
-                rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
-                poses[found.child_frame_id] = make_pose(rotation, np.array([at.x, at.y, at.z]))
+    for found in _decoder(connection)(data).transforms:
+        if found.child_frame_id.startswith("tag_"):
+            at, turn = found.transform.translation, found.transform.rotation
+            rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+            poses[found.child_frame_id] = make_pose(rotation, np.array([at.x, at.y, at.z]))
     return poses
 
 
