@@ -78,20 +78,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--upgrade", action="store_true", help="take the newest versions, not those of the file")
     options = parser.parse_args()
-    written: set[str] = set()
+    written: dict[str, str] = {}
     parts = {name: list[str]() for name in ("run", "cuda", "dev", "docs")}
     with tempfile.TemporaryDirectory() as folder:
         held = Path(folder) / "held.txt"
         held.write_text("" if options.upgrade else "\n".join(pins(_FILE.read_text(encoding="utf-8"))), encoding="utf-8")
         for which, extras in _SETS.items():
             found = compile_set(extras, held)
-            for name in found.keys() - written:
+            for name in found.keys() - written.keys():
                 if "--hash=sha256:" not in found[name]:
                     sys.exit(f"pin: no hash of {name}")
             for name, entry in found.items():
-                if name not in written:
+                marker = entry.splitlines()[0].partition(";")[2].rstrip(" \\")
+                if written.get(name) not in ("", marker):  # A set may need a package where the sets before it do not.
                     parts["cuda" if _CUDA.match(name) else which].append(with_cpu_builds(name, entry))
-            written |= found.keys()
+                    written[name] = marker
     sections = ("\n".join([f"# set: {which}", *lines]) for which, lines in parts.items())
     _FILE.write_text(_HEAD + "\n".join(sections) + "\n", encoding="utf-8")
     print(f"{len(written)} packages with {sum(line.count('--hash') for part in parts.values() for line in part)} hashes")
