@@ -73,7 +73,7 @@ class ClockInstruments:
         own = np.where(self.moved[clock][:, None, None], velocity, 0.0)
         if self.motions is not None:
             change = own[1:][self.steps] - self.back @ own[:-1][self.steps]
-            instruments[self.motions.rows] = -self.motions.weighted(change)
+            instruments[self.motions.rows] = -self.motions.whitened(change)
         if len(self.absolute):
             rows = (self.absolute @ own).reshape(-1, own.shape[2])
             instruments[self.first : self.first + len(rows)] = -rows

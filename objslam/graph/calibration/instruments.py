@@ -70,15 +70,17 @@ def motion_instruments(of: Linearised, names: Sequence[str], sides: Floats) -> F
     The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
     if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is independent
     (instrumental variables; Fuller 1987, 1.4). The noise is also in the weight, because longer motions have more noise. So
-    motions that were measured too short would weigh more, and bias all columns. Hence the neighbours also predict the
-    covariance, within limits (`_ALIKE`), because a motion between two stands has no like neighbours.
+    motions that were measured too short would weigh more, and bias the errors of the odometry. Hence the neighbours also
+    predict the covariance there, within limits (`_ALIKE`), because a motion between two stands has no like neighbours. The
+    derivatives by other errors do not point along the noise that changes the weight.
     """
     instruments = sides.copy()
     if len(of.graph.steps):
         motions, scales = Motions.of(of), [k for k, name in enumerate(names) if name in ODOMETRY_SCALES]
+        own = [k for k, name in enumerate(names) if name.startswith("odometry.")]
         twists = motions.twists(sides)
         twists[..., scales] = motions.predicted(twists[..., scales])
-        instruments[motions.rows] = motions.weighted(twists)
+        instruments[motions.rows, own] = motions.weighted(twists[..., own])
     return instruments
 
 
@@ -94,7 +96,8 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
     """Predict motions (n, D) at the rate of four motions near each: two before, two after. seconds: (n,) the durations.
 
-    The motions next to it do not count: they may share a step of the odometry with it, and so share its noise.
+    The motions next to it do not count: they may share a step of the odometry with it, and so share its noise. A motion that
+    takes longer than all four stays as it is, because they do not show where the robot turned in this time.
     """
 
     def near(values: Floats) -> Floats:
@@ -102,4 +105,5 @@ def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
         return np.asarray(sum(padded[i : i + len(values)] for i in (0, 1, 5, 6)))
 
     time = near(seconds[:, None])
-    return np.asarray(np.where(time > 0, near(motions) / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
+    predicted = near(motions) / np.maximum(time, 1e-9) * seconds[:, None]
+    return np.asarray(np.where(time >= seconds[:, None], predicted, motions))
