@@ -4,8 +4,8 @@
     python tools/pin.py --upgrade      # take the newest version of everything
 
 It asks pypi.org, by uv (`pip install uv`). The file has a part for each set of packages: run, cuda (what the ordinary build
-of torch needs on Linux, the CPU build does not), dev, docs. A package is in the first set that needs it, and again in a set that
-needs it on more platforms.
+of torch needs on Linux, the CPU build does not), dev, docs. A package is in the first set that needs it, and again in a set
+that needs it on more platforms.
 """
 
 from __future__ import annotations
