@@ -96,8 +96,7 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
     """Predict motions (n, D) at the rate of four motions near each: two before, two after. seconds: (n,) the durations.
 
-    The motions next to it do not count: they may share a step of the odometry with it, and so share its noise. A motion that
-    takes longer than all four stays as it is, because they do not show where the robot turned in this time.
+    The motions next to it do not count: they may share a step of the odometry with it, and so share its noise.
     """
 
     def near(values: Floats) -> Floats:
@@ -105,5 +104,4 @@ def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
         return np.asarray(sum(padded[i : i + len(values)] for i in (0, 1, 5, 6)))
 
     time = near(seconds[:, None])
-    predicted = near(motions) / np.maximum(time, 1e-9) * seconds[:, None]
-    return np.asarray(np.where(time >= seconds[:, None], predicted, motions))
+    return np.asarray(np.where(time > 0, near(motions) / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
