@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from objslam.config import is_file
-from objslam.fleet.keys import file_content, hash_settings, key_of
+from objslam.fleet.keys import OPTION_FILES, file_content, hash_settings, key_of
 from objslam.fleet.stores.open_store import is_remote, open_store
 from objslam.fleet.tasks.map_task import Job
 
@@ -21,6 +21,7 @@ _INPUTS = "inputs"
 def make_job(store: str, settings: Settings, options: SourceOptions, detector: Path | None, *, report: bool) -> Job:
     """Return the job of a fleet. If the store is remote, workers get the files of the settings through it.
 
+    The content of the files that settings and options name counts in the key of the results, and their paths do not.
     store: the path or URL of the output. detector: the file of a model. report: whether each log gets a report.html.
     ConfigError if a file cannot be read, StoreError if the store refuses.
     """
@@ -35,6 +36,10 @@ def make_job(store: str, settings: Settings, options: SourceOptions, detector: P
             files["detector.names"] = found
     if detector is not None:
         files["detector"] = detector
+    for name in OPTION_FILES:
+        said = getattr(options, name, None)
+        if said is not None and is_file(Path(said)):
+            files[name] = Path(said)
     content = {key: file_content(file) for key, file in files.items()}
     url = store if is_remote(store) else open_store(store).url
     placed = tuple((key, _placed(url, file, content[key])) for key, file in files.items())

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.sources import SourceOptions
 
+OPTION_FILES = ("class_names", "camera_info")
+"""The options of a source that may name a file."""
 _LETTERS = 32
 """The hexadecimal digits of a key. A larger number makes longer names. With 32, two contents never have one key by
 chance."""
@@ -38,12 +40,14 @@ def hash_log(path: Path) -> str:
 def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str, bytes]) -> str:
     """Return the hash of all that decides a result besides its log: settings, options of the source, version and `files`.
 
-    files: the content of each file that a setting names, by the dotted key of the setting, and of the detector, by the key
-    "detector". The path of a file does not count.
+    files: the content of each file that a setting names, by the dotted key of the setting, of each file that an option
+    names, by the name of the option, and of the detector, by the key "detector". The path of a file does not count.
     """
     values = change_settings(settings, dict.fromkeys((key for key in files if "." in key), "a file")).model_dump(mode="json")
     said: dict[str, Any] = {"version": __version__, "settings": values}
-    said["options"] = {name: value for name, value in asdict(options).items() if value not in (None, ())}
+    said["options"] = {
+        name: value for name, value in asdict(options).items() if value not in (None, ()) and name not in files
+    }
     said["files"] = {name: sha256(content).hexdigest() for name, content in files.items()}
     return key_of(json.dumps(said, sort_keys=True, default=str))
 

@@ -57,3 +57,20 @@ def test_a_fleet_finds_the_boxes_as_a_run_does(tmp_path):
         assert (tmp_path / "out" / "results" / one.key / "detections.jsonl").is_file()
     other = make_job(str(tmp_path / "out"), settings, SourceOptions(), None, report=False)
     assert other.digest != job.digest
+
+
+def test_new_names_of_classes_are_a_new_job(tmp_path):
+    """The content of the file counts, and its path does not. Workers of a remote store get the file through it."""
+    one, same = tmp_path / "one.txt", tmp_path / "same.txt"
+    one.write_text("cup\nbook\n")
+    same.write_text("cup\nbook\n")
+
+    def job(names):
+        return make_job(str(tmp_path / "out"), Settings(), SourceOptions(class_names=names), None, report=False)
+
+    before = job(str(one)).digest
+    assert job(str(same)).digest == before
+    assert job("coco").digest != before
+    one.write_text("cup\nvase\n")
+    assert job(str(one)).digest != before
+    assert dict(job(str(one)).files)["class_names"] == str(one)

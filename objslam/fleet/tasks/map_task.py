@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from objslam import __version__
 from objslam.errors import ObjslamError
-from objslam.fleet.keys import hash_log, key_of
+from objslam.fleet.keys import OPTION_FILES, hash_log, key_of
 from objslam.fleet.record import Parameter, Record, record_name, result_name, seen_name
 from objslam.fleet.stores.open_store import is_remote, open_source, open_store
 from objslam.fleet.stores.store import StoreError
@@ -39,8 +39,8 @@ class Job:
     """The part that the tasks of all logs of a fleet share.
 
     store: the path or URL of the output. options: of the sources. digest: the hash of all that decides a result besides its
-    log. files: the dotted key of each setting that names a file, or `detector`, with the path of the file, or with its name
-    in a remote store. report: whether to write the report of each log.
+    log. files: the dotted key of each setting that names a file, an option of `OPTION_FILES`, or `detector`, with the path
+    of the file, or with its name in a remote store. report: whether to write the report of each log.
     """
 
     store: str
@@ -104,9 +104,9 @@ def _mapped(given: MapTask, log: Path, out: Path, record: Record) -> Record:
     from objslam.core.diagnostics import Ledger
     from objslam.sources import read
 
-    settings, detector = _settings(given.job)
+    settings, options, detector = _inputs(given.job)
     ledger = Ledger()
-    found = read(log, ledger, given.job.options)
+    found = read(log, ledger, options)
     if detector is not None:
         found = _with_boxes(found, detector, settings, ledger)
     path = found.robot_path
@@ -151,13 +151,15 @@ def _said(result: Result) -> dict[str, Any]:
     }
 
 
-def _settings(job: Job) -> tuple[Settings, Path | None]:
-    """Return the settings of a job with local paths, and its detector."""
+def _inputs(job: Job) -> tuple[Settings, SourceOptions, Path | None]:
+    """Return the settings and the options of a job with local paths, and its detector."""
     from objslam.config.settings import change_settings
 
     local = {key: _local_file(job.store, name) for key, name in job.files}
     detector = local.pop("detector", None)
-    return change_settings(job.settings, {key: str(path) for key, path in local.items()}), detector
+    given = {name: type(getattr(job.options, name))(local.pop(name)) for name in OPTION_FILES if name in local}
+    options = replace(job.options, **given) if given else job.options
+    return change_settings(job.settings, {key: str(path) for key, path in local.items()}), options, detector
 
 
 @lru_cache(maxsize=16)

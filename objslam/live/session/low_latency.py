@@ -18,7 +18,7 @@ def configure() -> None:
     Where the C library is glibc, fix the size of the blocks that go back to the system.
     """
     sys.setswitchinterval(_SWITCH_INTERVAL)
-    if hasattr(ctypes.CDLL(None), "mallopt"):
+    if sys.platform == "linux" and hasattr(ctypes.CDLL(None), "mallopt"):
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE)
     gc.collect()
     gc.freeze()
