@@ -4,7 +4,7 @@ Poses are not corrected. Odometry drifts, so a log without a localisation is cut
 points.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays
 from objslam.errors import LogError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
+from objslam.mapping.checks.meeting_points import fit_points
 
 FRAMES = 600
 """The most frames that are examined. More frames give a more certain answer and take longer."""
@@ -27,21 +28,11 @@ _DRIFT_YAW, _DRIFT_XY = 0.015, 0.03
 """The errors (rad, m) of odometry within a window that a ray may have. With larger values, wrong input may fit too."""
 _SIGMAS = 3.0
 """The deviation of a ray from its point, in standard deviations, up to which it fits. A larger value lets false rays fit."""
-_PAIRS = 96
-"""The number of tried pairs of rays for a point. More pairs find points with fewer rays, and take longer."""
-_JUDGES = 400
-"""The most rays of a label that choose among the tried points. More rays choose better, and take longer in a crowd."""
-_FEWEST = 4
-"""The fewest rays of a point. Fewer rays agree by chance."""
-_LEAST_ANGLE = np.radians(4.0)
-"""The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
-_NEAREST = 0.25
-"""The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself."""
 _COST = 3.0
 """The number of boxes that a point must explain before it counts, one for each coordinate. A larger number drops points with
 few boxes."""
-_MOST_POINTS = 40
-"""The most points of one label in a window. More points explain more boxes by chance."""
+_AT_ONCE = 100_000
+"""The most rays of several logs to which points are fitted at once. A larger number needs fewer passes and more memory."""
 
 
 @dataclass(frozen=True)
@@ -121,11 +112,39 @@ def bounded_part(log: Log, settings: Settings) -> Part:
     return Part(replace(log, cameras=tuple(cameras), truth=None), tuple(windows), drifts)
 
 
+@dataclass(frozen=True)
+class _Measured:
+    """The measurements of a log, as input of `fit_points`. label: (R,) a number for each label and window."""
+
+    keyframes: Keyframes
+    rays: Rays
+    origins: Floats
+    directions: Floats
+    label: Ints
+
+
 def agreement(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] | None = None) -> Agreement | None:
     """Return how well the boxes of a log agree. `log` has the frames of the part. None if no frame has a pose.
 
     window: for each camera, the windows of its frames, if they are not those of the part.
     """
+    return next(agreements(part, (log,), settings, window))
+
+
+def agreements(
+    part: Part, logs: Iterable[Log], settings: Settings, window: tuple[Ints, ...] | None = None
+) -> Iterator[Agreement | None]:
+    """Yield the `agreement` of each of several logs. One log does not affect another, but together they take less time."""
+    waiting: list[_Measured | None] = []
+    for log in logs:
+        waiting.append(_measure(part, log, settings, window))
+        if sum(len(one.rays) for one in waiting if one is not None) > _AT_ONCE:
+            yield from _fitted(part, waiting, settings)
+            waiting = []
+    yield from _fitted(part, waiting, settings)
+
+
+def _measure(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] | None) -> _Measured | None:
     free = settings.model_copy(update={"mode": "fixed"})
     try:
         keyframes = build_keyframes(log, free, Ledger())
@@ -137,14 +156,32 @@ def agreement(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...]
     for index, mine in enumerate(windows):
         own = keyframes.camera == index
         of_keyframe[own] = mine[keyframes.frame[own]]
-    yaw, place = pose_noise(part, settings)
-    origins, directions = rays.in_map(keyframes.map_T_camera)
-    tolerance = _SIGMAS * np.hypot(rays.sigma, yaw)
     label = rays.label + len(rays.label_names) * of_keyframe[rays.keyframe]
-    point, points, gain = _fit_points(origins, directions, tolerance, _SIGMAS * place, label, settings.seed)
-    total = max(part.boxes, 1)
-    score = (gain.sum() - _COST * len(points)) / total
-    return Agreement(float((point >= 0).sum() / total), float(score), total, keyframes, rays, point, points, gain)
+    return _Measured(keyframes, rays, *rays.in_map(keyframes.map_T_camera), label)
+
+
+def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Iterator[Agreement | None]:
+    known = [one for one in logs if one is not None]
+    if known:
+        yaw, place = pose_noise(part, settings)
+        begin = np.cumsum([0, *(one.label.max(initial=-1) + 1 for one in known)])
+        label = np.concatenate([one.label + first for one, first in zip(known, begin[:-1], strict=True)])
+        origins = np.concatenate([one.origins for one in known])
+        directions = np.concatenate([one.directions for one in known])
+        tolerance = _SIGMAS * np.hypot(np.concatenate([one.rays.sigma for one in known]), yaw)
+        point, points, gain = fit_points(origins, directions, tolerance, _SIGMAS * place, label, settings.seed)
+    total, first = max(part.boxes, 1), 0
+    for one in logs:
+        if one is None:
+            yield None
+            continue
+        mine = slice(first, first + len(one.rays))
+        first = mine.stop
+        number, own = np.unique(point[mine], return_inverse=True)
+        number, own = number[number >= 0], own - (number < 0).any()
+        score = (gain[mine].sum() - _COST * len(number)) / total
+        share = float((own >= 0).sum() / total)
+        yield Agreement(share, float(score), total, one.keyframes, one.rays, own, points[number], gain[mine])
 
 
 def pose_noise(part: Part, settings: Settings) -> tuple[float, float]:
@@ -173,89 +210,3 @@ def _take_frames(one: CameraLog, kept: Bools) -> Detections:
     boxes = found.take(kept[found.frame])
     number = np.cumsum(kept) - 1
     return replace(boxes, frame_stamps=found.frame_stamps[kept], frame=number[boxes.frame])
-
-
-def _fit_points(
-    origins: Floats, directions: Floats, tolerance: Floats, place: float, label: Ints, seed: int
-) -> tuple[Ints, Floats, Floats]:
-    """Fit points to the rays of each label. Return each ray's point (R,), the points (N, 3), and each ray's fit (R,).
-
-    tolerance: (R,) rad. place: m. A ray fits up to its tolerance times the distance, plus place, added in quadrature.
-    """
-    rng = np.random.default_rng(seed)
-    point, gain = np.full(len(label), -1), np.zeros(len(label))
-    points: list[Floats] = []
-    order = np.argsort(label, kind="stable")
-    for group in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
-        for mine, where, fit in _points_of(origins[group], directions[group], tolerance[group], place, rng):
-            point[group[mine]], gain[group[mine]] = len(points), fit
-            points.append(where)
-    return point, np.array(points).reshape(-1, 3), gain
-
-
-def _points_of(
-    origins: Floats, directions: Floats, tolerance: Floats, place: float, rng: np.random.Generator
-) -> Iterator[tuple[Ints, Floats, Floats]]:
-    """Yield for each point its rays, the point (3,), and how well each ray fits. The best point comes first."""
-    left = np.arange(len(origins))
-    for _ in range(_MOST_POINTS):
-        if len(left) < _FEWEST:
-            return
-        o, d, t = origins[left], directions[left], tolerance[left]
-        where = _meeting_points(o, d, rng)
-        if not len(where):
-            return
-        few = rng.choice(len(left), _JUDGES, replace=False) if len(left) > _JUDGES else slice(None)
-        best = where[int(_fit(o[few], d[few], t[few], place, where).sum(axis=1).argmax())]
-        fit = _fit(o, d, t, place, best[None])[0]
-        for _ in range(2):  # Each pass is a least-squares fit to the rays that fit now.
-            inside = fit > 0
-            if inside.sum() < _FEWEST:
-                return
-            moved = nearest_point(o[inside], d[inside], best)
-            other = _fit(o, d, t, place, moved[None])[0]
-            if other.sum() <= fit.sum():
-                break
-            best, fit = moved, other
-        inside = fit > 0
-        to = best - o[inside]
-        to /= np.linalg.norm(to, axis=1, keepdims=True)
-        if inside.sum() < _FEWEST or (to @ to[0]).min() > np.cos(_LEAST_ANGLE):
-            return
-        yield left[inside], best, fit[inside]
-        left = left[~inside]
-
-
-def _meeting_points(origins: Floats, directions: Floats, rng: np.random.Generator) -> Floats:
-    """Return the points (P, 3) where random pairs of rays meet ahead of both cameras."""
-    a, b = rng.integers(len(origins), size=(2, _PAIRS))
-    cos = np.einsum("ni,ni->n", directions[a], directions[b])
-    between = origins[b] - origins[a]
-    sin2 = 1 - cos**2
-    fine = sin2 > np.sin(_LEAST_ANGLE / 2) ** 2
-    along_a, along_b = (np.einsum("ni,ni->n", between, directions[k]) for k in (a, b))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s, t = (along_a - cos * along_b) / sin2, (cos * along_a - along_b) / sin2
-    fine &= (s > _NEAREST) & (t > _NEAREST)
-    one, two = origins[a] + s[:, None] * directions[a], origins[b] + t[:, None] * directions[b]
-    return np.asarray((one + two)[fine] / 2)
-
-
-def _fit(origins: Floats, directions: Floats, tolerance: Floats, place: float, points: Floats) -> Floats:
-    """Return how well each ray fits each point (P, R): 1 on the ray, 0 from the tolerance on."""
-    to = points[:, None] - origins
-    along = np.einsum("pri,ri->pr", to, directions)
-    squared = np.einsum("pri,pri->pr", to, to)
-    across = np.maximum(squared - along**2, 0.0)
-    allowed = tolerance**2 * squared + place**2
-    fit = 1 - across / np.maximum(allowed, 1e-12)
-    return np.where((along > _NEAREST) & (fit > 0), fit, 0.0)
-
-
-def nearest_point(origins: Floats, directions: Floats, start: Floats) -> Floats:
-    """Return the point (3,) that is nearest to rays in least squares of angles. start: (3,) a point near it, whose distances
-    turn offsets into angles."""
-    weight = 1 / np.maximum(((start - origins) ** 2).sum(axis=1), _NEAREST**2)
-    across = weight[:, None, None] * (np.eye(3) - directions[:, :, None] * directions[:, None, :])
-    matrix, vector = across.sum(axis=0), np.einsum("rij,rj->i", across, origins)
-    return np.asarray(np.linalg.solve(matrix + 1e-9 * np.eye(3), vector + 1e-9 * start))

@@ -12,7 +12,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
-from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part, pose_noise
+from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.halves import check_halves
@@ -140,7 +140,7 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
     """Return whether few boxes fit, whether the fitting boxes fit poorly, or whether another clock fits better."""
     if found is None or found.share < _ALARM or found.fit.sum() < _FITTING * (found.point >= 0).sum():
         return True
-    trials = [agreement(part, later(part.log, offset), settings) for offset in _ALARM_CLOCKS]
+    trials = agreements(part, (later(part.log, offset) for offset in _ALARM_CLOCKS), settings)
     return any(trial is not None and trial.score > found.score for trial in trials)
 
 
@@ -150,9 +150,10 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
         return None
     noise = pose_noise(part, settings)
     start, best, log = found, 0.0, part.log
-    for offset in _CLOCKS:  # With a large clock error, the rays that would show the error do not fit.
-        moved = later(part.log, offset)
-        trial = agreement(part, moved, settings)
+    logs = [later(part.log, offset) for offset in _CLOCKS]
+    trials = agreements(part, logs, settings)
+    for offset, moved, trial in zip(_CLOCKS, logs, trials, strict=True):
+        # With a large clock error, the rays that would show the error do not fit.
         if trial is not None and trial.score > start.score + _GAIN:
             start, best, log = trial, offset, moved
     errors = find_small_errors(log, start, settings, noise)
@@ -166,9 +167,8 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
     if not errors.harmful:
         return None
     # What the run corrects itself is no reason for a warning. Only what the harmful errors explain beyond it counts.
-    before, after = (
-        agreement(part, log, settings) for log in (errors.corrected(part.log, errors.estimated), errors.corrected(part.log))
-    )
+    corrected = errors.corrected(part.log, errors.estimated), errors.corrected(part.log)
+    before, after = agreements(part, corrected, settings)
     least = found.score if before is None else max(found.score, before.score)
     return errors if after is not None and after.score > least + _GAIN else None
 

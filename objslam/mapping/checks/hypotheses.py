@@ -193,12 +193,8 @@ def _from_degrees(poses: Floats) -> Floats:
     robot turns evenly, and it drives in the direction of its heading.
     """
     said = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    steps = np.diff(said)
-    rate = 0.0
-    for i, step in enumerate(steps.tolist()):  # Each step is near the step before.
-        steps[i] = step + 2 * np.pi * round((rate - step) / (2 * np.pi))
-        rate = steps[i]
-    yaw = np.radians(np.append(0.0, np.cumsum(steps)))
+    steps = np.unwrap(np.append(0.0, np.diff(said)))  # Each step is near the step before.
+    yaw = np.radians(np.cumsum(steps))
     way = np.diff(poses[:, :2, 3], axis=0) @ [1, 1j] * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
     yaw += np.angle(way.sum())
     return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])

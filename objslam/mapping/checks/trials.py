@@ -1,10 +1,11 @@
 """Try hypotheses about wrong input on a part of a log, and name the hypothesis that explains the log much better."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from objslam.config import Settings
 from objslam.core.types import Log
-from objslam.mapping.checks.agreement import Agreement, Part, agreement
+from objslam.mapping.checks.agreement import Agreement, Part, agreements
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses import Hypothesis, hypotheses
 from objslam.mapping.checks.path import straightness
@@ -42,14 +43,21 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
     """Return a trial of the unchanged log, followed by one for each hypothesis. The best hypothesis comes first."""
     first = Trial(None, before.score if before else 0.0, before.share if before else 0.0, _straight(log))
     every = list(hypotheses(part.log))
+
+    def corrected() -> Iterator[Log]:
+        for number, hypothesis in enumerate(every):
+            progress("doctor", number, len(every))
+            logs.append(hypothesis.put_right(part.log))
+            yield logs[-1]
+
+    logs: list[Log] = []
     trials = []
-    for number, hypothesis in enumerate(every):
-        progress("doctor", number, len(every))
-        changed = hypothesis.put_right(part.log)
-        found = agreement(part, changed, settings)
+    for number, found in enumerate(agreements(part, corrected(), settings)):
+        changed = logs[number]
         of_path = changed.localization is not part.log.localization or changed.odometry is not part.log.odometry
         straight = _straight(changed) if of_path else first.straight
-        trials.append(Trial(hypothesis, found.score if found else 0.0, found.share if found else 0.0, straight))
+        score, share = (found.score, found.share) if found else (0.0, 0.0)
+        trials.append(Trial(every[number], score, share, straight))
     return [first, *sorted(trials, key=lambda trial: -trial.score)]
 
 

@@ -8,8 +8,8 @@ from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.mapping.checks.agreement import nearest_point
 from objslam.mapping.checks.diagnosis import Diagnosis
+from objslam.mapping.checks.meeting_points import nearest_point
 from objslam.mapping.checks.small_errors import shared
 
 _STEPS = 2

@@ -1,0 +1,84 @@
+"""Points that explain the rays of labels, against the simulated truth and a plain second implementation."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from objslam.mapping.checks.meeting_points import fit_points, nearest_point
+
+
+def rays_to(points, owner, rng, noise=0.005):
+    """Rays from random places 5 m around points to the point of each ray, turned by a random angle."""
+    origins = rng.uniform(-5, 5, (len(owner), 3)) + 6 * rng.choice([-1, 1], (len(owner), 3))
+    to = points[owner] - origins
+    directions = to / np.linalg.norm(to, axis=1, keepdims=True) + noise * rng.normal(size=to.shape)
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("offset", [0.0, 5e5])
+def test_each_object_of_each_label_gets_a_point_and_its_rays(offset):
+    """Labels of 12 to 1500 rays, with one to three objects each. A tenth of the rays are false."""
+    rng = np.random.default_rng(0)
+    label = np.repeat(np.arange(6), [12, 12, 40, 60, 300, 1500])
+    objects = np.repeat(np.arange(6), [1, 1, 1, 2, 2, 3])
+    points = rng.uniform(-3, 3, (len(objects), 3))
+    owner = np.array([rng.choice(np.flatnonzero(objects == one)) for one in label])
+    origins, directions = rays_to(points, owner, rng)
+    false = rng.random(len(label)) < 0.1
+    directions[false] = rays_to(points, owner[false], rng, noise=3.0)[1]
+    order = rng.permutation(len(label))
+    origins, directions, label, owner, false = (a[order] for a in (origins + offset, directions, label, owner, false))
+    found, where, fit = fit_points(origins, directions, np.full(len(label), 0.02), 0.05, label, 0)
+    for number, truth in enumerate(points + offset):
+        mine = (owner == number) & ~false
+        nearest = int(np.linalg.norm(where - truth, axis=1).argmin())
+        assert np.linalg.norm(where[nearest] - truth) < 0.1
+        assert (found[mine] == nearest).mean() > 0.9
+    held = found >= 0
+    assert fit[held].min() > 0
+    assert not fit[~held].any()
+    assert held[false].mean() < 0.3
+    # What fit means, ray by ray.
+    to = where[found[held]] - origins[held]
+    across = np.linalg.norm(np.cross(to, directions[held]), axis=1)
+    allowed = np.hypot(0.02 * np.linalg.norm(to, axis=1), 0.05)
+    np.testing.assert_allclose(fit[held], 1 - (across / allowed) ** 2, atol=1e-6)
+
+
+def test_other_labels_do_not_change_the_points_of_a_label():
+    rng = np.random.default_rng(1)
+    label = np.repeat(np.arange(40), rng.integers(4, 60, 40))
+    origins, directions = rays_to(rng.uniform(-3, 3, (40, 3)), label, rng, noise=0.03)
+    tolerance = np.full(len(label), 0.02)
+    together, _, fit = fit_points(origins, directions, tolerance, 0.05, label, 0)
+    for one in range(0, 40, 7):
+        mine = label == one
+        alone, _, own = fit_points(origins[mine], directions[mine], tolerance[mine], 0.05, label[mine], 0)
+        np.testing.assert_array_equal(together[mine] >= 0, alone >= 0)
+        np.testing.assert_allclose(fit[mine], own, atol=1e-9)
+
+
+def test_rays_that_hardly_differ_have_no_point():
+    """A camera that only turns, and one that sees a thing from one side."""
+    rng = np.random.default_rng(2)
+    origins = 0.001 * rng.normal(size=(50, 3))
+    directions = np.array([1.0, 0.0, 0.0]) + 0.005 * rng.normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    found, where, fit = fit_points(origins, directions, np.full(50, 0.02), 0.05, np.zeros(50, dtype=int), 0)
+    assert (found == -1).all()
+    assert len(where) == 0
+    assert not fit.any()
+
+
+def test_the_nearest_point_is_that_of_least_squares():
+    rng = np.random.default_rng(3)
+    start = rng.normal(size=(3, 3))
+    origins, directions = (a.reshape(3, 20, 3) for a in rays_to(start, np.repeat(np.arange(3), 20), rng, noise=0.1))
+    used = rng.random((3, 20)) < 0.7
+    found = nearest_point(origins, directions, start, used)
+    for one in range(3):
+        o, d = origins[one, used[one]], directions[one, used[one]]
+        distance = np.linalg.norm(start[one] - o, axis=1, keepdims=True)
+        truth = least_squares(lambda x, o=o, d=d, s=distance: (np.cross(x - o, d) / s).ravel(), start[one]).x
+        np.testing.assert_allclose(found[one], truth, atol=1e-6)
+        np.testing.assert_allclose(nearest_point(o, d, start[one]), truth, atol=1e-6)
