@@ -41,8 +41,8 @@ class ClockInstruments:
     velocity: Floats
 
     @classmethod
-    def of(cls, of: Linearised, moved: Mapping[int, Bools]) -> Self:
-        """Return the instruments of a graph."""
+    def of(cls, of: Linearised, moved: Mapping[int, Bools], motions: Motions | None) -> Self:
+        """Return the instruments of a graph with these motions."""
         keyframes, graph = of.measured.keyframes, of.graph
         path = of.map_T_camera @ inverse(keyframes.base_T_camera)
         apart = np.where(keyframes.measured, np.maximum(np.diff(keyframes.stamps), 0.0), 0.0)
@@ -56,7 +56,7 @@ class ClockInstruments:
         return cls(
             moved,
             graph.steps,
-            Motions.of(of) if len(graph.steps) else None,
+            motions,
             adjoint(inverse(path[1:]) @ path[:-1])[graph.steps],
             roots @ adjoint(inverse(keyframes.base_T_camera)) if local else np.zeros((0, 6, 6)),
             graph.first_motion + 6 * len(graph.steps),

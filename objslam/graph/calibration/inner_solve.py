@@ -11,6 +11,7 @@ from objslam.core.geometry import exp_se3
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
+from objslam.graph.least_squares.normal_equations import elimination_order
 from objslam.graph.optimizers import levenberg_marquardt
 from objslam.graph.outlier_rejection import supported
 from objslam.graph.variables import read_poses, with_points
@@ -42,7 +43,7 @@ class InnerSolve(Linearised):
 
     def ordered(self) -> Self:
         """Return the state with the order of elimination, which all later states share."""
-        return replace(self, order=self.normal.order)
+        return replace(self, order=elimination_order(self.rows.jacobian, self.graph.blocks), known=self.graph)
 
     def moved(self, change: Floats) -> Self:
         """Return the state after a change (D,) of its variables."""

@@ -64,7 +64,7 @@ class Motions:
         return np.asarray((np.swapaxes(self.to_twist, 1, 2) @ weighted).reshape(6 * len(twists), twists.shape[2]))
 
 
-def motion_instruments(of: Linearised, names: Sequence[str], sides: Floats) -> Floats:
+def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Floats) -> Floats:
     """Return instruments (M, p): the sides, but without the noise of motions in scales of the odometry, and in weights.
 
     The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
@@ -75,12 +75,12 @@ def motion_instruments(of: Linearised, names: Sequence[str], sides: Floats) -> F
     derivatives by other errors do not point along the noise that changes the weight.
     """
     instruments = sides.copy()
-    if len(of.graph.steps):
-        motions, scales = Motions.of(of), [k for k, name in enumerate(names) if name in ODOMETRY_SCALES]
-        own = [k for k, name in enumerate(names) if name.startswith("odometry.")]
-        twists = motions.twists(sides)
-        twists[..., scales] = motions.predicted(twists[..., scales])
-        instruments[motions.rows, own] = motions.weighted(twists[..., own])
+    own = [k for k, name in enumerate(names) if name.startswith("odometry.")]
+    if motions is not None and own:
+        scaled = np.isin([names[k] for k in own], ODOMETRY_SCALES)
+        twists = motions.twists(sides[:, own])
+        twists[..., scaled] = motions.predicted(twists[..., scaled])
+        instruments[motions.rows, own] = motions.weighted(twists)
     return instruments
 
 

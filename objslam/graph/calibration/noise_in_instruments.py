@@ -7,7 +7,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import inverse, log_se3
-from objslam.graph.calibration.instruments import Motions, from_neighbours
+from objslam.graph.calibration.instruments import from_neighbours
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 
@@ -29,11 +29,11 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     residuals of the solution. Commanded motions are smooth: their residuals come from the robot and not from the
     measurement, so the sides have no noise.
     """
-    names, clocks = errors.names, system.clocks.moved
+    names, clocks = errors.names, {} if system.clocks is None else system.clocks.moved
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}
-    if not len(of.graph.steps) or not (scales or clocks):
+    motions, stamps, steps = system.motions, of.measured.keyframes.stamps, of.graph.steps
+    if motions is None or not (scales or clocks):
         return np.zeros(len(names))
-    motions, stamps, steps = Motions.of(of), of.measured.keyframes.stamps, of.graph.steps
     sigma = np.sqrt(np.einsum("kii->ki", motions.covariance)) / np.sqrt(np.maximum(motions.seconds, 1e-9))[:, None]
     walks = _random_walks(errors.odometry_stamps)
     walk = np.diff(walks(stamps), axis=0)[steps]

@@ -201,17 +201,18 @@ class _Fit:
             """Return half the squared Mahalanobis distance of parameters (P,) from their prior."""
             return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
 
-        shares = noise_shares(state, linearise(state, errors, theta), errors) if noise is None else noise
+        first = linearise(state, errors, theta)
+        shares = noise_shares(state, first, errors) if noise is None else noise
 
-        def at(state: InnerSolve, theta: Floats) -> _Outer:
-            linear = linearise(state, errors, theta, shares)
+        def outer(state: InnerSolve, theta: Floats, linear: LinearSystem) -> _Outer:
+            linear = linear.with_noise(shares)
             system = _without_shrinking(state, linear.reduce(), errors, theta)
             weights, information = _likelihood(system)
             gradient = weights @ system.gradient
             step = np.linalg.solve(information + prior, gradient - prior @ (theta - errors.mean))
             return _Outer(state, theta, linear, system, gradient, information, information + prior, np.asarray(step))
 
-        now, history, steps = at(state, theta), list[tuple[Floats, Floats]](), 0
+        now, history, steps = outer(state, theta, first), list[tuple[Floats, Floats]](), 0
         while steps < _ROUNDS and not now.converged(now.step, converged):
             history = [*history[-MEMORY:], (now.theta, now.step)]
             target = accelerated(history, sigma)
@@ -219,7 +220,8 @@ class _Fit:
             for _ in range(_HALVINGS + 1):
                 other = np.clip(target, -errors.bounds, errors.bounds)
                 trial = now.state.predicted(now.system, other - now.theta, self.measure(*errors.at(other))).solved()
-                after = at(trial.settled(), other)
+                settled = trial.settled()
+                after = outer(settled, other, linearise(settled, errors, other))
                 # The noise of the odometry makes the cost rugged along the clocks. There, the gradient tells more.
                 if now.cost_of_signal(trial.cost + deviation(other), other) <= before or after.left < now.left / 2:
                     better = after

@@ -4,7 +4,8 @@ The shared errors are no variables of the graph. Their columns of the Jacobian a
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy import sparse
@@ -15,7 +16,7 @@ from objslam.core.calibration import CalibratedMeasurements, kind
 from objslam.core.geometry import inverse, log_se3
 from objslam.core.types import Keyframes, Rays
 from objslam.graph.calibration.clock_instruments import ClockInstruments
-from objslam.graph.calibration.instruments import ODOMETRY_SCALES, motion_instruments
+from objslam.graph.calibration.instruments import ODOMETRY_SCALES, Motions, motion_instruments
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.least_squares.joint_rows import from_origins
 from objslam.graph.least_squares.normal_equations import NormalEquations
@@ -34,8 +35,10 @@ class LinearSystem:
     each. normal: the normal equations of the Jacobian. sides: (M, P) by the shared errors. residual: (M,). first_range,
     first_motion: the first rows of the ranges and of the motions. instruments: (M, P). At the optimum, the residuals do not
     correlate with the instruments. The instruments equal the sides, except for clocks and the scales of the odometry: these
-    sides contain the noise of the odometry, and so do the residuals. noise: (P,) the shares of noise in the information,
-    from `noise_shares`. longer: (P,) by how much a parameter makes the noise in the residuals longer than in its side.
+    sides contain the noise of the odometry, and so do the residuals. motions: None if neither the odometry nor a clock is a
+    parameter. clocks: None without a clock. by_path: (M, C) instruments of the C clocks by the solved path. noise: (P,) the
+    shares of noise in the information, from `noise_shares`. longer: (P,) by how much a parameter makes the noise in the
+    residuals longer than in its side.
     """
 
     jacobian: sparse.csr_matrix
@@ -45,9 +48,18 @@ class LinearSystem:
     first_range: int
     first_motion: int
     normal: NormalEquations
-    clocks: ClockInstruments
+    motions: Motions | None
+    clocks: ClockInstruments | None
+    by_path: Floats
     noise: Floats
     longer: Floats
+
+    def with_noise(self, noise: Floats) -> Self:
+        """Return the system whose sides contain the shares (P,) of noise. They change the instruments of clocks."""
+        instruments, columns = self.instruments.copy(), [] if self.clocks is None else list(self.clocks.moved)
+        sides = self.sides[:, columns]
+        instruments[:, columns] = sides + noise[columns] * (self.by_path - sides)
+        return replace(self, instruments=instruments, noise=noise)
 
     def left(self, columns: Floats) -> Floats:
         """Return what poses and landmarks leave of columns (M, n), by least squares."""
@@ -65,20 +77,21 @@ class LinearSystem:
         information, variance, slope = sides.T @ sides, instruments.T @ instruments, instruments.T @ sides
         noise = self.noise * np.diagonal(information)
         gradient = -instruments.T @ residual + noise * self.longer
-        clocks = list(self.clocks.moved)
-        others = np.setdiff1d(np.arange(count), clocks)
-        poses = len(self.clocks.seconds)
-        velocity = self.clocks.changes(changes[self.jacobian.shape[1] - 6 * poses :, :count].reshape(poses, 6, count))
-        for k in clocks:
-            share = self.noise[k]
-            # The side of a clock can be mostly noise. Its instrument stands in for it in products with other instruments.
-            slope[others, k] = variance[others, k]
-            # The path, and with it the instrument, depends on the parameters too. Without this part, the noise that the path
-            # and the side have in common would be in the slope.
-            follows = np.zeros_like(sides)
-            self.clocks.put(follows, k, velocity)
-            slope[k] += share * (residual @ follows)
-            noise[k] *= 1 - share
+        if self.clocks is not None:
+            others = np.setdiff1d(np.arange(count), list(self.clocks.moved))
+            poses = len(self.clocks.seconds)
+            velocity = self.clocks.changes(changes[-6 * poses :, :count].reshape(poses, 6, count))
+            for k in self.clocks.moved:
+                share = self.noise[k]
+                # The side of a clock can be mostly noise. In products with other instruments, its instrument stands in for
+                # it.
+                slope[others, k] = variance[others, k]
+                # The path, and with it the instrument, depends on the parameters too. Without this part, the noise that the
+                # path and the side have in common would be in the slope.
+                follows = np.zeros_like(sides)
+                self.clocks.put(follows, k, velocity)
+                slope[k] += share * (residual @ follows)
+                noise[k] *= 1 - share
         return ReducedSystem(
             information=information,
             slope=slope - np.diag(noise),
@@ -115,17 +128,30 @@ def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats, noi
 
     noise: (P,) from `noise_shares`. None means that the sides have no noise. SolveError if the system is singular.
     """
-    noise = np.zeros(len(theta)) if noise is None else noise
     graph, rows = of.graph, of.rows
     sides, moved = _parameter_columns(of, errors, theta)
-    instruments, clocks = motion_instruments(of, errors.names, sides), ClockInstruments.of(of, moved)
-    for k in moved:
-        own = instruments[:, [k]].copy()
-        clocks.put(own, k, clocks.velocity[..., None])
-        instruments[:, k] += noise[k] * (own[:, 0] - instruments[:, k])
-    longer = np.where([name in ODOMETRY_SCALES for name in errors.names], 1 + theta, 0.0)
-    first = graph.first_range, graph.first_motion
-    return LinearSystem(rows.jacobian, sides, instruments, rows.residual, *first, of.normal, clocks, noise, longer)
+    asked = bool(moved) or any(name.startswith("odometry.") for name in errors.names)
+    motions = Motions.of(of) if asked and len(graph.steps) else None
+    clocks = ClockInstruments.of(of, moved, motions) if moved else None
+    by_path = sides[:, list(moved)]
+    for i, k in enumerate(moved):
+        assert clocks is not None
+        clocks.put(by_path[:, i : i + 1], k, clocks.velocity[..., None])
+    found = LinearSystem(
+        jacobian=rows.jacobian,
+        sides=sides,
+        instruments=motion_instruments(motions, errors.names, sides),
+        residual=rows.residual,
+        first_range=graph.first_range,
+        first_motion=graph.first_motion,
+        normal=of.normal,
+        motions=motions,
+        clocks=clocks,
+        by_path=by_path,
+        noise=np.zeros(len(theta)),
+        longer=np.where([name in ODOMETRY_SCALES for name in errors.names], 1 + theta, 0.0),
+    )
+    return found if noise is None else found.with_noise(noise)
 
 
 def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> tuple[Floats, dict[int, Bools]]:
@@ -144,18 +170,20 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
         return joined.keyframes(images), joined.rays(images, rays.take(of.which)), settings
 
     here = measured(theta)
+    values = [part.measured(*here) for part in parts]
+    residuals = [part.residuals(*value) if value else np.zeros(0) for part, value in zip(parts, values, strict=True)]
     for k, name in enumerate(errors.names):
         clock = kind(name) == "clock"
         step = errors.steps[k] * (1.0 if clock else _SHORT)
         change = step * np.eye(len(theta))[k]
-        sides, apart = (measured(theta + change), measured(theta - change) if clock else here), step * (2 if clock else 1)
+        ahead, behind = measured(theta + change), measured(theta - change) if clock else None
         if clock:
-            moved[k] = np.abs(sides[0][0].stamps - here[0].stamps) > step / 2  # At the ends of the path, stamps hardly move.
-        for part in parts:
-            ahead, behind = (part.measured(*side) for side in sides)
-            if any(not np.array_equal(one, other) for one, other in zip(ahead, behind, strict=True)):
-                off = (part.residuals(*ahead) - part.residuals(*behind)).ravel()
-                result[part.first : part.first + len(off), k] = off / apart
+            moved[k] = np.abs(ahead[0].stamps - here[0].stamps) > step / 2  # At the ends of the path, stamps hardly move.
+        for part, value, residual in zip(parts, values, residuals, strict=True):
+            after, before = part.measured(*ahead), value if behind is None else part.measured(*behind)
+            if any(not np.array_equal(one, other) for one, other in zip(after, before, strict=True)):
+                off = (part.residuals(*after) - (residual if behind is None else part.residuals(*before))).ravel()
+                result[part.first : part.first + len(off), k] = off / (2 * step if clock else step)
     return result, moved
 
 
