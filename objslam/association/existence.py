@@ -9,7 +9,7 @@ from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
-from objslam.core.statistics import poisson_tail
+from objslam.core.statistics import logistic, poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
@@ -83,9 +83,7 @@ def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) ->
 
 def existence(state: State, gate: float) -> Floats:
     """Return the probability (N,) that each landmark is a static object."""
-    from scipy.special import expit
-
-    return np.asarray(expit(static_odds(state)) * expit(chance_odds(state, gate)))
+    return np.asarray(logistic(static_odds(state)) * logistic(chance_odds(state, gate)))
 
 
 def static_odds(state: State, fitted: int = 0) -> Floats:

@@ -123,11 +123,19 @@ class SlidingWindow:
 
 
 def _at_a_point(positions: Floats, points: Floats) -> Bools:
-    """Return which positions (N, 3) are at one of the points (K, 3), K > 0."""
-    from scipy.spatial import cKDTree
+    """Return which positions (N, 3) are at one of the points (K, 3), K > 0.
 
-    distance, _ = cKDTree(points).query(positions)
-    return np.asarray(distance < _AT_CAMERA)
+    Only points that are near along the longest axis of the path are compared. A search tree would do, but the import of
+    scipy.spatial takes 0.1 s.
+    """
+    axis = int(np.ptp(points, axis=0).argmax())
+    order = np.argsort(points[:, axis])
+    first, last = (np.searchsorted(points[order, axis], positions[:, axis] + side) for side in (-_AT_CAMERA, _AT_CAMERA))
+    number = last - first
+    which = np.repeat(np.arange(len(positions)), number)
+    beside = order[np.arange(len(which)) + np.repeat(first - np.cumsum(number) + number, number)]
+    at_it = np.linalg.norm(positions[which] - points[beside], axis=1) < _AT_CAMERA
+    return np.bincount(which[at_it], minlength=len(positions)) > 0
 
 
 def _is_landmark(key: int) -> bool:

@@ -38,7 +38,7 @@ from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
 
-_LIBRARIES = ("cv2", "gtsam", "scipy.linalg", "scipy.sparse", "scipy.special")
+_LIBRARIES = ("gtsam", "scipy.linalg", "scipy.sparse")
 """The libraries of every solve. They load in a stage of their own, because this takes longer than a small solve."""
 
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import expit
 from scipy.stats import chi2, norm, rayleigh
 
 import objslam
 from objslam.core import statistics
-from objslam.core.statistics import grouped_median, grouped_quantile, noise_factors, poisson_tail
+from objslam.core.statistics import grouped_median, grouped_quantile, logistic, noise_factors, poisson_tail
 
 
 def test_they_are_the_quantiles_that_they_say():
@@ -82,3 +83,8 @@ def test_the_poisson_tail_is_one_less_the_sum_of_the_smaller_counts():
     least, mean = np.array([-2, 0, 1, 2, 5, 3]), np.array([1.0, 0.0, 0.5, 3.0, 2.0, 0.0])
     expected = [1 - sum(math.exp(-m) * m**k / math.factorial(k) for k in range(n)) for n, m in zip(least, mean, strict=True)]
     np.testing.assert_allclose(poisson_tail(least, mean), expected, atol=1e-15)
+
+
+def test_log_odds_become_probabilities_however_large_they_are():
+    odds = np.array([-1e4, -800.0, -30.0, -1.0, 0.0, 2.5, 40.0, 1e4, -np.inf, np.inf])
+    np.testing.assert_allclose(logistic(odds), expit(odds), rtol=1e-13, atol=1e-300)

@@ -140,3 +140,14 @@ def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
     graph = build_graph(measured.factors(drive.association.object, rays, landmarks, drive.points))
     values = make_values(drive.keyframes.map_T_camera, drive.points, landmarks)
     assert apart(window.map_T_camera, read_poses(levenberg_marquardt(graph, values, 100).values)) < 1e-3
+
+
+def test_a_point_is_at_a_camera_if_any_camera_is_near_enough():
+    """Among many cameras, against all distances; some stand in a line across the path, and some in the same place."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([np.round(np.linspace(0, 20, 300), 1), rng.uniform(-1, 1, 300), np.zeros(300)])
+    positions = np.concatenate([points[::7] + 4e-4 * rng.normal(size=(43, 3)), rng.uniform(-1, 21, (50, 3)), points[:1]])
+    nearest = np.linalg.norm(positions[:, None] - points, axis=2).min(axis=1)
+    found = sliding_window._at_a_point(positions, points)
+    assert 20 < found.sum() < 44
+    np.testing.assert_array_equal(found, nearest < sliding_window._AT_CAMERA)

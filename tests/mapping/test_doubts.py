@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from doubtful_drives import LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled, with_boxes
+from scipy.spatial import cKDTree
 
 from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
+from objslam.mapping.doubts import pairs
 from objslam.simulation import pair, preset, simulate
 from objslam.simulation.settings import DepthNoise
 
@@ -162,3 +164,14 @@ def test_boxes_of_another_label_on_an_object():
     on = [one for one in result.doubts if one.reason == "on an object"]
     pairs = [one for one in result.doubts if one.kind == "pair"]
     assert len(on) + len(pairs) == len(result.doubts) == 1
+
+
+@pytest.mark.parametrize("number", [2, 9, 400])
+def test_neighbours_are_the_nearest_objects(number, monkeypatch):
+    """Against a search tree, in parts of a few objects."""
+    monkeypatch.setattr(pairs, "_AT_ONCE", 5_000)
+    position = np.random.default_rng(0).normal(size=(number, 3))
+    count = min(9, number)
+    found = np.sort(pairs._nearest(position, count), axis=1)
+    expected = cKDTree(position).query(position, k=np.arange(1, count + 1))[1]
+    np.testing.assert_array_equal(found, np.sort(expected, axis=1))

@@ -20,6 +20,7 @@ from objslam.association.observations import observe
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
+from objslam.core.statistics import logistic
 from objslam.core.types import Association, Keyframes, Rays
 
 _MOVING = 6
@@ -161,12 +162,10 @@ class _Few:
 
     def existence(self, found: State) -> Floats:
         """Return the probability (N,) that each new landmark is a static object, and not strays that meet by chance."""
-        from scipy.special import expit
-
         every = self.joined(found)
         rates = detection_rates(every.history, every.label, len(every.unassigned))
         odds = chance_odds(every, self.gate, self.strays, rates) + _alike_odds(every)
-        return np.asarray(expit(static_odds(every, fitted=_MOVING)) * expit(_POWER * odds))[self.known.count :]
+        return np.asarray(logistic(static_odds(every, fitted=_MOVING)) * logistic(_POWER * odds))[self.known.count :]
 
     def joined(self, found: State) -> State:
         """Return the known landmarks, followed by the new ones."""

@@ -10,12 +10,14 @@ import numpy as np
 from objslam.association.duplicates import TOGETHER
 from objslam.association.merging import common_frames
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.statistics import SAME_POINT
+from objslam.core.statistics import SAME_POINT, logistic
 from objslam.mapping.doubts.evidence import Evidence
 
 _NEIGHBOURS = 8
 """The number of nearest objects that each object is compared with. A larger number is slower, and matters in dense places
 only."""
+_AT_ONCE = 1_000_000
+"""The number of distances between objects that are computed at once. A larger number takes more memory."""
 _PRIOR = 0.05
 """The prior probability that two neighbours are one object. It is chosen, not measured: association has merged nearly all
 copies. A larger value reports more pairs."""
@@ -67,16 +69,12 @@ def find_pairs(evidence: Evidence) -> Pairs:
     hardly any frame shows both (`TOGETHER`). If they are two, the second lies anywhere among the objects of its label, and
     frames in view of both show both. Objects that fill one space are candidates too, because two things cannot do so.
     """
-    from scipy.spatial import cKDTree
-    from scipy.special import expit
-
     state, covariance = evidence.state, evidence.covariance
     position = state.landmarks.position
     if state.count < 2:
         return _none()
-    near = min(_NEIGHBOURS + 1, state.count)
-    found = np.asarray(cKDTree(position).query(position, k=np.arange(1, near + 1))[1])
-    pairs = np.stack([np.repeat(np.arange(state.count), near), found.ravel()], axis=1)
+    found = _nearest(position, min(_NEIGHBOURS + 1, state.count))
+    pairs = np.stack([np.repeat(np.arange(state.count), found.shape[1]), found.ravel()], axis=1)
     pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
     a, b = pairs[:, 0], pairs[:, 1]
     meets = evidence.accepts[a, state.label[b]] | evidence.accepts[b, state.label[a]]
@@ -93,10 +91,22 @@ def find_pairs(evidence: Evidence) -> Pairs:
     by_frames = frames * np.log(if_one / if_two) + if_two - if_one
     as_one = -0.5 * (np.where(shared, np.minimum(squared, 3.0), squared) + np.linalg.slogdet(2 * np.pi * both)[1])
     as_two = np.log(_density(position, state.label, state.label[a], len(state.unassigned)))
-    probability = expit(as_one - as_two + by_frames + np.log(_PRIOR / (1 - _PRIOR)))
+    probability = logistic(as_one - as_two + by_frames + np.log(_PRIOR / (1 - _PRIOR)))
     result = Pairs(evidence.object[a], evidence.object[b], gap, np.sqrt(squared), probability, frames, expected)
     order = np.argsort(-probability, kind="stable")
     return result.take(order[probability[order] >= _LEAST])
+
+
+def _nearest(position: Floats, count: int) -> Ints:
+    """Return the `count` nearest positions to each of positions (N, 3), itself included, as indices (N, count).
+
+    A search tree would take less time for more than some 5,000 objects, but the import of scipy.spatial takes 0.1 s.
+    """
+    parts = []
+    for rows in np.array_split(position, 1 + len(position) ** 2 // _AT_ONCE):
+        squared = sum((rows[:, [axis]] - position[:, axis]) ** 2 for axis in range(3))
+        parts.append(np.argpartition(squared, count - 1, axis=1)[:, :count])
+    return np.concatenate(parts)
 
 
 def _none() -> Pairs:
