@@ -20,6 +20,7 @@ from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.marginals import (
+    SolvedGraph,
     correlated_factor,
     joint_covariances,
     largest_sigma,
@@ -191,16 +192,17 @@ def solve_joint(
     covariance = np.full((association.count, 3, 3), np.nan)
     inliers = used & (weight > 0)
     gaussian, _ = measured.whole(association.object, inliers, map_T_camera, positions, "gnc")
-    covariance[landmarks] = marginal_covariances(gaussian, optimum.values, landmarks, ledger)
+    solved = SolvedGraph(gaussian, optimum.values)
+    covariance[landmarks] = marginal_covariances(solved, landmarks, ledger)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    drift = correlated_factor(gaussian, optimum.values, known, covariance[known])
+    drift = correlated_factor(solved, known, covariance[known])
     correlated = np.zeros((association.count, 3, drift.shape[2]))
     correlated[known] = drift
     seen_sigma = largest_sigma(covariance)
     witness = _witnesses(rays, association, used & (weight > 0))
     reach = np.linalg.norm(positions - map_T_camera[witness, :3, 3], axis=1)
     far = np.flatnonzero(seen_sigma > settings.triangulation.max_rel_sigma * reach)
-    seen_sigma[far] = largest_sigma(seen_covariances(gaussian, optimum.values, far, witness[far], ledger))
+    seen_sigma[far] = largest_sigma(seen_covariances(solved, far, witness[far], ledger))
     body = np.arange(association.count) if tags is None else tags.object_of_landmark()
     wider = widening(residual, body[association.object[used]], association.count)[body]
     covariance *= wider[:, None, None]
@@ -227,7 +229,7 @@ def solve_joint(
     if tags is None:
         return estimate
     told = None if calibrated is None else calibrated.sensitivity
-    covariances = partial(joint_covariances, gaussian, optimum.values)
+    covariances = partial(joint_covariances, solved)
     return with_objects(estimate, tags, rays, map_T_camera, optimum.values, covariances, wider, told, ledger)
 
 

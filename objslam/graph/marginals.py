@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import gtsam
@@ -31,26 +32,41 @@ _DIRECTIONS = 20
 With a larger number, the bends of a long path count too, and the search takes longer."""
 _ITERATIONS = 3
 """The number of steps of this search. More steps find the directions more exactly, and take longer."""
+_COLUMNS = 48
+"""The number of columns of the inverse that are computed at once. A larger number takes more memory."""
 
 
-def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, ledger: Ledger) -> Floats:
-    """Return the covariances (n, 3, 3), m^2, of the landmarks (n,) at `values`.
+@dataclass(frozen=True)
+class SolvedGraph:
+    """A graph at its solution. Its normal equations are factored once, whatever is asked about them."""
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+
+    @cached_property
+    def inverse(self) -> "_Inverse | None":
+        """The inverse of the normal equations, None if the system is indeterminate."""
+        return _Inverse.of(self.graph.linearize(self.values), self.values)
+
+
+def marginal_covariances(solved: SolvedGraph, landmarks: Ints, ledger: Ledger) -> Floats:
+    """Return the covariances (n, 3, 3), m^2, of the landmarks (n,).
 
     If the linear system is indeterminate, the ledger gets a warning, and every landmark gets a temporary prior with the
     standard deviation `HELD`. Landmarks that only this prior determines get NaN. The other covariances are corrected for the
     prior. If the system is still indeterminate, all covariances are NaN.
     """
     try:
-        return _marginals(graph, values, landmarks)
+        return _marginals(solved, landmarks)
     except RuntimeError as error:
         ledger.warn(
             f"covariances: {indeterminate(error).message}; objects that no measurement determines are left unresolved"
         )
-    held = graph.clone()
+    held, values = solved.graph.clone(), solved.values
     for j in landmarks.tolist():
         held.push_back(point_prior(j, values.atPoint3(L0 + j), HELD))
     try:
-        covariance = _marginals(held, values, landmarks)
+        covariance = _marginals(SolvedGraph(held, values), landmarks)
     except RuntimeError as error:
         ledger.warn(f"covariances: {indeterminate(error).message}; no object has a covariance")
         return np.full((len(landmarks), 3, 3), np.nan)
@@ -60,21 +76,19 @@ def marginal_covariances(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
     return without_prior
 
 
-def seen_covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, witnesses: Ints, ledger: Ledger
-) -> Floats:
+def seen_covariances(solved: SolvedGraph, landmarks: Ints, witnesses: Ints, ledger: Ledger) -> Floats:
     """Return the covariances (n, 3, 3), m^2, of landmarks (n,). Each is relative to one keyframe, its witness (n,).
 
     A covariance is in the camera frame of the witness, without the uncertainty of this camera's pose. In a map by odometry,
     far from its start, nearly all uncertainty of a landmark comes from the pose. If the linear system is indeterminate, the
     ledger gets a warning, and the remaining covariances are NaN.
     """
-    covariance = np.full((len(landmarks), 3, 3), np.nan)
+    covariance, values = np.full((len(landmarks), 3, 3), np.nan), solved.values
     if len(landmarks) == 0:
         return covariance
     try:
         pairs = list(zip(landmarks.tolist(), witnesses.tolist(), strict=True))
-        joint = joint_covariances(graph, values, [(X0 + k, L0 + j) for j, k in pairs])
+        joint = joint_covariances(solved, [(X0 + k, L0 + j) for j, k in pairs])
         for i, (j, k) in enumerate(pairs):
             covariance[i] = in_camera(joint[i], values.atPose3(X0 + k).matrix(), values.atPoint3(L0 + j))
     except RuntimeError as error:
@@ -103,26 +117,23 @@ def largest_sigma(covariances: Floats) -> Floats:
     return sigma
 
 
-def _marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints) -> Floats:
-    covariance = np.array(joint_covariances(graph, values, [(L0 + j,) for j in landmarks.tolist()])).reshape(-1, 3, 3)
+def _marginals(solved: SolvedGraph, landmarks: Ints) -> Floats:
+    covariance = np.array(joint_covariances(solved, [(L0 + j,) for j in landmarks.tolist()])).reshape(-1, 3, 3)
     if not np.isfinite(covariance).all():
         raise RuntimeError("a marginal covariance is not finite")
     return covariance
 
 
-def joint_covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, groups: Sequence[Sequence[int]]
-) -> list[Floats]:
-    """Return the covariance (d, d) of each group of variables, given by their keys, at `values`, in the order of the keys.
+def joint_covariances(solved: SolvedGraph, groups: Sequence[Sequence[int]]) -> list[Floats]:
+    """Return the covariance (d, d) of each group of variables, given by their keys, in the order of the keys.
 
     The normal equations are factored once for all groups. GTSAM eliminates the system again for each group, which takes 20
     times as long for 150 landmarks that were seen together. It is asked where the normal equations lose too many digits, and
     names the variable that is not determined. RuntimeError if both find the system indeterminate.
     """
-    found = of_normal_equations(graph.linearize(values), values, groups)
-    if found is not None:
-        return found
-    marginals = gtsam.Marginals(graph, values)
+    if solved.inverse is not None:
+        return solved.inverse.blocks(groups)
+    marginals = gtsam.Marginals(solved.graph, solved.values)
     return [_of_marginals(marginals, group) for group in groups]
 
 
@@ -137,32 +148,15 @@ def in_order(joint: gtsam.JointMarginal, keys: Sequence[int]) -> Floats:
     return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
 
-def of_normal_equations(
-    system: gtsam.GaussianFactorGraph, values: gtsam.Values, groups: Sequence[Sequence[int]]
-) -> list[Floats] | None:
-    """Return the covariances of the groups from the sparse normal equations, None if the system is indeterminate."""
-    inverse = _Inverse.of(system, values)
-    if inverse is None:
-        return None
-    found = []
-    for group in groups:
-        at = inverse.columns(group)
-        part = inverse.times(at, np.eye(len(at)))
-        found.append((part + part.T) / 2)
-    return found
-
-
-def correlated_factor(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, landmarks: Ints, covariance: Floats
-) -> Floats:
-    """Return the correlated errors of landmarks (n,) at `values`, as a factor (n, 3, m), m, of their joint covariance.
+def correlated_factor(solved: SolvedGraph, landmarks: Ints, covariance: Floats) -> Floats:
+    """Return the correlated errors of landmarks (n,), as a factor (n, 3, m), m, of their joint covariance.
 
     covariance: (n, 3, 3) m^2 of the landmarks. A few products with the joint covariance find its strongest directions
     (subspace iteration), so the time grows with the number of landmarks, not with its square. The factor comes from the
     Nystroem approximation, which is nowhere above the joint covariance. m is 0 if the linear system is indeterminate.
     """
     none = np.zeros((len(landmarks), 3, 0))
-    inverse = _Inverse.of(graph.linearize(values), values)
+    inverse = solved.inverse
     if inverse is None or not len(landmarks):
         return none
     at = inverse.columns([L0 + j for j in landmarks.tolist()])
@@ -226,6 +220,25 @@ class _Inverse:
     def columns(self, keys: Sequence[int]) -> Ints:
         """Return the columns of variables, in the order of the keys."""
         return np.concatenate([np.arange(self.begin[key], self.end[key]) for key in keys])
+
+    def blocks(self, groups: Sequence[Sequence[int]]) -> list[Floats]:
+        """Return the block (d, d) of the inverse for each group of variables, in the order of their keys."""
+        found: list[Floats] = []
+        waiting: list[Ints] = []
+        for i, group in enumerate(groups):
+            waiting.append(self.columns(group))
+            if sum(map(len, waiting)) < _COLUMNS and i + 1 < len(groups):
+                continue
+            at = np.concatenate(waiting)
+            whole = np.zeros((len(self.scale), len(at)))
+            whole[at, np.arange(len(at))] = 1 / self.scale[at]
+            columns, first = self.normal.solve(whole), 0
+            for own in waiting:
+                block = columns[own, first : first + len(own)] / self.scale[own, None]
+                found.append((block + block.T) / 2)
+                first += len(own)
+            waiting = []
+        return found
 
     def times(self, at: Ints, right: Floats) -> Floats:
         """Return the part of the inverse at some columns (d,), times vectors (d, m)."""

@@ -16,7 +16,7 @@ from objslam.errors import SolveError
 from objslam.graph.factors.odometry import motions
 from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
-from objslam.graph.marginals import largest_sigma, marginal_covariances, seen_covariances
+from objslam.graph.marginals import SolvedGraph, largest_sigma, marginal_covariances, seen_covariances
 from objslam.graph.optimizers import levenberg_marquardt
 from objslam.graph.variables import X0, make_values, read_points, read_poses
 from objslam.simulation import preset, simulate
@@ -90,13 +90,14 @@ def test_covariances_are_those_of_the_batch_solve(drive):
     graph, landmarks = grown(drive)
     graph.solve(50)
     whole, values = batch(drive, graph, landmarks)
-    expected = marginal_covariances(whole, values, landmarks, Ledger())
+    expected = marginal_covariances(SolvedGraph(whole, values), landmarks, Ledger())
     found = np.array([graph.point_covariance(j) for j in landmarks.tolist()])
     np.testing.assert_allclose(found, expected, rtol=0.05, atol=1e-6)
     held = drive.association.object
     newest = np.array([drive.rays.keyframe[held == j].max() for j in landmarks])
     seen = np.array([graph.seen_covariance(j, k) for j, k in zip(landmarks.tolist(), newest.tolist(), strict=True)])
-    np.testing.assert_allclose(seen, seen_covariances(whole, values, landmarks, newest, Ledger()), rtol=0.05, atol=1e-5)
+    told = seen_covariances(SolvedGraph(whole, values), landmarks, newest, Ledger())
+    np.testing.assert_allclose(seen, told, rtol=0.05, atol=1e-5)
     assert (largest_sigma(seen) < largest_sigma(found)).any()
     last = len(drive.keyframes) - 1
     assert np.linalg.eigvalsh(graph.pose_covariance(last))[0] > 0

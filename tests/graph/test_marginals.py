@@ -10,12 +10,12 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.graph.factors.bearing import bearings
 from objslam.graph.marginals import (
+    SolvedGraph,
     correlated_factor,
     in_order,
     joint_covariances,
     largest_sigma,
     marginal_covariances,
-    of_normal_equations,
     seen_covariances,
 )
 from objslam.graph.optimizers import build_graph
@@ -56,7 +56,7 @@ def dense(graph, values, landmark):
 def test_covariances_are_blocks_of_the_inverse_information():
     graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]), anchors(range(3)))
     values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
-    covariance = marginal_covariances(graph, values, np.array([2, 0]), ledger)
+    covariance = marginal_covariances(SolvedGraph(graph, values), np.array([2, 0]), ledger)
     np.testing.assert_allclose(covariance[0], dense(graph, values, 2), rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(covariance[1], dense(graph, values, 0), rtol=1e-6, atol=1e-12)
     assert not ledger.lines()
@@ -68,23 +68,23 @@ def test_the_normal_equations_give_what_gtsam_gives():
     groups = [(L0 + 1,), (X0 + 2, L0 + 0)]
     marginals = gtsam.Marginals(graph, values)
     expected = [in_order(marginals.jointMarginalCovariance(list(keys)), keys) for keys in groups]
-    found = joint_covariances(graph, values, groups)
+    found = joint_covariances(SolvedGraph(graph, values), groups)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found[0], dense(graph, values, 1), rtol=1e-6, atol=1e-12)
     floating = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]))  # Nothing holds the frame.
-    assert of_normal_equations(floating.linearize(values), values, groups) is None
+    assert SolvedGraph(floating, values).inverse is None
 
 
 def test_the_correlated_factor_is_the_joint_covariance():
     """Three landmarks have fewer coordinates than the factor has columns, so it is exact. Without a frame there is none."""
     pairs = [(k, j) for k in range(3) for j in range(3)]
     graph, values = build_graph(sightings(pairs), anchors(range(3), 0.05)), make_values(CAMERAS, POINTS, np.arange(3))
-    (joint,) = joint_covariances(graph, values, [[L0 + 2, L0, L0 + 1]])
+    (joint,) = joint_covariances(SolvedGraph(graph, values), [[L0 + 2, L0, L0 + 1]])
     blocks = np.array([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(3)])
-    factor = correlated_factor(graph, values, np.array([2, 0, 1]), blocks).reshape(9, -1)
+    factor = correlated_factor(SolvedGraph(graph, values), np.array([2, 0, 1]), blocks).reshape(9, -1)
     np.testing.assert_allclose(factor @ factor.T, joint, rtol=1e-6, atol=1e-12)
-    assert not correlated_factor(build_graph(sightings(pairs)), values, np.array([2, 0, 1]), blocks).size
+    assert not correlated_factor(SolvedGraph(build_graph(sightings(pairs)), values), np.array([2, 0, 1]), blocks).size
 
 
 def test_the_correlated_factor_of_many_landmarks_keeps_their_correlations():
@@ -101,9 +101,9 @@ def test_the_correlated_factor_of_many_landmarks_keeps_their_correlations():
     ]
     graph = build_graph(bearings(camera, to / np.linalg.norm(to, axis=1, keepdims=True), point, noise), held)
     values = make_values(cameras, points, np.arange(40))
-    (joint,) = joint_covariances(graph, values, [[L0 + j for j in range(40)]])
+    (joint,) = joint_covariances(SolvedGraph(graph, values), [[L0 + j for j in range(40)]])
     blocks = np.array([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(40)])
-    factor = correlated_factor(graph, values, np.arange(40), blocks)
+    factor = correlated_factor(SolvedGraph(graph, values), np.arange(40), blocks)
     left = joint - factor.reshape(120, -1) @ factor.reshape(120, -1).T
     assert factor.shape[2] < 40
     assert np.linalg.eigvalsh(left).min() > -1e-9 * np.linalg.eigvalsh(joint).max()  # Nowhere above the joint covariance.
@@ -115,7 +115,7 @@ def test_a_landmark_that_one_ray_holds_is_left_out_and_the_others_are_not():
     pairs = [(k, j) for k in range(3) for j in range(2)]
     graph = build_graph(sightings([*pairs, (1, 2)]), anchors(range(3)))
     values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
-    covariance = marginal_covariances(graph, values, np.arange(3), ledger)
+    covariance = marginal_covariances(SolvedGraph(graph, values), np.arange(3), ledger)
     assert np.isnan(covariance[2]).all()
     # the same graph with the loose landmark held: that changes nothing for the others, for nothing ties it to them
     sure = build_graph(sightings([*pairs, (1, 2)]), anchors(range(3)))
@@ -130,7 +130,7 @@ def test_a_landmark_that_one_ray_holds_is_left_out_and_the_others_are_not():
 def test_where_nothing_says_where_the_cameras_are_no_landmark_has_a_covariance():
     graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]))
     values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
-    covariance = marginal_covariances(graph, values, np.arange(3), ledger)
+    covariance = marginal_covariances(SolvedGraph(graph, values), np.arange(3), ledger)
     assert np.isnan(covariance).all()
     assert "left unresolved" in ledger.lines()[0]
 
@@ -139,7 +139,7 @@ def test_a_camera_that_one_ray_holds_leaves_no_covariance_at_all():
     pairs = [(k, j) for k in range(2) for j in range(3)]
     graph = build_graph(sightings([*pairs, (2, 0)]), anchors(range(2)))  # landmarks can be held, camera 2 cannot
     values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
-    covariance = marginal_covariances(graph, values, np.arange(3), ledger)
+    covariance = marginal_covariances(SolvedGraph(graph, values), np.arange(3), ledger)
     assert covariance.shape == (3, 3, 3)
     assert np.isnan(covariance).all()
     assert any("no object has a covariance" in warning for warning in ledger.warnings)
@@ -148,7 +148,8 @@ def test_a_camera_that_one_ray_holds_leaves_no_covariance_at_all():
 def test_no_landmarks():
     ledger = Ledger()
     values = make_values(CAMERAS, POINTS, np.zeros(0, dtype=np.int64))
-    covariance = marginal_covariances(build_graph(anchors(range(3))), values, np.zeros(0, dtype=np.int64), ledger)
+    solved = SolvedGraph(build_graph(anchors(range(3))), values)
+    covariance = marginal_covariances(solved, np.zeros(0, dtype=np.int64), ledger)
     assert covariance.shape == (0, 3, 3)
     assert not ledger.lines()
 
@@ -171,11 +172,11 @@ def test_seen_from_a_camera_the_covariance_is_that_of_a_map_that_begins_there():
 
     def anchored_at(k):
         anchor = gtsam.PriorFactorPose3((X0 + k), gtsam.Pose3(turned[k]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
-        return build_graph(rays, steps, [anchor])
+        return SolvedGraph(build_graph(rays, steps, [anchor]), values)
 
-    seen = seen_covariances(anchored_at(0), values, np.arange(3), np.array([2, 2, 2]), ledger)
-    there = marginal_covariances(anchored_at(2), values, np.arange(3), ledger)
+    seen = seen_covariances(anchored_at(0), np.arange(3), np.array([2, 2, 2]), ledger)
+    there = marginal_covariances(anchored_at(2), np.arange(3), ledger)
     turn = turned[2, :3, :3]
     np.testing.assert_allclose(turn @ seen @ turn.T, there, rtol=1e-4, atol=1e-8)
-    assert (largest_sigma(seen) < largest_sigma(marginal_covariances(anchored_at(0), values, np.arange(3), ledger))).any()
+    assert (largest_sigma(seen) < largest_sigma(marginal_covariances(anchored_at(0), np.arange(3), ledger))).any()
     assert not ledger.lines()

@@ -9,7 +9,7 @@ from test_isam2 import grown
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3
 from objslam.graph.assembly import Measurements
-from objslam.graph.marginals import marginal_covariances, seen_covariances
+from objslam.graph.marginals import SolvedGraph, marginal_covariances, seen_covariances
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import L0, make_values, read_points, read_poses, with_points
 
@@ -54,8 +54,8 @@ def test_a_solve_and_its_marginals_with_others_are_those_without(drive):
             values.insert(OTHER_POSE, POSE)
             values.insert(OTHER_POINT, POINT)
         values = levenberg_marquardt(graph, values, 30).values
-        covariance = marginal_covariances(graph, values, landmarks, Ledger())
-        seen = seen_covariances(graph, values, landmarks, np.full(len(landmarks), 5), Ledger())
+        covariance = marginal_covariances(SolvedGraph(graph, values), landmarks, Ledger())
+        seen = seen_covariances(SolvedGraph(graph, values), landmarks, np.full(len(landmarks), 5), Ledger())
         found.append((read_poses(values), with_points(drive.points, landmarks, values), covariance, seen))
     for without, beside in zip(*found, strict=True):
         np.testing.assert_allclose(beside, without, rtol=1e-4, atol=1e-6)
