@@ -40,9 +40,10 @@ class Optimum:
 def build_graph(*groups: Sequence[gtsam.NonlinearFactor]) -> gtsam.NonlinearFactorGraph:
     """Return one graph with all factors in their order."""
     graph = gtsam.NonlinearFactorGraph()
+    add = graph.add  # It takes a fifth of the time of push_back, which first tries whether the factor is a graph.
     for group in groups:
         for factor in group:
-            graph.push_back(factor)
+            add(factor)
     return graph
 
 
