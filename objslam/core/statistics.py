@@ -103,7 +103,7 @@ def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[flo
 def logistic(odds: Floats) -> Floats:
     """Return the probabilities (N,) of log odds (N,): 1 / (1 + exp(-odds)), without overflow.
 
-    scipy.special has it too, as `expit`, but its import takes 0.07 s.
+    scipy.special has it too, as `expit`, but its import takes 0.04 s.
     """
     return np.asarray(np.exp(-np.logaddexp(0.0, -odds)))
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from doubtful_drives import LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled, with_boxes
-from scipy.spatial import cKDTree
 
 from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
@@ -166,12 +165,11 @@ def test_boxes_of_another_label_on_an_object():
     assert len(on) + len(pairs) == len(result.doubts) == 1
 
 
-@pytest.mark.parametrize("number", [2, 9, 400])
-def test_neighbours_are_the_nearest_objects(number, monkeypatch):
-    """Against a search tree, in parts of a few objects."""
-    monkeypatch.setattr(pairs, "_AT_ONCE", 5_000)
+@pytest.mark.parametrize("number", [2, 9, 400, 1200])
+def test_neighbours_are_the_nearest_objects(number):
+    """Few objects, and many; against all distances."""
     position = np.random.default_rng(0).normal(size=(number, 3))
     count = min(9, number)
     found = np.sort(pairs._nearest(position, count), axis=1)
-    expected = cKDTree(position).query(position, k=np.arange(1, count + 1))[1]
+    expected = np.argsort(np.linalg.norm(position[:, None] - position, axis=2), axis=1)[:, :count]
     np.testing.assert_array_equal(found, np.sort(expected, axis=1))
