@@ -133,10 +133,11 @@ def _second(
     """
     found = place(tags.seen(rays, map_T_camera), tags.shape, tags.side)
     best, other = found.best.take(which), found.other.take(which)
-    gain = (found.other_cost - found.cost)[which] / wider[tags.object[which]]
+    cost = np.where(np.isfinite(found.cost), found.cost, 0.0)  # Without a pose, the other cost is infinite too.
+    gain = (found.other_cost - cost)[which] / wider[tags.object[which]]
     off = [np.linalg.norm(rotation_vector(np.swapaxes(rotation, 1, 2) @ o.pose[:, :3, :3]), axis=1) for o in (best, other)]
     swapped = (off[1] < off[0]) & np.isfinite(gain)
     turned = np.where(swapped[:, None, None], best.pose[:, :3, :3], other.pose[:, :3, :3])
     way = (other.pose[:, :3, 3] - best.pose[:, :3, 3]) * np.where(swapped, -1.0, 1.0)[:, None]
-    gain = np.where(np.isnan(gain), np.inf, np.where(swapped, -gain, gain))
+    gain = np.where(swapped, -gain, gain)
     return turned, 1 / (1 + np.exp(np.clip(gain / 2, -50.0, 50.0))), np.where(np.isfinite(gain)[:, None], way, 0.0)
