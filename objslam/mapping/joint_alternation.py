@@ -19,6 +19,7 @@ from objslam.core.trace import Trace, Why
 from objslam.core.trajectory import correct_poses, turned_since
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.frontend.turning_clocks import clocks_of_turns
 from objslam.mapping.duplicates import merge_unseen_together
 from objslam.mapping.labels import (
     angles_to_objects,
@@ -264,6 +265,7 @@ def solve_joint(
 
     start: a known start. With it, the log is not explored, and labels are not trusted.
     """
+    state = _with_clocks(state)
     if start is None and may_be_by_label(state.settings, state.all_rays):
         state, agree = _by_label(state)
         if agree and state.settings.association.method == "auto":
@@ -289,6 +291,15 @@ def solve_joint(
     assert state.association is not None
     assert state.estimate is not None
     return state.association, state.estimate, state.rounds
+
+
+def _with_clocks(state: JointState) -> JointState:
+    """Return the state that begins at the clocks which the robot's turns show."""
+    if state.errors is None or state.theta is not None:
+        return state
+    theta = clocks_of_turns(state.errors)
+    keyframes, rays, _ = state.errors.at(theta)
+    return replace(state, theta=theta, keyframes=keyframes, rays=rays)
 
 
 def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
