@@ -1,6 +1,6 @@
 """Measure whether the sigmas of square fiducials hold the truth, on simulated drives past eight tags.
 
-    python tools/bench_tags.py [--seeds 25] [--noise 0.3 0.5] [--reach 1.6] [--unknown] [--defaults] [--mode joint]
+    python tools/bench_tags.py [--noise 0.3 0.5] [--reach 1.6] [--unknown] [--wrong 0.01] [--defaults] [--mode M]
 
 The odometry has the noise of the settings. A line for each noise of the corners (px) says which share of the positions, the
 rotations and, with --unknown, the sizes has the truth inside its 95 % region. It also gives the median error of each, the
@@ -37,6 +37,7 @@ def main() -> None:
     parser.add_argument("--noise", type=float, nargs="+", default=[0.3, 0.5], help="standard deviation of a corner, px")
     parser.add_argument("--reach", type=float, default=1.6, help="least distance of a tag, m; the largest is 1.5 m more")
     parser.add_argument("--unknown", action="store_true", help="the sizes are not told")
+    parser.add_argument("--wrong", type=float, default=0.0, help="standard deviation of an error that all given sizes share")
     parser.add_argument("--defaults", action="store_true", help="the noise is not told, and shared errors are estimated")
     parser.add_argument("--mode", choices=("joint", "fixed"), default="joint")
     options = parser.parse_args()
@@ -59,7 +60,8 @@ def measured(drive: TagDrive, seed: int, noise: float, options: argparse.Namespa
     plain = ("output.recording=false", "checks.use=false", "association.method=by_label", f"mode={options.mode}")
     told = ("calibration.use=false", "noise.rays=false", "noise.odometry=false", f"tags.corner_sigma={noise}")
     settings = load_settings(None, (*plain, *(() if options.defaults else told)))
-    sizes = {} if options.unknown else drive.side
+    ratio = np.exp(options.wrong * np.random.default_rng([seed, 1]).normal())
+    sizes = {} if options.unknown else {label: side * ratio for label, side in drive.side.items()}
     settings = settings.model_copy(update={"tags": settings.tags.model_copy(update={"sizes": sizes})})
     rows = []
     for o in pipeline.run(log, settings, Ledger()).map.resolved():

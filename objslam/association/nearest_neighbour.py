@@ -55,14 +55,16 @@ def assign(
     return np.where(chosen >= 0, known[chosen], -1) if len(known) else chosen
 
 
-def associate_by_label(rays: Rays) -> Association:
+def associate_by_label(rays: Rays, off: Floats | None = None) -> Association:
     """Make one object for each label with a ray, in the order of label_names.
 
-    In each frame, the box with the highest score of its label gets the object. Of equal scores, the first box wins. All
-    other boxes get no object.
+    In each frame, one box of each label gets the object: the nearest one if `off` is given, else the one with the highest
+    score. Of equal scores, the first box wins. All other boxes get no object. off: (R,) the angle between each ray and the
+    object of its label, NaN if it is not known.
     """
     labels = np.unique(rays.label)
-    best = np.lexsort((np.arange(len(rays)), -rays.score, rays.label, rays.keyframe))
+    far = np.zeros(len(rays)) if off is None else np.where(np.isfinite(off), off, np.inf)
+    best = np.lexsort((np.arange(len(rays)), -rays.score, far, rays.label, rays.keyframe))
     _, first = np.unique(np.stack([rays.keyframe[best], rays.label[best]]), axis=1, return_index=True)
     which = np.full(len(rays), -1, dtype=np.int64)
     which[best[first]] = np.searchsorted(labels, rays.label[best[first]])

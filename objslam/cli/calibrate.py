@@ -66,7 +66,7 @@ def calibrate(
     if not found:
         raise LogError(f"none of the {len(logs)} logs can be used", hint="the warnings say why")
     if settings.calibration.file is not None:  # The prior of all logs. The result also has errors that only the file has.
-        known = load_calibration(Path(settings.calibration.file))
+        known = load_calibration(Path(settings.calibration.file)).of_robot()
         found.insert(0, replace(known, prior=known.sigma, prior_mean=known.values, prior_covariance=known.covariance))
     together = combine(found)
     console().print(calibration_table(together.to_dict()))
@@ -93,7 +93,7 @@ def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: L
     result = pipeline.run(log, settings, ledger, show)
     if result.calibration is None:
         raise SolveError("nothing was calibrated", where=str(path), hint="; ".join(ledger.warnings) or None)
-    return result.calibration
+    return result.calibration.of_robot()
 
 
 def _of_several(show: Progress, number: int, total: int) -> Progress:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from objslam.config import Settings
+    from objslam.config.tags import Tags
     from objslam.core.diagnostics import Ledger
     from objslam.core.object_map import MapObject
     from objslam.core.result import RunResult
@@ -153,7 +154,7 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
     """Print the objects, a line with the counts and `more`, the names of `removed` files of an older result, and `out`."""
     if result.map.objects:
         console().print(objects_table(result.map.objects, console()))
-    if advice := advice_on_tags(result.map.objects):
+    if advice := advice_on_tags(result.map.objects, result.settings.tags):
         say(advice)
     if calibration := result.summary.get("calibration"):
         if any(of["observable"] for of in calibration["parameters"].values()):
@@ -191,9 +192,9 @@ def _size(o: MapObject) -> str:
     return "" if o.body is None else " x ".join(f"{side:.2f}" for side in o.body.size)
 
 
-def advice_on_tags(objects: Sequence[MapObject]) -> str:
+def advice_on_tags(objects: Sequence[MapObject], given: Tags) -> str:
     """Return what to do if the sizes of fiducials are estimated. "" if there are no such fiducials."""
-    if not any(o.tag is not None and o.tag.size_sigma > 0 for o in objects):
+    if not any(o.tag is not None and given.size_of(o.label) is None for o in objects):
         return ""
     return "the sides of tags are estimated in the scale of the poses; a known side sets the scale: --set tags.size=METRES"
 

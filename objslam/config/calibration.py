@@ -36,5 +36,8 @@ class CalibrationSettings(Section):
     """m; the offset of each camera's place on the base, along each axis."""
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
+    tag_scale: NotNegative = 0.01
+    """share by which all fiducials of a given size are smaller or larger than the settings say. A printer, a ruler, the lens
+    and the detector of the corners each add to it. It is estimated in joint mode only."""
     focal: NotNegative = 0.0
     """share by which the focal length of each camera is too long or too short."""

@@ -94,8 +94,8 @@ class AssociationSettings(Section):
 
     method: Literal["auto", "global", "by_label"] = "auto"
     """Association method. by_label: each label is one object. global: several objects may share a label. auto uses by_label
-    if no frame has two boxes of one label and few rays miss the single object of their label. Otherwise auto uses global. In
-    joint mode, if many rays miss, auto decides again with the noise estimated from the log."""
+    if hardly any frame has two boxes of one label, and few rays miss the single object of their label. Otherwise auto uses
+    global. In joint mode, if many rays miss, auto decides again with the noise estimated from the log."""
     hypotheses: Annotated[int, Field(ge=16)] = 1024
     """Number of ray pairs whose points are tested per label in one pass. A larger value is slower and finds rarer
     objects."""

@@ -1,5 +1,7 @@
 """The settings of square fiducials (AprilTag, ArUco)."""
 
+from typing import Self
+
 from pydantic import Field
 
 from objslam.config.section import Positive, Section
@@ -19,6 +21,12 @@ class Tags(Section):
     corner_sigma: Positive = 1.0
     """Standard deviation of a corner per axis in px. It covers the error of the detector, which is smaller, and the error
     that a lens calibration leaves. An estimated factor on the noise of rays also multiplies this noise."""
+
+    def scaled(self, ratio: float) -> Self:
+        """Return the settings with all given sizes multiplied by a ratio."""
+        size = None if self.size is None else self.size * ratio
+        sizes = {key: None if side is None else side * ratio for key, side in self.sizes.items()}
+        return self.model_copy(update={"size": size, "sizes": sizes})
 
     def size_of(self, label: str) -> float | None:
         """Return the side (m) of the fiducial with a label, None if it is not known."""

@@ -1,7 +1,7 @@
 """Shared errors: errors that all measurements of a robot have in common, such as a wrong scale of its odometry."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -18,8 +18,10 @@ TRADED_OFF = 0.9
 """Two parameters trade off if their absolute correlation is above this value: the log hardly tells them apart. With a larger
 value, fewer pairs trade off."""
 
-SCALES = ("scale", "turn_scale", "range_scale", "focal")
+SCALES = ("scale", "turn_scale", "range_scale", "tag_scale", "focal")
 """The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
+OF_PLACES = ("tag_scale",)
+"""The parameters of a place, not of a robot. The calibration of a robot has none of them."""
 MOST_SCALE = 0.5
 """The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of more than half
 means a wrong unit, and a calibration should not hide that."""
@@ -75,6 +77,20 @@ class Calibration:
         correlation = self.covariance / np.outer(self.sigma, self.sigma)
         first, second = np.nonzero(np.triu(np.abs(correlation) > TRADED_OFF, 1))
         return [(self.names[i], self.names[j]) for i, j in zip(first, second, strict=True)]
+
+    def of_robot(self) -> Self:
+        """Return the calibration without the parameters of the place (`OF_PLACES`): the marginal of the others."""
+        own = np.flatnonzero([name not in OF_PLACES for name in self.names])
+        square = np.ix_(own, own)
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in own),
+            values=self.values[own],
+            covariance=self.covariance[square],
+            prior=self.prior[own],
+            prior_mean=self.expected[own],
+            prior_covariance=self.before[square],
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entries of summary.json: each parameter with value, sigma, prior, unit and whether it is observable,

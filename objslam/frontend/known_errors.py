@@ -25,16 +25,16 @@ def error_names(log: Log) -> tuple[str, ...]:
     """Return the names of all errors that the measurements of a log can share."""
     odometry = () if log.odometry is None else ODOMETRY
     cameras = tuple(f"{one.camera.name}.{name}" for one in log.cameras for name in _CAMERA)
-    return (*odometry, *cameras, "range_scale")
+    return (*odometry, *cameras, "range_scale", "tag_scale")
 
 
 def prior_sigma(name: str, settings: Settings) -> float:
     """Return the prior standard deviation of an error in the settings, in the unit of the error, 0 if the error is fixed.
 
-    In fixed mode, the errors are estimated from bearings and given poses. So the errors of odometry and of ranges are fixed.
+    In fixed mode, the errors are estimated from bearings and given poses. So errors of lengths and of odometry are fixed.
     """
     what = kind(name)
-    if settings.mode == "fixed" and (name in ODOMETRY or what == "range_scale"):
+    if settings.mode == "fixed" and (name in ODOMETRY or what in ("range_scale", "tag_scale")):
         return 0.0
     return float(getattr(settings.calibration, "translation" if what in ("x", "y", "z") else what))
 
@@ -70,8 +70,8 @@ def possible(log: Log, settings: Settings) -> list[str]:
 
 
 def known_errors(settings: Settings) -> Calibration | None:
-    """Return the shared errors in calibration.file, None without a file. ConfigError if the file is wrong."""
-    return None if settings.calibration.file is None else load_calibration(Path(settings.calibration.file))
+    """Return the robot's shared errors in calibration.file, None without a file. ConfigError if the file is wrong."""
+    return None if settings.calibration.file is None else load_calibration(Path(settings.calibration.file)).of_robot()
 
 
 def warn_of_others(known: Calibration, log: Log, settings: Settings, ledger: Ledger) -> None:

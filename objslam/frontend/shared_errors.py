@@ -39,7 +39,8 @@ class SharedErrors:
     """The measurements of some keyframes of a log, as a function of its shared errors.
 
     keyframes, rays: as the log measured them. names: the P parameters. mean: (P,) and prior: (P, P), their expected
-    values and covariance before the solve. noise: the factors on the nominal noise.
+    values and covariance before the solve. noise: the factors on the nominal noise. sized_tags: whether rays are to
+    fiducials whose size is given.
     """
 
     log: Log
@@ -50,6 +51,7 @@ class SharedErrors:
     mean: Floats
     prior: Floats
     noise: NoiseFactors = NOMINAL
+    sized_tags: bool = False
     _path: list[CorrectablePath] = field(default_factory=list, repr=False, compare=False)  # Copies share this list.
 
     @property
@@ -78,7 +80,8 @@ class SharedErrors:
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return frozenset()
-        scales = {"odometry.scale"} | ({"range_scale"} if np.isfinite(self.rays.range).any() else set())
+        lengths = {"range_scale": np.isfinite(self.rays.range).any(), "tag_scale": self.sized_tags}
+        scales = {"odometry.scale"} | {name for name, measured in lengths.items() if measured}
         return frozenset(scales) if scales <= set(self.names) else frozenset()
 
     @property
@@ -149,7 +152,8 @@ class SharedErrors:
         )
         longer = (1 + error.get("range_scale", 0.0)) * (1 + self.noise.shrinkage)
         ranged = replace(rays, direction=direction, range=rays.range * longer, range_sigma=rays.range_sigma * longer)
-        return moved, ranged, settings
+        tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))
+        return moved, ranged, settings.model_copy(update={"tags": tags})
 
     def corrected_log(self, values: Floats) -> Log:
         """Return the log corrected by the errors (P,): odometry, cameras and the stamps of frames."""
@@ -294,17 +298,26 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
         measured = {
             **cameras,
             "odometry": keyframes.odom_T_base is not None,
-            "": np.isfinite(rays.range).any(),  # The name range_scale has no part before a dot.
+            "range_scale": np.isfinite(rays.range).any(),
+            "tag_scale": _sized_tags(rays, settings),
         }
-        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0]])
+        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
     mean = np.zeros(len(names))
     prior = np.diag([prior_sigma(name, settings) ** 2 for name in names]).reshape(len(names), len(names))
     known = known_errors(settings) if names else None
     if known is not None:
         here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
         mean[here], prior[np.ix_(here, here)] = known.values[there], known.covariance[np.ix_(there, there)]
-    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior)
+    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior, sized_tags=_sized_tags(rays, settings))
     return errors if names or errors.unknown_noise else None
+
+
+def _sized_tags(rays: Rays, settings: Settings) -> bool:
+    """Return whether any ray is to a fiducial whose size is given."""
+    if rays.corner_sigma is None:
+        return False
+    labels = np.unique(rays.label[np.isfinite(rays.corner_sigma)]).tolist()
+    return any(settings.tags.size_of(rays.label_names[i]) is not None for i in labels)
 
 
 def _at_stamps(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:

@@ -56,7 +56,8 @@ class Measurements:
         joined = Multiframes.single(len(images)) if multiframes is None else multiframes
         keyframes, rays = joined.keyframes(images), joined.rays(images, rays)
         motion, covariance = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
-        return cls(joined, images, keyframes, rays, settings, motion, covariance, tags)
+        sized = None if tags is None else tags.sized(rays.label_names, settings)
+        return cls(joined, images, keyframes, rays, settings, motion, covariance, sized)
 
     def map_T_base(self, map_T_camera: Floats) -> Floats:
         """Return the base poses (K, 4, 4) at all images, from the poses (P, 4, 4) of the graph."""

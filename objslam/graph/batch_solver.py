@@ -230,7 +230,8 @@ def solve_joint(
         return estimate
     told = None if calibrated is None else calibrated.sensitivity
     covariances = partial(joint_covariances, solved)
-    return with_objects(estimate, tags, rays, map_T_camera, optimum.values, covariances, wider, told, ledger)
+    assert measured.tags is not None
+    return with_objects(estimate, measured.tags, rays, map_T_camera, optimum.values, covariances, wider, told, ledger)
 
 
 def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from objslam.association.observations import MIN_DEPTH
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import angles_off
 from objslam.core.statistics import MOST_NOISE_FACTOR, OUTLIER_RAY, STRAY_RAY, noise_factors
@@ -146,7 +147,8 @@ def second_opinion(
 def supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
     """Return which rays (R,) agree with their object, given the noise of the object's inliers.
 
-    used: (R,) the inliers. If there are none at all, all rays count as inliers.
+    used: (R,) the inliers. If there are none at all, all rays count as inliers. A camera does not see an object within
+    `MIN_DEPTH` of itself. There, the information of a bearing is so large that the linear system becomes singular.
     """
     placed = np.isin(association.object, np.flatnonzero(np.isfinite(positions[:, 0])))
     landmark = association.object[placed]
@@ -155,7 +157,8 @@ def supported(rays: Rays, association: Association, map_T_camera: Floats, positi
     before = used[placed] if used.any() else np.ones(len(miss), dtype=bool)
     noise = np.minimum(noise_factors(miss[before], landmark[before], association.count, _FEWEST), MOST_NOISE_FACTOR)
     agreeing = np.zeros(len(rays), dtype=bool)
-    agreeing[placed] = miss <= OUTLIER_RAY * noise[landmark]
+    apart = np.linalg.norm(positions[landmark] - origins, axis=1) > MIN_DEPTH
+    agreeing[placed] = apart & (miss <= OUTLIER_RAY * noise[landmark])
     return agreeing
 
 

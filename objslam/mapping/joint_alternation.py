@@ -19,8 +19,17 @@ from objslam.core.trace import Trace, Why
 from objslam.core.trajectory import correct_poses, turned_since
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.frontend.turning_clocks import clocks_of_turns
 from objslam.mapping.duplicates import merge_unseen_together
-from objslam.mapping.labels import clock_explains, labels_tell, may_be_by_label, noise_explains, warn_of_noise
+from objslam.mapping.labels import (
+    angles_to_objects,
+    clock_explains,
+    labels_tell,
+    may_be_by_label,
+    noise_explains,
+    shows_second_object,
+    warn_of_noise,
+)
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import rays_moved, without_errors
 
@@ -256,8 +265,11 @@ def solve_joint(
 
     start: a known start. With it, the log is not explored, and labels are not trusted.
     """
+    state = _with_clocks(state)
     if start is None and may_be_by_label(state.settings, state.all_rays):
         state, agree = _by_label(state)
+        if agree and state.settings.association.method == "auto":
+            state, agree = _with_doubles(state)
         if agree:
             assert state.association is not None
             assert state.estimate is not None
@@ -279,6 +291,15 @@ def solve_joint(
     assert state.association is not None
     assert state.estimate is not None
     return state.association, state.estimate, state.rounds
+
+
+def _with_clocks(state: JointState) -> JointState:
+    """Return the state that begins at the clocks which the robot's turns show."""
+    if state.errors is None or state.theta is not None:
+        return state
+    theta = clocks_of_turns(state.errors)
+    keyframes, rays, _ = state.errors.at(theta)
+    return replace(state, theta=theta, keyframes=keyframes, rays=rays)
 
 
 def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
@@ -306,6 +327,21 @@ def _by_label(state: JointState) -> tuple[JointState, bool]:
     if begin is None:
         return solved, False
     return replace(solved, errors=errors, theta=begin).solve("labels", association), True
+
+
+def _with_doubles(state: JointState) -> tuple[JointState, bool]:
+    """Return the state of one object per label with the nearest box of each label and keyframe, and whether the other boxes
+    show no second object of any label."""
+    assert state.association is not None
+    assert state.estimate is not None
+    if (state.association.object >= 0).all():
+        return state, True
+    nearest = associate_by_label(state.rays, angles_to_objects(state.rays, state.estimate, state.solved_poses))
+    if not np.array_equal(nearest.object, state.association.object):
+        state = state.solve("labels", nearest, state.solved_poses)
+    assert state.estimate is not None
+    solved = state.rays, nearest, state.estimate, state.keyframes, state.solved_poses
+    return state, not shows_second_object(*solved, state.settings)
 
 
 def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:

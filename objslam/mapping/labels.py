@@ -5,17 +5,25 @@ from collections.abc import Callable
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Bools, Floats
 from objslam.core.calibration import kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
+from objslam.core.geometry import angles_off
 from objslam.core.noise import NOMINAL
-from objslam.core.types import Association, Rays
+from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 
 MANY, SECOND = 5, 0.25
 """A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
 find fewer."""
+_DOUBLE = 0.1
+"""One object for each label is tried if at most this share of labels has several boxes in a keyframe, over all keyframes. A
+detector draws some boxes twice, and some false ones. With a larger share, more logs are tried in vain, which takes a solve
+each."""
+_AGREES = 3.0
+"""A ray agrees with the object of its label if it is off by at most this many standard deviations. With a larger value,
+fewer boxes can show a second object."""
 _JUDGEMENTS = 2
 """How often `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays finds too
 little noise, so a second one finds more. A larger number is slower."""
@@ -36,12 +44,55 @@ _LARGER = 1.5
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:
     """Return whether to try one object for each label.
 
-    association.method decides: `by_label` is yes. `auto` is yes if no keyframe has two rays of one label.
+    association.method decides: `by_label` is yes. `auto` is yes if hardly any keyframe has two rays of one label.
     """
     if settings.association.method != "auto":
         return settings.association.method == "by_label"
-    pairs = np.stack([rays.keyframe, rays.label])
-    return np.unique(pairs, axis=1).shape[1] == pairs.shape[1]
+    _, number = np.unique(np.stack([rays.keyframe, rays.label]), axis=1, return_counts=True)
+    return bool((number > 1).sum() <= _DOUBLE * len(number))
+
+
+def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> Floats:
+    """Return the angle (R,), rad, between each ray and the object of its label, NaN if the object has no position.
+
+    estimate: of one object for each label. map_T_camera: (K, 4, 4) the solved poses.
+    """
+    origins, directions = rays.in_map(map_T_camera)
+    return angles_off(origins, directions, estimate.positions[np.searchsorted(np.unique(rays.label), rays.label)])
+
+
+def shows_second_object(
+    rays: Rays, association: Association, estimate: Estimate, keyframes: Keyframes, map_T_camera: Floats, settings: Settings
+) -> bool:
+    """Return whether the other boxes of a label meet in a point of their own, more closely than by chance.
+
+    These are the boxes without an object. A box that agrees with the object of its label, or that is drawn around the same
+    thing in the same keyframe, shows no second object. keyframes: of the rays. map_T_camera: (K, 4, 4) the solved poses.
+    """
+    from objslam.graph.fixed_pose_triangulation import triangulate_at
+
+    off = angles_to_objects(rays, estimate, map_T_camera)
+    other = (association.object < 0) & ~(off <= _AGREES * rays.sigma) & ~_drawn_twice(rays, association)
+    others = Association(np.where(other, np.searchsorted(association.label, rays.label), -1), association.label)
+    found = triangulate_at(map_T_camera, keyframes, rays, others, settings)
+    return bool((found.ok & (found.counts >= settings.association.min_rays)).any())
+
+
+def _drawn_twice(rays: Rays, association: Association) -> Bools:
+    """Return which rays (R,) have the centre of their box inside the box of their label's object in the same keyframe, or
+    the centre of that box inside their own."""
+    held = np.flatnonzero(association.object >= 0)
+    key = rays.keyframe * len(rays.label_names) + rays.label
+    order = held[np.argsort(key[held], kind="stable")]
+    twin = order[np.minimum(np.searchsorted(key[order], key), len(order) - 1)]
+    own, other = rays.box, rays.box[twin]
+    return (key[twin] == key) & (_contains(own, other) | _contains(other, own))
+
+
+def _contains(boxes: Floats, others: Floats) -> Bools:
+    """Return whether boxes (R, 4) contain the centres of other boxes (R, 4)."""
+    centre = (others[:, :2] + others[:, 2:]) / 2
+    return np.asarray(((boxes[:, :2] <= centre) & (centre <= boxes[:, 2:])).all(axis=1))
 
 
 def labels_tell(association: Association, estimate: Estimate) -> bool:

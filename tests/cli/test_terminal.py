@@ -12,6 +12,7 @@ from rich.console import Console
 from objslam.cli import console as terminal
 from objslam.cli.live_command.status import status_line
 from objslam.cli.run import advice_on_tags, objects_table
+from objslam.config.tags import Tags
 from objslam.core.bodies.body import Body
 from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.diagnostics import Ledger
@@ -92,12 +93,12 @@ def test_a_cell_without_a_value_is_empty_and_a_body_has_its_size():
     assert "nan" not in screen.file.getvalue()
 
 
-@pytest.mark.parametrize(("sigma", "told"), [(0.002, True), (0.0, False)])
-def test_tags_of_unknown_size_say_how_a_size_helps(sigma, told):
-    tag = TagPose(np.array([0.0, 0.0, 0.0, 1.0]), 1e-4 * np.eye(3), 0.16, sigma)
+@pytest.mark.parametrize(("given", "told"), [(Tags(), True), (Tags(size=0.16), False), (Tags(sizes={1: 0.16}), False)])
+def test_tags_of_unknown_size_say_how_a_size_helps(given, told):
+    tag = TagPose(np.array([0.0, 0.0, 0.0, 1.0]), 1e-4 * np.eye(3), 0.16, 0.002)
     objects = (thing(0, "cup", (1.0, 2.0, 3.0)), replace(thing(1, "tag_1", (1.0, 2.0, 3.0)), tag=tag))
-    assert ("--set tags.size=METRES" in advice_on_tags(objects)) == told
-    assert advice_on_tags(objects[:1]) == ""
+    assert ("--set tags.size=METRES" in advice_on_tags(objects, given)) == told
+    assert advice_on_tags(objects[:1], given) == ""
 
 
 def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before(monkeypatch):

@@ -206,7 +206,7 @@ def test_rows_of_squares_are_the_ties_without_the_pose(known: bool) -> None:
     """Against GTSAM's ties: the same cost after their pose and size are solved. And the derivatives, numerically."""
     truth, rng = squares(3, seed=8), np.random.default_rng(8)
     sides = truth.side if known else np.full(3, np.nan)
-    rows = SquareRows(np.arange(12).reshape(3, 4), truth.shape, sides)
+    rows = SquareRows(np.arange(3), np.arange(12).reshape(3, 4), truth.shape, sides)
     assert np.abs(rows.rows(truth.corners.reshape(-1, 3))[0]).max() < 1e-6
     bent = truth.corners.reshape(-1, 3) + 1e-4 * rng.normal(size=(12, 3))
     residual, derivative = rows.rows(bent)
@@ -287,6 +287,42 @@ def test_known_sizes_give_the_scale_and_centres_do_not() -> None:
         scale[name] = scale_of(np.array([found[label] for label in sorted(found)]), true)
     assert abs(scale["corners"] - 1) < 0.01
     assert abs(scale["centres"] - 1) > 0.025
+
+
+@pytest.mark.parametrize("wrong", [1.03, 0.98])
+def test_odometry_that_knows_its_scale_tells_the_error_of_given_sizes(wrong: float) -> None:
+    noise = tuple(f"odometry.{name}=0.002" for name in ("x_per_m", "y_per_m", "yaw_per_m", "yaw_per_rad", "xy_per_rad"))
+    settings = load_settings(None, noise)
+    drive = make_tag_drive(2, pixel_sigma=0.5, settings=settings)
+    given = replace(drive, side={label: wrong * side for label, side in drive.side.items()})
+    overrides = (*noise, "noise.odometry=false", "calibration.scale=0.001", "calibration.tag_scale=0.05")
+    result = mapped(drive, settings_for(given, *overrides))
+    assert result.calibration is not None
+    k = result.calibration.names.index("tag_scale")
+    value, sigma = result.calibration.values[k], result.calibration.sigma[k]
+    assert sigma < 0.007
+    assert abs(value - (1 / wrong - 1)) < 3 * sigma
+    for o in result.map.resolved():
+        assert o.tag is not None
+        assert abs(o.tag.size - drive.side[o.label]) < 3 * o.tag.size_sigma
+        assert o.tag.size_sigma == pytest.approx(o.tag.size * sigma / (1 + value), rel=0.05)
+    place, _ = errors(drive, result)
+    assert (place < 7.815).all()
+
+
+def test_given_sizes_are_only_as_exact_as_their_prior() -> None:
+    """All sizes are 1 % too large, which nothing in the log can tell. The map is 1 % too large, and its sigmas say so."""
+    drive = make_tag_drive(4, pixel_sigma=0.3, drift=0.1, reach=4)
+    given = replace(drive, side={label: 1.01 * side for label, side in drive.side.items()})
+    noise = ("odometry.x_per_m=0.004", "odometry.y_per_m=0.002", "odometry.yaw_per_m=0.003", "odometry.yaw_per_rad=0.002")
+    sizes = {}
+    for prior in (0.0, 0.01):
+        result = mapped(drive, settings_for(given, f"calibration.tag_scale={prior}", "calibration.scale=0.2", *noise))
+        spread = [float(np.sqrt(np.trace(o.covariance))) for o in result.map.resolved()]
+        sizes[prior] = np.array(spread)
+        away = np.array([np.linalg.norm(o.position) for o in result.map.resolved()])
+    grown = np.sqrt(sizes[0.01] ** 2 - sizes[0.0] ** 2)
+    assert np.median(grown / away) == pytest.approx(0.01, rel=0.4)
 
 
 def test_an_unknown_size_is_estimated_in_the_scale_of_the_odometry() -> None:

@@ -89,6 +89,47 @@ def test_a_label_of_two_objects_is_two_objects():
         assert min(np.linalg.norm(position - twin) for twin in twins) < 0.5
 
 
+def test_boxes_drawn_twice_and_a_few_wrong_names_leave_one_object_per_label():
+    log = drive(5, frames=200, laps=2)
+    camera, rng = log.cameras[0], np.random.default_rng(5)
+    found = camera.detections
+    label = np.where(rng.random(len(found.frame)) < 0.01, rng.integers(0, 12, len(found.frame)), found.label)
+    twice = np.flatnonzero(rng.random(len(found.frame)) < 0.04)
+    source = np.sort(np.concatenate([np.arange(len(found.frame)), twice]))
+    jitter = np.zeros((len(source), 4))
+    again = np.append(False, np.diff(source) == 0)
+    jitter[again] = rng.normal(0, 6, (again.sum(), 4))
+    more = replace(found, label=label).take(source)
+    assert len(more.frame) == len(source)
+    score = np.where(again, more.scores - 0.1, more.scores)
+    more = replace(more, boxes=more.boxes + jitter, scores=np.clip(score, 0.01, 1))
+    result, _ = mapped(replace(log, cameras=(replace(camera, detections=more),)))
+    assert result.summary["rounds"] == []
+    assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)
+
+
+def test_a_second_object_that_is_seldom_seen_is_found_beside_the_first():
+    """Its few boxes are all in frames that show the first object of its label too."""
+    log = drive(4, frames=200, laps=2)
+    found = log.cameras[0].detections
+    seen = np.zeros((len(found.frame_stamps), len(found.label_names)), dtype=bool)
+    seen[found.frame, found.label] = True
+    together = seen.T.astype(int) @ seen
+    np.fill_diagonal(together, 0)
+    keep, other = (int(i) for i in np.unravel_index(np.argmax(together), together.shape))
+    both = np.flatnonzero(seen[:, keep] & seen[:, other])
+    shown = both[:: max(len(both) // 12, 1)]
+    left = (found.label != other) | np.isin(found.frame, shown)
+    names = found.label_names
+    fewer = replace(found, label=np.where(found.label == other, keep, found.label)).take(left)
+    assert len(shown) < 0.1 * len(fewer.frame)
+    result, _ = mapped(replace(log, cameras=(replace(log.cameras[0], detections=fewer),)))
+    assert result.summary["rounds"] != []
+    twins = [o.position for o in result.map.resolved() if o.label == names[keep]]
+    for position in (o.position for o in log.truth.objects if o.label in (names[keep], names[other])):
+        assert min(np.linalg.norm(position - twin) for twin in twins) < 0.5
+
+
 def test_a_label_without_a_position_tells_nothing():
     association = Association(np.repeat([0, 1], 10), np.arange(2))
     agrees = np.repeat([1.0, 0.0], 10)

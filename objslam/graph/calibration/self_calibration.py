@@ -294,9 +294,7 @@ def _without_shrinking(
     around = landmarks[near] - landmarks[near].mean(axis=0)  # Without the mean, a shift of the map would count as growth.
     moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
     size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
-    scaled = state.measured.tags is not None and bool(np.isfinite(state.measured.tags.side).any())
-    unknown = frozenset() if scaled else errors.unknown_scales  # Fiducials of known size tell the scale.
-    growing = np.where([name in unknown for name in errors.names], 1 + theta, 0.0)
+    growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
     if not growing @ size > _LEAST_GROWTH:
         return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
     project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)

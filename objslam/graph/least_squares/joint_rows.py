@@ -67,7 +67,8 @@ class JointGraph:
 
     def measuring(self, measured: Measurements) -> Self:
         """Return the graph of the same rays and landmarks with other measured values."""
-        return replace(self, measured=measured, rays=measured.rays.take(self.which))
+        squares = self.squares.sized(measured.tags)
+        return replace(self, measured=measured, rays=measured.rays.take(self.which), squares=squares)
 
     @cached_property
     def ranged(self) -> Ints:

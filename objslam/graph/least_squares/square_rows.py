@@ -4,7 +4,7 @@ The square nearest to four corners is computed from the corners. The residual is
 step that only moves or turns the square does not change the residual.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -19,10 +19,11 @@ from objslam.graph.tags.shapes import squares_of, turned_by_squares
 class SquareRows:
     """T squares among the landmarks of a graph, twelve rows each.
 
-    corner: (T, 4) the row of each corner among the landmarks. shape: (T, 4, 3) the corners at side 1. side: (T,) m, NaN for
-    a free side.
+    tag: (T,) the fiducial of each. corner: (T, 4) the row of each corner among the landmarks. shape: (T, 4, 3) the corners
+    at side 1. side: (T,) m, NaN for a free side.
     """
 
+    tag: Ints
     corner: Ints
     shape: Floats
     side: Floats
@@ -31,9 +32,13 @@ class SquareRows:
     def of(cls, tags: TagCorners | None, landmarks: Ints) -> Self:
         """Return the squares all of whose corners are among the landmarks (m,), which are in increasing order."""
         if tags is None:
-            return cls(np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4, 3)), np.zeros(0))
+            return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4, 3)), np.zeros(0))
         tied = tags.tied(landmarks)
-        return cls(np.searchsorted(landmarks, tags.landmarks[tied]), tags.shape[tied], tags.side[tied])
+        return cls(tied, np.searchsorted(landmarks, tags.landmarks[tied]), tags.shape[tied], tags.side[tied])
+
+    def sized(self, tags: TagCorners | None) -> Self:
+        """Return the same squares with the sides of `tags`."""
+        return self if tags is None else replace(self, side=tags.side[self.tag])
 
     @property
     def columns(self) -> Ints:
@@ -51,5 +56,16 @@ class SquareRows:
         by_square = turned_by_squares(local, rotation)
         by_square[:, :, 6] *= free[:, None]
         off = np.eye(12) - by_square @ np.linalg.pinv(by_square)
-        sigma = TIE * side * np.linalg.norm(self.shape[:, 0], axis=1)
+        sigma = self._sigma(side)
         return (corners - square).reshape(-1, 12) / sigma[:, None], off / sigma[:, None, None]
+
+    def by_sides(self, landmarks: Floats, sides: Floats) -> Floats:
+        """Return the whitened residuals (T, 12) at sides (T,), m, with the noise of the present sides. A free side has 0."""
+        rotation, centre, _ = squares_of(landmarks[self.corner], self.shape)
+        square = np.einsum("tij,tcj->tci", rotation, self.shape * sides[:, None, None]) + centre[:, None]
+        off = (landmarks[self.corner] - square).reshape(-1, 12) / self._sigma(self.side)[:, None]
+        return np.where(np.isnan(self.side)[:, None], 0.0, off)
+
+    def _sigma(self, side: Floats) -> Floats:
+        """Return the noise (T,), m, of the corners of squares with sides (T,), m."""
+        return np.asarray(TIE * side * np.linalg.norm(self.shape[:, 0], axis=1))

@@ -1,5 +1,6 @@
 """The rays of a log with four rays, one to each corner, in place of the one ray of a fiducial."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -62,7 +63,6 @@ class TagCorners:
         label = np.concatenate([association.label, np.repeat(association.label[object_], 3)])
         turns = np.where(goes_clockwise(rays.corners[squares]), 1, -1)
         clockwise = np.bincount(tag_of_view, turns) > 0
-        sides = [settings.tags.size_of(rays.label_names[i]) for i in association.label[object_].tolist()]
         return cls(
             source=source,
             corner=corner,
@@ -71,10 +71,14 @@ class TagCorners:
             object=object_,
             landmarks=landmarks,
             shape=np.where(clockwise[:, None, None], CLOCKWISE, COUNTER_CLOCKWISE),
-            side=np.array([np.nan if side is None else side for side in sides]),
+            side=_sides(rays.label_names, association.label[object_], settings),
             first=first,
             tag=tag_of_view,
         )
+
+    def sized(self, names: Sequence[str], settings: Settings) -> Self:
+        """Return the fiducials with the sizes of the settings. names: of the labels."""
+        return replace(self, side=_sides(names, self.association.label[self.object], settings))
 
     def rays(self, rays: Rays) -> Rays:
         """Return the new rays (n,) of the rays (R,). A ray to a corner has the noise of a corner, and no range."""
@@ -125,3 +129,9 @@ class TagCorners:
         objects = np.arange(self.association.count)
         objects[self.landmarks] = self.object[:, None]
         return objects
+
+
+def _sides(names: Sequence[str], labels: Ints, settings: Settings) -> Floats:
+    """Return the sides (T,), m, of fiducials with labels (T,), NaN if unknown."""
+    sides = [settings.tags.size_of(names[i]) for i in labels.tolist()]
+    return np.array([np.nan if side is None else side for side in sides])

@@ -57,6 +57,7 @@ def with_objects(
     spread = _marginals(values, covariances, tags, which, ledger)
     if len(which) and spread is not None:
         rotation, centre, side = squares_of(corners[which], tags.shape[which])
+        side = np.where(np.isfinite(tags.side[which]), tags.side[which], side)
         spread = spread * wider[object_[which], None, None]
         if sensitivity is not None and estimate.calibration is not None:
             by_error = _of_squares(tags.shape[which] * side[:, None, None], rotation) @ sensitivity[
@@ -73,12 +74,11 @@ def with_objects(
         xyzw, other_xyzw = quaternion_from_rotation(rotation), quaternion_from_rotation(other)
         told = probability >= LEAST_PROBABILITY
         for i, j in enumerate(object_[which].tolist()):
-            known = np.isfinite(tags.side[which[i]])
             found[j] = TagPose(
                 xyzw=xyzw[i],
                 covariance=(spread[i, :3, :3] + spread[i, :3, :3].T) / 2,
-                size=float(tags.side[which[i]] if known else side[i]),
-                size_sigma=0.0 if known else float(side[i] * np.sqrt(spread[i, 6, 6])),
+                size=float(side[i]),
+                size_sigma=float(side[i] * np.sqrt(spread[i, 6, 6])),
                 other_xyzw=other_xyzw[i] if told[i] else None,
                 other_probability=float(probability[i]) if told[i] else 0.0,
             )
@@ -133,10 +133,11 @@ def _second(
     """
     found = place(tags.seen(rays, map_T_camera), tags.shape, tags.side)
     best, other = found.best.take(which), found.other.take(which)
-    gain = (found.other_cost - found.cost)[which] / wider[tags.object[which]]
+    cost = np.where(np.isfinite(found.cost), found.cost, 0.0)  # Without a pose, the other cost is infinite too.
+    gain = (found.other_cost - cost)[which] / wider[tags.object[which]]
     off = [np.linalg.norm(rotation_vector(np.swapaxes(rotation, 1, 2) @ o.pose[:, :3, :3]), axis=1) for o in (best, other)]
     swapped = (off[1] < off[0]) & np.isfinite(gain)
     turned = np.where(swapped[:, None, None], best.pose[:, :3, :3], other.pose[:, :3, :3])
     way = (other.pose[:, :3, 3] - best.pose[:, :3, 3]) * np.where(swapped, -1.0, 1.0)[:, None]
-    gain = np.where(np.isnan(gain), np.inf, np.where(swapped, -gain, gain))
+    gain = np.where(swapped, -gain, gain)
     return turned, 1 / (1 + np.exp(np.clip(gain / 2, -50.0, 50.0))), np.where(np.isfinite(gain)[:, None], way, 0.0)

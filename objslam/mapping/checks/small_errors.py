@@ -103,9 +103,8 @@ class SmallErrors:
 
 def shared(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors:
     """Return the examined errors, as parameters of the measurements."""
-    of = settings.calibration.model_copy(
-        update={**_PRIORS, "use": True, "file": None, "scale": 0.0, "turn_scale": 0.0, "turn_bias": 0.0, "range_scale": 0.0}
-    )
+    fixed = dict.fromkeys(("scale", "turn_scale", "turn_bias", "range_scale", "tag_scale"), 0.0)
+    of = settings.calibration.model_copy(update={**_PRIORS, **fixed, "use": True, "file": None})
     wide = settings.model_copy(update={"calibration": of, "mode": "joint"})
     found = shared_errors(log, keyframes, rays, wide)
     assert found is not None  # Every log has a camera, and every camera has a clock.
