@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -10,6 +11,8 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from collections.abc import Iterator
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,7 @@ import yaml
 from waiting import LIMIT
 
 from objslam import ObjectMap
-from objslam.cli import app
+from objslam.cli import app, main
 from objslam.config import Settings, load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -98,26 +101,50 @@ def dead_links(file: Path) -> list[str]:
     return dead
 
 
+def steps() -> Iterator[tuple[str, str]]:
+    """(kind, text) of all that a reader types. The kind is python, objslam for one whole command of it, else bash."""
+    for language, block in marked():
+        if language == "python":
+            yield language, block
+        else:  # Lines with a pipe or a redirection are for bash.
+            for part in re.split(r"^(objslam [^|>\n]+)\n", block, flags=re.MULTILINE):
+                if part.strip():
+                    yield "objslam" if re.fullmatch(r"objslam [^|>\n]+", part) else "bash", part
+
+
+def type_here(kind: str, text: str) -> tuple[int, str]:
+    """Run Python or a command of objslam in this process, which has imported everything. Return exit code and output."""
+    said = io.StringIO()
+    with redirect_stdout(said), redirect_stderr(said), pytest.MonkeyPatch.context() as patch:
+        if kind == "python":
+            exec(compile(text, "block", "exec"), {"__name__": "__main__"})
+            return 0, said.getvalue()
+        patch.setattr(sys, "argv", shlex.split(text, comments=True))
+        with pytest.raises(SystemExit) as ended:
+            main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code, said.getvalue()
+
+
+def type_in_bash(text: str) -> tuple[int, str]:
+    """Run lines of bash, in which `objslam` is the installed script. Return exit code and output."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    words = ["bash", "-euo", "pipefail", "-c", text]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    done = subprocess.run(words, env={**os.environ, "PATH": path}, timeout=LIMIT, check=False, **pipes)
+    return done.returncode, done.stdout
+
+
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which all marked blocks ran, one after the other, as a reader types them."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "configs", folder / "configs")
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    runs = {"bash": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-c"]}
-    assert {language for language, _ in marked()} == set(runs)
-    for language, block in marked():
-        done = subprocess.run(
-            [*runs[language], block],
-            cwd=folder,
-            env={**os.environ, "PATH": path},
-            capture_output=True,
-            text=True,
-            timeout=LIMIT,
-            check=False,
-        )
-        assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
-        assert "Traceback" not in done.stderr
+    with chdir(folder):
+        for kind, text in steps():
+            code, said = type_in_bash(text) if kind == "bash" else type_here(kind, text)
+            assert code == 0, f"{text}\n{said}"
+            assert "Traceback" not in said
     return folder
 
 
