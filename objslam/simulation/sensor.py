@@ -53,7 +53,7 @@ def expose(sensor: Sensor, light: Reals, gain: NDArray[np.float64], rng: np.rand
     fall_off = (1 - sensor.vignette * (x**2 + (y**2)[:, None]) / 2)[..., None]
     image = light * (fall_off * (0.25 / max(float(light.mean()), 1e-6) * gain).astype(np.float32))
     if sensor.blur > 0:
-        image = cv2.GaussianBlur(image, (0, 0), sensor.blur)
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sensor.blur), dtype=np.float32)
     exposed = np.empty(image.shape, dtype=np.uint8)
     for start in range(0, len(image), _STRIP):
         part = image[start : start + _STRIP]
