@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
@@ -12,7 +11,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,11 @@ import numpy as np
 import pytest
 import typer
 import yaml
+from commands import Call, call
 from waiting import LIMIT
 
 from objslam import ObjectMap
-from objslam.cli import app, main
+from objslam.cli import app
 from objslam.config import Settings, load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -112,27 +112,18 @@ def steps() -> Iterator[tuple[str, str]]:
                     yield "objslam" if re.fullmatch(r"objslam [^|>\n]+", part) else "bash", part
 
 
-def type_here(kind: str, text: str) -> tuple[int, str]:
-    """Run Python or a command of objslam in this process, which has imported everything. Return exit code and output."""
-    said = io.StringIO()
-    with redirect_stdout(said), redirect_stderr(said), pytest.MonkeyPatch.context() as patch:
-        if kind == "python":
-            exec(compile(text, "block", "exec"), {"__name__": "__main__"})
-            return 0, said.getvalue()
-        patch.setattr(sys, "argv", shlex.split(text, comments=True))
-        with pytest.raises(SystemExit) as ended:
-            main()
-    assert isinstance(ended.value.code, int)
-    return ended.value.code, said.getvalue()
-
-
-def type_in_bash(text: str) -> tuple[int, str]:
-    """Run lines of bash, in which `objslam` is the installed script. Return exit code and output."""
+def typed(kind: str, text: str) -> Call:
+    """What happens when a reader types it. Python and commands of objslam run in this process, which has its imports."""
+    if kind == "python":
+        exec(compile(text, "block", "exec"), {"__name__": "__main__"})
+        return Call(0, "", "")
+    if kind == "objslam":
+        return call(*shlex.split(text, comments=True)[1:])
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     words = ["bash", "-euo", "pipefail", "-c", text]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    done = subprocess.run(words, env={**os.environ, "PATH": path}, timeout=LIMIT, check=False, **pipes)
-    return done.returncode, done.stdout
+    environment = {**os.environ, "PATH": path}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False)
+    return Call(done.returncode, done.stdout, done.stderr)
 
 
 @pytest.fixture(scope="module")
@@ -142,9 +133,9 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT / "configs", folder / "configs")
     with chdir(folder):
         for kind, text in steps():
-            code, said = type_in_bash(text) if kind == "bash" else type_here(kind, text)
-            assert code == 0, f"{text}\n{said}"
-            assert "Traceback" not in said
+            done = typed(kind, text)
+            assert done.code == 0, f"{text}\n{done.out}\n{done.err}"
+            assert "Traceback" not in done.err
     return folder
 
 
