@@ -90,7 +90,7 @@ def existence(state: State, gate: float) -> Floats:
 
 def static_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
-    motion. fitted: as in `rest_odds`."""
+    motion. fitted: see `rest_odds`."""
     rates = detection_rates(state.history, state.label, len(state.unassigned))
     by_rate = prior_odds(state) + rates.log_odds(state.history, state.label)
     return np.asarray(by_rate + size_odds(state) + rest_odds(state, fitted))

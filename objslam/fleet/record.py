@@ -71,12 +71,12 @@ class Record:
 
 
 def record_name(key: str) -> str:
-    """Return the name of the record of a key in the store."""
+    """Return the name of a record in the store. key: the key of its log."""
     return f"{RECORDS}/{key}.json"
 
 
 def result_name(key: str) -> str:
-    """Return the folder of the result of a key in the store."""
+    """Return the folder of a result in the store. key: the key of its log."""
     return f"{RESULTS}/{key}"
 
 

@@ -44,8 +44,8 @@ _PRIOR = 0.5
 
 @dataclass(frozen=True)
 class _Density:
-    """The densities of the boxes of each label along one coordinate. low: of the first bin. width: of a bin. value:
-    (L, bins)."""
+    """The densities of the boxes of each label along one coordinate. low: where the first bin begins. width: the
+    width of a bin. value: (L, bins)."""
 
     low: float
     width: float
@@ -55,7 +55,7 @@ class _Density:
     def of(cls, x: Floats, label: Ints, labels: int, noise: Floats, reach: float = 0.0) -> "_Density":
         """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel. Values can reach `reach`.
 
-        Few boxes leave gaps between their kernels. So the fewer boxes lie in a kernel, the more a uniform density weighs.
+        Few boxes leave gaps between their kernels. So a uniform density weighs more where fewer boxes lie in a kernel.
         """
         pad = 2 * float(noise.max(initial=1e-6))
         low, high = (float(x.min()) - pad, float(x.max()) + pad) if len(x) else (-pad, pad)

@@ -31,7 +31,10 @@ class Problem:
         self._heights = b.position[order, 2] + b.label[order] * 4 * self.apart
 
     def nearest(self, moved: Floats, index: Ints) -> Ints:
-        """Return the nearest object of b with the same label, for objects `index` (H, P) of a at `moved` (H, P, 3)."""
+        """Return the nearest object (H, P) of the map b for each object of the map a. Both have the same label.
+
+        index: (H, P) the objects of a. moved: (H, P, 3) m, their positions in the frame of b.
+        """
         at = np.concatenate([moved, self.a.label[index][..., None] * self.apart], axis=-1)
         return np.asarray(self._labelled.query(at.reshape(-1, 4))[1]).reshape(index.shape)
 

@@ -99,7 +99,7 @@ class StampLeaps(Generic[T]):
             s.steps.clear()
             return s.pass_on(chain), s.empty()
         s.hear(stamp)
-        if not s.waiting or (before is not None and stamp <= before):  # A late message says nothing of those ahead.
+        if not s.waiting or (before is not None and stamp <= before):  # A late message says nothing about messages ahead.
             return [message], []
         earlier = s.near(stamp)
         return [*earlier, message, *s.near(s.reach(stamp))], s.empty()

@@ -74,7 +74,7 @@ def fit(
     still: float = STILL,
     most: int = _ITERATIONS,
 ) -> Fit:
-    """Return the most probable bodies of one kind. start: (N, 7). still: as `STILL`. most: the most steps."""
+    """Return the most probable bodies of one kind. start: (N, 7). still: see `STILL`. most: the most steps."""
     values, now = start.copy(), residuals(edges, start, kind)
     moving = np.arange(len(start))
     damping = np.full(len(start), _DAMPING[0])
