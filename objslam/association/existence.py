@@ -35,7 +35,8 @@ class Rates:
     concentration: float
 
     def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
-        """Return -2 ln of the probability (N,) that objects with these labels are `seen` times in `expected` frames."""
+        """Return -2 ln(p) (N,). p is the probability that an object of a label is detected in `seen` of `expected`
+        frames."""
         return -2 * _beta_binomial(seen, expected, self.mean[label], self.concentration)
 
     def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:

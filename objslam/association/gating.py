@@ -30,8 +30,8 @@ sizes less."""
 _SIZED_BY = 5
 """The least number of boxes that tell the size of a landmark. A larger number leaves more landmarks without a size."""
 _SIZE_FREE = 5.99
-"""The squared deviation of a size that costs nothing, chi-squared of 2 degrees of freedom at 95 %. A larger value needs
-larger differences of size."""
+"""A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. A larger
+value needs larger differences of size."""
 SIZE_LOSS = 6.0
 """The largest cost of a size. It is less than a usual gate, because a half hidden thing still has its bearing. A larger
 value loses more boxes of half hidden things."""

@@ -11,7 +11,7 @@ from objslam.fleet.stores.store import StoreError
 from objslam.results.files import dump_json
 
 RESULTS, RECORDS, SEEN = "results", "records", "seen"
-"""The folders of a fleet: of the results by key, of their records, and of the empty files that `seen_name` names."""
+"""The three folders of a fleet. They hold the results by key, their records, and the empty files that `seen_name` names."""
 
 
 @dataclass(frozen=True, slots=True)

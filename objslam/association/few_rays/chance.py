@@ -72,7 +72,7 @@ class _Density:
         return cls(low, width, value / value.sum(axis=1, keepdims=True) / width)
 
     def at(self, x: Floats, label: Ints) -> Floats:
-        """Return the density at values x of any shape, among the boxes of labels of a shape that fits."""
+        """Return the density at values x among the boxes of labels. Both may have any shapes that broadcast together."""
         inside = np.abs((x - self.low) / self.width - _BINS / 2) <= _BINS / 2
         return np.where(inside, self.value[label, _bins(x, self.low, self.width)], _OUTSIDE)
 
@@ -135,7 +135,7 @@ class Strays:
         return np.asarray(np.maximum(number, 1.0) / max(self.frames, 1))
 
     def along(self, distance: Floats, label: Ints) -> Floats:
-        """Return the density, m^-1, of distances (E,) m at which there are boxes of a label (E,)."""
+        """Return the density (E,), m^-1, of boxes of a label (E,) at a distance (E,), m, from the camera."""
         anywhere = 1 / _LOG_RANGE
         if self.log_range is None:
             return anywhere / distance
@@ -152,7 +152,7 @@ def ray_odds(
     noise: Floats | float,
     gate: float,
 ) -> tuple[Floats, Floats]:
-    """Return the log odds (..., R) that each ray sees its point over being stray, and the density of strays, m^-2.
+    """Return the log odds (..., R) that each ray sees its point and is no stray, and the density of strays, m^-2.
 
     number: (..., R) strays of the label in the log. off2, distance: (..., R) m^2, m, of the point from the ray and from the
     camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs no more.

@@ -63,7 +63,10 @@ def move(x: Floats, points: Floats) -> Floats:
 
 
 def covariances(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
-    """Return the covariances (H, P, 3, 3) of the offsets between objects `a` (H, P) moved by x (H, 4) and objects `b`."""
+    """Return the covariances (H, P, 3, 3), m^2, of the offsets between moved objects and others.
+
+    a: (H, P) the objects that x (H, 4) moves. b: (H, P) the others.
+    """
     rotation = lift_se2(np.stack([x[:, 0], x[:, 1], x[:, 3]], axis=1))[:, None, :3, :3]
     return rotation @ problem.a.covariance[a] @ np.swapaxes(rotation, -1, -2) + problem.b.covariance[b]
 

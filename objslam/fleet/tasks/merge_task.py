@@ -37,7 +37,7 @@ _SESSION_FILES = (files.OBJECTS, files.VIEWS, files.RAYS)
 
 @dataclass(frozen=True, slots=True)
 class MergeTask:
-    """One node of a site. store: the URL of the output."""
+    """The merge at one node of the tree of a site. store: the URL of the output."""
 
     store: str
     node: Node
