@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -22,6 +23,7 @@ import yaml
 from commands import Call, call
 from waiting import LIMIT
 
+import objslam
 from objslam import ObjectMap
 from objslam.cli import app
 from objslam.config import Settings, load_settings
@@ -159,6 +161,14 @@ def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
     mapped = ObjectMap.load(played / "out"), ObjectMap.load(played / "demo_boxes" / "fixed")
     both = ObjectMap.load(played / "both.json")
     assert max(map(len, mapped)) <= len(both) < sum(map(len, mapped))  # the same room twice
+
+
+def test_the_python_blocks_use_public_names() -> None:
+    """They run in a process that has imported more of objslam than a reader's."""
+    blocks = [ast.parse(text) for kind, text in steps() if kind == "python"]
+    nodes = [node for block in blocks for node in ast.walk(block) if isinstance(node, ast.Attribute)]
+    used = {node.attr for node in nodes if isinstance(node.value, ast.Name) and node.value.id == "objslam"}
+    assert {"read", "run"} <= used <= set(objslam.__all__)
 
 
 def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
