@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -10,6 +11,8 @@ import shutil
 import subprocess
 import sys
 import textwrap
+from collections.abc import Iterator
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +20,10 @@ import numpy as np
 import pytest
 import typer
 import yaml
+from commands import Call, call
 from waiting import LIMIT
 
+import objslam
 from objslam import ObjectMap
 from objslam.cli import app
 from objslam.config import Settings, load_settings
@@ -98,26 +103,41 @@ def dead_links(file: Path) -> list[str]:
     return dead
 
 
+def steps() -> Iterator[tuple[str, str]]:
+    """(kind, text) of all that a reader types. The kind is python, objslam for one whole command of it, else bash."""
+    for language, block in marked():
+        if language == "python":
+            yield language, block
+        else:  # Lines with a pipe or a redirection are for bash.
+            for part in re.split(r"^(objslam [^|>\n]+)\n", block, flags=re.MULTILINE):
+                if part.strip():
+                    yield "objslam" if re.fullmatch(r"objslam [^|>\n]+", part) else "bash", part
+
+
+def typed(kind: str, text: str) -> Call:
+    """What happens when a reader types it. Python and commands of objslam run in this process, which has its imports."""
+    if kind == "python":
+        exec(compile(text, "block", "exec"), {"__name__": "__main__"})
+        return Call(0, "", "")
+    if kind == "objslam":
+        return call(*shlex.split(text, comments=True)[1:])
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    words = ["bash", "-euo", "pipefail", "-c", text]
+    environment = {**os.environ, "PATH": path}
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False)
+    return Call(done.returncode, done.stdout, done.stderr)
+
+
 @pytest.fixture(scope="module")
 def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder in which all marked blocks ran, one after the other, as a reader types them."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "configs", folder / "configs")
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    runs = {"bash": ["bash", "-euo", "pipefail", "-c"], "python": [sys.executable, "-c"]}
-    assert {language for language, _ in marked()} == set(runs)
-    for language, block in marked():
-        done = subprocess.run(
-            [*runs[language], block],
-            cwd=folder,
-            env={**os.environ, "PATH": path},
-            capture_output=True,
-            text=True,
-            timeout=LIMIT,
-            check=False,
-        )
-        assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
-        assert "Traceback" not in done.stderr
+    with chdir(folder):
+        for kind, text in steps():
+            done = typed(kind, text)
+            assert done.code == 0, f"{text}\n{done.out}\n{done.err}"
+            assert "Traceback" not in done.err
     return folder
 
 
@@ -141,6 +161,14 @@ def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
     mapped = ObjectMap.load(played / "out"), ObjectMap.load(played / "demo_boxes" / "fixed")
     both = ObjectMap.load(played / "both.json")
     assert max(map(len, mapped)) <= len(both) < sum(map(len, mapped))  # the same room twice
+
+
+def test_the_python_blocks_use_public_names() -> None:
+    """They run in a process that has imported more of objslam than a reader's."""
+    blocks = [ast.parse(text) for kind, text in steps() if kind == "python"]
+    nodes = [node for block in blocks for node in ast.walk(block) if isinstance(node, ast.Attribute)]
+    used = {node.attr for node in nodes if isinstance(node.value, ast.Name) and node.value.id == "objslam"}
+    assert {"read", "run"} <= used <= set(objslam.__all__)
 
 
 def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:

@@ -1,29 +1,42 @@
 """The tools that read what a user names end as the commands do: an error is one line."""
 
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
 import pytest
-from waiting import LIMIT
 
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 
 
-@pytest.mark.parametrize("tool", ["fig2", "bench_reconstruction", "bench_viewer", "bench_detection"])
-def test_a_missing_input_is_one_line(tool, tmp_path):
-    words = [sys.executable, str(TOOLS / f"{tool}.py"), str(tmp_path / "nowhere")]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT, check=False)
-    assert done.returncode == 1
-    assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert done.stderr.startswith(f"{tool}.py: ")
+@pytest.fixture
+def tool(monkeypatch, capsys):
+    """Run a tool as Python does, but in this process. Return its exit code, and what it printed on stderr."""
+
+    def run(name, *arguments):
+        script = str(TOOLS / f"{name}.py")
+        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(script, run_name="__main__")
+        return ended.value.code, capsys.readouterr().err
+
+    return run
+
+
+@pytest.mark.parametrize("name", ["fig2", "bench_reconstruction", "bench_viewer", "bench_detection"])
+def test_a_missing_input_is_one_line(tool, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, said = tool(name, tmp_path / "nowhere")
+    assert code == 1
+    assert len(said.splitlines()) == 1, said
+    assert said.startswith(f"{name}.py: ")
     assert not list(tmp_path.iterdir())
 
 
-def test_a_demo_without_images_has_nothing_to_reconstruct(tmp_path):
+def test_a_demo_without_images_has_nothing_to_reconstruct(tool, tmp_path):
     (tmp_path / "log").mkdir()
-    words = [sys.executable, str(TOOLS / "bench_reconstruction.py"), str(tmp_path)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=LIMIT, check=False)
-    assert done.returncode == 1
-    assert len(done.stderr.splitlines()) == 1
-    assert "`objslam demo` without --boxes makes one" in done.stderr
+    code, said = tool("bench_reconstruction", tmp_path)
+    assert code == 1
+    assert len(said.splitlines()) == 1
+    assert "`objslam demo` without --boxes makes one" in said

@@ -48,7 +48,7 @@ def as_poses(values: ArrayLike) -> Floats:
 
 
 def as_pose(values: ArrayLike) -> Floats:
-    """Return one pose (4, 4) from a row or a matrix of `as_poses`. ValueError if it is no valid pose."""
+    """Return one pose (4, 4), given in any form that `as_poses` takes for a pose. ValueError if it is no valid pose."""
     return as_poses(np.asarray(values, dtype=np.float64)[None])[0]
 
 

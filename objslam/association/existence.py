@@ -35,7 +35,8 @@ class Rates:
     concentration: float
 
     def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
-        """Return -2 ln of the probability (N,) that objects with these labels are `seen` times in `expected` frames."""
+        """Return -2 ln(p) (N,). p is the probability that an object of a label is detected in `seen` of `expected`
+        frames."""
         return -2 * _beta_binomial(seen, expected, self.mean[label], self.concentration)
 
     def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:
@@ -88,7 +89,7 @@ def existence(state: State, gate: float) -> Floats:
 
 def static_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
-    motion. fitted: as in `rest_odds`."""
+    motion. fitted: see `rest_odds`."""
     rates = detection_rates(state.history, state.label, len(state.unassigned))
     by_rate = prior_odds(state) + rates.log_odds(state.history, state.label)
     return np.asarray(by_rate + size_odds(state) + rest_odds(state, fitted))

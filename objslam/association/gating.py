@@ -30,8 +30,8 @@ sizes less."""
 _SIZED_BY = 5
 """The least number of boxes that tell the size of a landmark. A larger number leaves more landmarks without a size."""
 _SIZE_FREE = 5.99
-"""The squared deviation of a size that costs nothing, chi-squared of 2 degrees of freedom at 95 %. A larger value needs
-larger differences of size."""
+"""A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. A larger
+value needs larger differences of size."""
 SIZE_LOSS = 6.0
 """The largest cost of a size. It is less than a usual gate, because a half hidden thing still has its bearing. A larger
 value loses more boxes of half hidden things."""
@@ -204,8 +204,8 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
     """Return the cost reduction (E,) of each edge: `TRACK_GAIN` if the other boxes of the ray's track support it, else 0.
 
-    The track supports an edge if at least two of its other boxes, and most of those with a landmark, have the landmark of
-    the edge. track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
+    The track supports an edge if at least two of its other boxes have the landmark of the edge. These must be most of the
+    boxes with a landmark. track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
     """
     bonus = np.zeros(len(edges.ray))
     known = np.flatnonzero((track >= 0) & (matched >= 0))

@@ -15,6 +15,10 @@ BEHIND = 1e6
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
 _DAMPING = 1e-6  # The share of the information added in all directions. Unobserved directions then stay unchanged.
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
+_FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+"""The row and the column of each of the six entries that give a symmetric matrix. Those of the diagonal come first."""
+_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+"""The place of each entry of the matrix among the six."""
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:
@@ -71,29 +75,39 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
     count = len(start)
     order = np.argsort(index, kind="stable")
     ray, index = ray[order], index[order]
-    origin, direction, measured, range_sigma = obs.origin[ray], obs.direction[ray], obs.range[ray], obs.range_sigma[ray]
-    along = direction[:, :, None] * direction[:, None, :]
+    # The axis of x, y and z comes first, because NumPy is slow if the last axis is short.
+    origin, direction = np.ascontiguousarray(obs.origin[ray].T), np.ascontiguousarray(obs.direction[ray].T)
+    measured, range_sigma = obs.range[ray], obs.range_sigma[ray]
     ranged = np.isfinite(measured)
     number = np.maximum(np.bincount(index, minlength=count), 1)
-    position = start.copy()
+    factor, position = noise[index], start.copy()
     for _ in range(_ITERATIONS):
-        to = position[index] - origin
-        depth = np.einsum("ri,ri->r", to, direction)
-        offset = to - depth[:, None] * direction
-        distance, across = _across(to)
-        spread = variance(obs, distance, noise[index], ray)
-        weight = 1 / (spread + np.einsum("ri,ri->r", offset, offset) / HALF_RAY)
-        beyond = np.where(ranged, measured - depth, 0.0)
-        range_weight = np.where(ranged, 1 / range_sigma**2 / (1 + (beyond / range_sigma) ** 2 / _HALF_RANGE) ** 2, 0.0)
-        each = weight[:, None, None] * across + range_weight[:, None, None] * along
-        pull = (range_weight * beyond)[:, None] * direction - weight[:, None] * (across @ offset[:, :, None])[:, :, 0]
-        total = grouped_sums(each.reshape(-1, 9), index, count).reshape(-1, 3, 3)
+        to = position.T.take(index, axis=1) - origin
+        depth = _dot(to, direction)
+        offset = to - depth * direction
+        distance = np.maximum(np.sqrt(_dot(to, to)), 1e-6)
+        toward = to / distance
+        weight = 1 / (variance(obs, distance, factor, ray) + _dot(offset, offset) / HALF_RAY)
+        pull = weight * (_dot(toward, offset) * toward - offset)
+        each = -weight * toward[_FIRST] * toward[_SECOND]
+        each[:3] += weight
+        if ranged.any():
+            beyond = np.where(ranged, measured - depth, 0.0)
+            along = np.where(ranged, 1 / range_sigma**2 / (1 + (beyond / range_sigma) ** 2 / _HALF_RANGE) ** 2, 0.0)
+            pull += along * beyond * direction
+            each += along * direction[_FIRST] * direction[_SECOND]
+        total = grouped_sums(each.T, index, count)[:, _MATRIX]
         total += (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
-        step = np.linalg.solve(total, grouped_sums(pull, index, count)[:, :, None])[:, :, 0]
+        step = np.linalg.solve(total, grouped_sums(pull.T, index, count)[:, :, None])[:, :, 0]
         # With little parallax, full steps are unreliable. So no step is longer than the mean distance of the point.
         length, reach = np.linalg.norm(step, axis=1), np.bincount(index, distance, count) / number
         position = position + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     return position
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    """Return the products (P,) of vectors (3, P)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Floats, steps: int) -> tuple[Floats, Floats]:

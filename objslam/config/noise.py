@@ -16,10 +16,10 @@ class Noise(Section):
     """
 
     rays: Estimated = "auto"
-    """rays.pixel_sigma and rays.box_sigma, with one common factor."""
+    """the noise of rays. rays.pixel_sigma and rays.box_sigma have one common factor."""
     ranges: Estimated = "auto"
-    """depth.sigma and depth.sigma_per_m, with one common factor, and depth.bias, with a factor of its own. auto
-    estimates none of them if a camera has its own depth_noise."""
+    """the noise of ranges. depth.sigma and depth.sigma_per_m have one common factor, and depth.bias has a factor of its own.
+    auto estimates none of them if a camera has its own depth_noise."""
     odometry: Estimated = "auto"
     """the noise of the odometry along, across and in turning, with a factor for each."""
     prior: Positive = 10.0

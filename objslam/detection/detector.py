@@ -69,7 +69,8 @@ class Detector:
         return fill(self.recipe, images, where, self.network.image.batch or len(images)), where
 
     def read(self, outputs: Sequence[Array], where: Fit, count: int) -> list[Boxes]:
-        """Return the boxes of the first `count` images of a batch from the network's outputs. where: from `prepare`."""
+        """Return the boxes of the first `count` images of a batch from the network's outputs. where: what `prepare`
+        returned."""
         named = _by_role(self.network, self.recipe, outputs)
         if not _has_batch(named):
             return [self._boxes(named, where)]

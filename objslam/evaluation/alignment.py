@@ -21,6 +21,7 @@ _DRAWN_PAIRS = 200_000  # The number of sampled pairs or triples of corresponden
 _MAX_TRIPLED = 80  # With more correspondences, triples of them are sampled: 80 have 82,160 triples. More are slower.
 _MAX_STARTS = 3000  # The most initial transforms that are scored. More are slower.
 _MAX_TRIPLES = 1000  # The most initial transforms from triples. Triples are right more often than pairs, so fewer suffice.
+_DISTANCES = 1_000_000  # The number of distances that are computed at once. More take more memory: 24 MB for a million.
 _MAX_REFINED = 12  # The number of the best initial transforms that are refined. A larger number is more reliable and slower.
 _MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
 _ON_A_LINE = 0.02
@@ -176,18 +177,21 @@ def _starts_in_space(source: Floats, target: Floats, i: Ints, k: Ints, radius: f
     else:
         drawn = rng.integers(len(i), size=(_DRAWN_PAIRS, 3))
     a, b = source[i[drawn]], target[k[drawn]]  # (T, 3, 3): the corners of each triangle in the map and in the truth.
-    side_a, side_b = (np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) for corners in (a, b))
+    along_a, along_b = (np.roll(corners, -1, axis=1) - corners for corners in (a, b))
+    side_a, side_b = (np.sqrt(np.einsum("tci,tci->tc", along, along)) for along in (along_a, along_b))
     long_a, long_b = side_a.sum(axis=1), side_b.sum(axis=1)
     likely = np.minimum(side_a, side_b).min(axis=1, initial=np.inf) > 1e-9  # A sampled triple may hold an object twice.
     scale = np.ones(len(a)) if kind == "se3" else long_b / np.maximum(long_a, 1e-9)
     likely &= (scale >= _SCALES[0]) & (scale <= _SCALES[1])
     likely &= (np.abs(scale[:, None] * side_a - side_b) <= 2 * radius).all(axis=1)
-    frame_a, frame_b = _frames(a), _frames(b)
-    likely &= np.isfinite(frame_a).all(axis=(1, 2)) & np.isfinite(frame_b).all(axis=(1, 2))
     chosen = np.flatnonzero(likely)
+    frame_a, frame_b = _frames(a[chosen]), _frames(b[chosen])
+    corners = np.isfinite(frame_a).all(axis=(1, 2)) & np.isfinite(frame_b).all(axis=(1, 2))
+    chosen, frame_a, frame_b = chosen[corners], frame_a[corners], frame_b[corners]
     if len(chosen) > _MAX_TRIPLES:
-        chosen = np.sort(rng.choice(chosen, _MAX_TRIPLES, replace=False))
-    rotation = frame_b[chosen] @ np.swapaxes(frame_a[chosen], 1, 2)
+        kept = np.sort(rng.choice(len(chosen), _MAX_TRIPLES, replace=False))
+        chosen, frame_a, frame_b = chosen[kept], frame_a[kept], frame_b[kept]
+    rotation = frame_b @ np.swapaxes(frame_a, 1, 2)
     turned = np.einsum("h,hij,hj->hi", scale[chosen], rotation, a[chosen].mean(axis=1))
     poses = make_pose(rotation, b[chosen].mean(axis=1) - turned)
     return [Transform(pose, float(s)) for pose, s in zip(poses, scale[chosen], strict=True)]
@@ -207,14 +211,23 @@ def _frames(corners: Floats) -> Floats:
 
 
 def _cheapest(starts: list[Transform], source: Floats, target: Floats, same: Bools, radius: float) -> list[Transform]:
-    costs = [_nearest_cost(start, source, target, same, radius) for start in starts]
-    return [starts[h] for h in np.argsort(costs, kind="stable")[:_MAX_REFINED]]
+    at_once = max(1, _DISTANCES // int(same.sum()))
+    costs = [_nearest_costs(starts[h : h + at_once], source, target, same, radius) for h in range(0, len(starts), at_once)]
+    return [starts[h] for h in np.argsort(np.concatenate(costs), kind="stable")[:_MAX_REFINED]]
 
 
-def _nearest_cost(transform: Transform, source: Floats, target: Floats, same: Bools, radius: float) -> float:
-    """Return the sum of min(distance, radius)^2 over the true objects, with the distance to the nearest possible match."""
-    squared = ((transform.apply(source)[:, None] - target[None]) ** 2).sum(axis=2)
-    return float(np.minimum(np.where(same, squared, np.inf).min(axis=0), radius**2).sum())
+def _nearest_costs(starts: list[Transform], source: Floats, target: Floats, same: Bools, radius: float) -> Floats:
+    """Return the cost (S,) of each start: the sum of min(distance, radius)^2 over the true objects, m^2.
+
+    The distance is from a true object to the nearest map object that may match it. At least one pair may match.
+    """
+    k, i = np.nonzero(same.T)  # Sorted by true object.
+    moved = np.stack([start.apply(source) for start in starts])
+    squared = sum((moved[:, i, axis] - target[k, axis]) ** 2 for axis in range(3))
+    matched, first = np.unique(k, return_index=True)
+    nearest = np.full((len(starts), len(target)), radius**2)
+    nearest[:, matched] = np.minimum(np.minimum.reduceat(squared, first, axis=1), radius**2)
+    return np.asarray(nearest.sum(axis=1))
 
 
 def lay_truth(objects: ObjectMap, truth: Truth, radius: float = 0.5) -> Truth:

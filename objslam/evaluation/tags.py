@@ -26,7 +26,7 @@ class TagMatch:
 
 
 def match_tags(found: MapObject, true: TruthObject, transform: Transform) -> TagMatch | None:
-    """Return how the rotation of a fiducial fits the true one, None if one of them has none."""
+    """Compare the rotation of a fiducial with the true one. Returns None if the map or the truth has no rotation of it."""
     if found.tag is None or true.tag_xyzw is None:
         return None
     truth = transform.pose[:3, :3].T @ rotation_from_quaternion(true.tag_xyzw[None])[0]

@@ -34,8 +34,8 @@ all."""
 class Mapped:
     """The driver's summary of a mapped log.
 
-    key: of the result. begin: the first stamp of the path, s. warnings: their number. seconds: of the task, s. report:
-    whether the result has a report.html. new: whether this run mapped the log.
+    key: the key of the result. begin: the first stamp of the path, s. warnings: their number. seconds: how long the task
+    took, s. report: whether the result has a report.html. new: whether this run mapped the log.
     """
 
     place: LogPlace
@@ -233,8 +233,8 @@ def _merge_sites(job: Job, engine: Engine, store: Store, price: float, found: Fl
 def _with_earlier(members: dict[str, Member], state: bytes | None, digest: str, paths: set[str]) -> dict[str, Member]:
     """Return the sessions of a site by key, in the order of time: `members`, and those of earlier runs with other logs.
 
-    state: the content of the file `state_name` of the site. digest: of the job. paths: of the logs that this run mapped or
-    could not map. An earlier session at one of these paths is left out, because this run replaces it.
+    state: the content of the file `state_name` of the site. digest: the hash of the job. paths: where the logs of
+    this run are, mapped or not. An earlier session with one of them is left out, because this run replaces it.
     """
     before = {one.key: one for one in site_task.earlier_members(state, digest) if one.path not in paths}
     return dict(sorted((before | members).items(), key=lambda entry: (entry[1].begin, entry[1].path)))

@@ -26,7 +26,7 @@ _BLOCK = 1 << 20  # The bytes that are read at once.
 
 
 def hash_log(path: Path) -> str:
-    """Return the hash of the content of a log: of the relative name and the bytes of each file. OSError from the disk."""
+    """Return the hash of a log. It covers the relative names and the bytes of all files. OSError from the disk."""
     digest = sha256()
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     for file in files:

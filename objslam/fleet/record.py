@@ -11,7 +11,7 @@ from objslam.fleet.stores.store import StoreError
 from objslam.results.files import dump_json
 
 RESULTS, RECORDS, SEEN = "results", "records", "seen"
-"""The folders of a fleet: of the results by key, of their records, and of the empty files that `seen_name` names."""
+"""The three folders of a fleet. They hold the results by key, their records, and the empty files that `seen_name` names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +71,12 @@ class Record:
 
 
 def record_name(key: str) -> str:
-    """Return the name of the record of a key in the store."""
+    """Return the name of a record in the store. key: the key of its log."""
     return f"{RECORDS}/{key}.json"
 
 
 def result_name(key: str) -> str:
-    """Return the folder of the result of a key in the store."""
+    """Return the folder of a result in the store. key: the key of its log."""
     return f"{RESULTS}/{key}"
 
 

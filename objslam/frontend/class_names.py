@@ -90,7 +90,7 @@ def named(label: str, names: Mapping[int, str]) -> str | None:
 
 
 def with_names(log: Log, given: str, ledger: Ledger) -> Log:
-    """Return a log whose labels that are numbers have become names. given: of `load_names`.
+    """Return the log with names in place of labels that are numbers. given: as for `load_names`.
 
     Numbers without a name stay, and one warning counts their boxes. Labels of the truth become names too. ConfigError as
     `load_names`.

@@ -130,7 +130,7 @@ class OdometryCorrection:
 def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str) -> Floats:
     """Return poses base_T_camera (..., 4, 4), turned about the axes of base and moved along them by the errors of a camera.
 
-    name: of the camera. error: by name, the turns in rad and the moves in m.
+    name: the name of the camera. error: the turns (rad) and the moves (m) by name.
     """
     turn = rotation_from_vector(np.array([error.get(f"{name}.{axis}", 0.0) for axis in AXES]))
     move = np.array([error.get(f"{name}.{axis}", 0.0) for axis in "xyz"])

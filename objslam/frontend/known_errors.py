@@ -52,7 +52,7 @@ def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
 
 
 def coarse(settings: Settings) -> bool:
-    """Return whether given poses err by so much that they reveal no error of a camera."""
+    """Return whether given poses err too much to reveal an error of a camera."""
     return settings.localization.xy >= COARSE
 
 

@@ -223,7 +223,7 @@ class SharedErrors:
                 base_T_camera[mine] = _at_stamps(one.mount, known[mine], max_gap)
         localization, odom_T_base = self.log.localization, keyframes.odom_T_base
         map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, known, max_gap)
-        if self.log.odometry is not None:
+        if self.log.odometry is not None and (localization is None or odom_T_base is not None):
             at = self._odometry_at(known, error)
             map_T_base = at if localization is None else map_T_base
             odom_T_base = None if odom_T_base is None else inverse(self.log.odometry.poses[0]) @ at

@@ -166,6 +166,7 @@ def widening(residual: Floats, landmark: Ints, count: int) -> Floats:
     """Return the factor (N,) >= 1 by which the covariance of each landmark grows if its rays miss it by more than their
     noise.
 
-    The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) divided by the latter.
+    The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) in units of the noise
+    of the settings.
     """
     return noise_factors(residual, landmark, count, _FEWEST) ** 2

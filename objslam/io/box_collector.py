@@ -64,8 +64,8 @@ class BoxCollector:
         self.box_places.append(place)
 
     def checked(self, ledger: Ledger) -> Detections:
-        """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted. A depth that is
-        not above zero or too large becomes unknown and is counted, and so do corners that are not those of a square, and
+        """Return the valid detections. Frames out of time order and invalid boxes are dropped and counted. Three
+        things become unknown and are counted: a depth that is not above zero or too large, corners that form no square, and
         appearance vectors that cannot be compared."""
         stamps = np.array(self.stamps, dtype=np.float64)
         forward = in_order(stamps)

@@ -38,9 +38,9 @@ _QUIETER = 0.5
 share of the noise. A larger share refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with
 mirrored images, because with these the path must turn the other way."""
 _IN_BOTH = 0.4
-"""The halves of a log agree if, in each half, at least this share of the explained rays is of objects that both halves see
-(`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs have 0.63 and more. Logs of two recordings have
-at most 0.23, even if the solve explains the rays of both."""
+"""The least share of rays of common objects at which the halves of a log agree. Common objects are seen in both halves. The
+share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs
+have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve explains the rays of both."""
 
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:

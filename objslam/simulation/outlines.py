@@ -55,7 +55,7 @@ def visible_box(camera: Camera, body: Floats, pose: Floats) -> Floats | None:
     """Return the box (4,), px, around the part of an ellipsoid (7,) that is in the image of a pinhole camera.
 
     The outline is clipped by the four edges of the image (Sutherland and Hodgman 1974). None if no part of it is in the
-    image, or if a part of it is behind the camera. Arguments: as of `outline_box`.
+    image, or if a part of it is behind the camera. The arguments are those of `outline_box`.
     """
     pixels = _outline(camera, body, pose)
     if pixels is None:

@@ -146,17 +146,19 @@ class Caster:
         return np.concatenate([self._shade_strip(cast.rows(slice(start, start + _STRIP)), eye) for start in starts])
 
     def _shade_strip(self, cast: Cast, eye: Floats) -> Reals:
+        """Shade some rows. Inside, the axis of x, y, z and of the colours comes first, because NumPy is fast then."""
         albedo, gloss = self._albedo(cast)
-        view = _unit(eye.astype(np.float32) - cast.point)
-        facing = _dot(cast.normal, view)
-        normal = cast.normal * np.where(facing < 0, np.float32(-1), np.float32(1))[..., None]
+        point, normal = (np.ascontiguousarray(np.moveaxis(values, -1, 0)) for values in (cast.point, cast.normal))
+        view = _unit(_column(eye) - point)
+        facing = _dot(normal, view)
+        normal *= np.where(facing < 0, np.float32(-1), np.float32(1))
         facing = np.abs(facing)
-        light = self.room.ambient.astype(np.float32) * (0.8 + 0.2 * normal[..., 2:])
+        light = _column(self.room.ambient) * (0.8 + 0.2 * normal[2])
         shine = np.zeros_like(albedo)
-        start = cast.point + np.float32(2e-3) * normal
+        start = point + np.float32(2e-3) * normal
         for lamp in self.room.lamps:
-            to = lamp.position.astype(np.float32) - start
-            rays = np.concatenate([start, to], axis=-1)
+            to = _column(lamp.position) - start
+            rays = np.moveaxis(np.concatenate([start, to]), 0, -1)
             dark = self._scene.test_occlusions(_tensor(rays), 0.0, 1.0, 1).numpy()
             squared = _dot(to, to)
             power = np.where(dark, np.float32(0), 1 / (np.float32(0.4) + np.float32(0.3) * squared))
@@ -168,20 +170,21 @@ class Caster:
             glint *= glint
             glint *= glint
             glint *= glint
-            colour = lamp.power.astype(np.float32)
-            light += (power * np.maximum(slope, 0))[..., None] * colour
-            shine += (power * glint**2 * gloss)[..., None] * colour
-        return np.where(cast.part[..., None] >= 0, albedo * light + shine, np.float32(0))
+            colour = _column(lamp.power)
+            light += power * np.maximum(slope, 0) * colour
+            shine += power * glint**2 * gloss * colour
+        shaded = np.where(cast.part >= 0, albedo * light + shine, np.float32(0))
+        return np.ascontiguousarray(np.moveaxis(shaded, 0, -1))
 
     def _albedo(self, cast: Cast) -> tuple[Reals, Reals]:
-        """Return the colour (H, W, 3) and the gloss (H, W) of the surface at each pixel."""
-        first, second, gloss, scale, pattern = (column.take(cast.part, axis=0) for column in self._materials)
+        """Return the colour (3, H, W) and the gloss (H, W) of the surface at each pixel."""
+        first, second, gloss, scale, pattern = (column.T.take(cast.part, axis=-1) for column in self._materials)
         share = np.zeros(cast.part.shape, dtype=np.float32)
         for kind in (1, 2, 3):
             chosen = pattern == kind
             if chosen.any():
                 share[chosen] = self._pattern(kind, cast.point[chosen] / scale[chosen][:, None])
-        return first + share[..., None] * (second - first), gloss
+        return first + share * (second - first), gloss
 
     def _pattern(self, kind: int, at: Reals) -> Reals:
         """Return the share (M,) of the second colour at points. at: (M, 3) in units of the pattern's scale."""
@@ -199,12 +202,17 @@ def _rays(directions: Reals, map_T_camera: Floats) -> Reals:
     return np.concatenate([np.broadcast_to(map_T_camera[:3, 3].astype(np.float32), turned.shape), turned], axis=-1)
 
 
+def _column(values: Floats) -> Reals:
+    """Return a point or a colour (3,) as an array (3, 1, 1)."""
+    return values.astype(np.float32)[:, None, None]
+
+
 def _dot(a: Reals, b: Reals) -> Reals:
-    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _unit(v: Reals) -> Reals:
-    return np.asarray(v / np.sqrt(_dot(v, v) + np.float32(1e-12))[..., None])
+    return np.asarray(v / np.sqrt(_dot(v, v) + np.float32(1e-12)))
 
 
 def _open3d() -> Any:

@@ -7,6 +7,12 @@ from objslam.config import NotNegative, Positive, Section
 from objslam.simulation.raycast import Reals
 from objslam.simulation.settings import Probability
 
+_STRIP = 32
+"""The number of rows that get their noise at a time. The arrays of such a strip fit into a processor's cache. A larger
+number is slower: whole images of 640 x 480 px take nearly twice the time."""
+_GAMMA = (255 * np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) + 0.5).astype(np.uint8)
+"""The 8-bit value of each of 4096 steps of linear light, with a gamma of 2.2. More steps round the dark values less."""
+
 
 class Sensor(Section):
     """The errors of colour and depth images."""
@@ -43,16 +49,21 @@ def expose(sensor: Sensor, light: Reals, gain: NDArray[np.float64], rng: np.rand
     """Turn linear light (H, W, 3) into an 8-bit RGB image (H, W, 3). If `gain` (3,) is 1, the mean light becomes 0.25."""
     import cv2
 
-    height, width = light.shape[:2]
-    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j].astype(np.float32)
-    fall_off = (1 - sensor.vignette * (x**2 + y**2) / 2)[..., None]
+    y, x = (np.linspace(-1, 1, count).astype(np.float32) for count in light.shape[:2])
+    fall_off = (1 - sensor.vignette * (x**2 + (y**2)[:, None]) / 2)[..., None]
     image = light * (fall_off * (0.25 / max(float(light.mean()), 1e-6) * gain).astype(np.float32))
     if sensor.blur > 0:
-        image = cv2.GaussianBlur(image, (0, 0), sensor.blur)
-    sigma = np.sqrt(sensor.shot**2 * np.clip(image, 0.0, 1.0) + sensor.read**2)
-    image = image + sigma.astype(np.float32) * rng.standard_normal(image.shape, dtype=np.float32)
-    table = (255 * np.linspace(0.0, 1.0, 4096) ** (1 / 2.2) + 0.5).astype(np.uint8)
-    return np.asarray(table[(np.clip(image, 0.0, 1.0) * 4095).astype(np.int32)])
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sensor.blur), dtype=np.float32)
+    exposed = np.empty(image.shape, dtype=np.uint8)
+    for start in range(0, len(image), _STRIP):
+        part = image[start : start + _STRIP]
+        noise = rng.standard_normal(part.shape, dtype=np.float32)
+        noise *= np.sqrt(np.float32(sensor.shot**2) * np.clip(part, 0.0, 1.0) + np.float32(sensor.read**2))
+        noise += part
+        np.clip(noise, 0.0, 1.0, out=noise)
+        noise *= 4095
+        _GAMMA.take(noise.astype(np.int32), out=exposed[start : start + _STRIP])
+    return exposed
 
 
 def measure_depth(sensor: Sensor, depth: Reals, rng: np.random.Generator) -> Reals:

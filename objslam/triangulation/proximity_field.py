@@ -82,7 +82,9 @@ def main_heading(directions: Floats) -> Floats:
 
 
 def supporting_rays(weight: Floats, object_: Bools) -> Bools:
-    """Return a mask (R,) of the rays of one object, those in the mask `object_` (R,), that have a weight (R,) above 0. If
-    none has one, return all rays of the object."""
+    """Return a mask (R,) of the rays of an object with a weight (R,) above 0. If there are none, return all its rays.
+
+    object_: (R,) the mask of the rays of the object.
+    """
     kept = object_ & (weight > 0)
     return kept if kept.any() else object_

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from commands import Call
+from commands import Call, call
 from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
@@ -40,6 +40,20 @@ def log_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs") / "small"
     write_log_folder(small_log(), folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def whole_result(log_folder, tmp_path_factory):
+    """What `run` writes with default settings."""
+    out = tmp_path_factory.mktemp("results") / "out"
+    assert call("run", log_folder, "-o", out, *LEAN).code == 0
+    return out
+
+
+@pytest.fixture
+def out(whole_result, tmp_path):
+    """A copy of the result to be evaluated, or spoilt."""
+    return Path(shutil.copytree(whole_result, tmp_path / "out"))
 
 
 @pytest.fixture
@@ -182,16 +196,15 @@ def test_config_dump_is_what_config_reads(objslam, tmp_path):
     assert Settings.model_validate(yaml.safe_load(objslam("config", "dump").out)) == Settings()
 
 
-def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, tmp_path):
-    assert objslam("run", log_folder, "-o", tmp_path, *LEAN).code == 0
+def test_eval_takes_the_truth_from_where_it_is_told(objslam, log_folder, out):
     values = []
     for truth in (log_folder, log_folder / "groundtruth", log_folder / "groundtruth" / "objects.json"):
-        assert objslam("eval", tmp_path, "--truth", truth, "--align", "se2", "--radius", "0.3").code == 0
-        found = json.loads((tmp_path / "evaluation.json").read_text())
+        assert objslam("eval", out, "--truth", truth, "--align", "se2", "--radius", "0.3").code == 0
+        found = json.loads((out / "evaluation.json").read_text())
         assert (found["align"], found["radius"], found["matched"]) == ("se2", 0.3, 4)
         values.append(found["position_rmse"])
     assert values[0] == pytest.approx(values[1])
-    assert (json.loads((tmp_path / "evaluation.json").read_text())["ate"]) is None  # objects.json has no path
+    assert (json.loads((out / "evaluation.json").read_text())["ate"]) is None  # objects.json has no path
 
 
 # How it answers at once
@@ -628,16 +641,15 @@ def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
         ("groundtruth_trajectory.txt", b"", "nothing in it"),
     ],
 )
-def test_a_corrupted_result_in_eval(objslam, log_folder, tmp_path, name, content, word):
-    assert objslam("run", log_folder, "-o", tmp_path, *LEAN).code == 0
+def test_a_corrupted_result_in_eval(objslam, out, name, content, word):
     if content is None:
-        (tmp_path / name).unlink()
+        (out / name).unlink()
     else:
-        (tmp_path / name).write_bytes(content)
-    failed = objslam("eval", tmp_path)
+        (out / name).write_bytes(content)
+    failed = objslam("eval", out)
     assert failed.code == 1
     failed.says(name, word)
-    assert not (tmp_path / "evaluation.json").exists()
+    assert not (out / "evaluation.json").exists()
 
 
 # The last resorts

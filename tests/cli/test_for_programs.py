@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from commands import Call
+from commands import Call, call
 from small_log import small_log
 
 from objslam.sources.log_folder import write_log_folder
@@ -23,6 +23,13 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs") / "small"
     write_log_folder(small_log(), folder)
     return folder
+
+
+@pytest.fixture(scope="module")
+def run(log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Call, Path]:
+    """A run with default settings, and its folder."""
+    out = tmp_path_factory.mktemp("results") / "out"
+    return call("run", log, "-o", out, *LEAN), out
 
 
 def test_a_run_in_json_is_its_files(objslam: Objslam, log: Path, tmp_path: Path) -> None:
@@ -43,16 +50,18 @@ def test_a_quiet_run_prints_warnings_only(objslam: Objslam, log: Path, tmp_path:
     assert (tmp_path / "out" / "summary.json").is_file()
 
 
-def test_a_run_ends_with_its_verdict(objslam: Objslam, log: Path, tmp_path: Path) -> None:
-    lines = objslam("run", log, "-o", tmp_path / "out", *LEAN).out.splitlines()
+def test_a_run_ends_with_its_verdict(run: tuple[Call, Path]) -> None:
+    done, out = run
+    lines = done.out.splitlines()
     assert lines[-2].startswith("verdict: good. 4 objects")
-    assert lines[-1] == f"wrote {tmp_path / 'out'}"
+    assert lines[-1] == f"wrote {out}"
 
 
-def test_an_evaluation_in_json_is_its_file(objslam: Objslam, log: Path, tmp_path: Path) -> None:
-    assert objslam("run", log, "-o", tmp_path / "out", "--quiet", *LEAN).code == 0
-    told = json.loads(objslam("eval", tmp_path / "out", "--json").out)
-    assert told == json.loads((tmp_path / "out" / "evaluation.json").read_text())
+def test_an_evaluation_in_json_is_its_file(objslam: Objslam, run: tuple[Call, Path]) -> None:
+    done, out = run
+    assert done.code == 0
+    told = json.loads(objslam("eval", out, "--json").out)
+    assert told == json.loads((out / "evaluation.json").read_text())
     assert told["matched"] == 4
 
 
@@ -69,8 +78,10 @@ def test_help_is_a_word_too(objslam: Objslam) -> None:
         assert objslam("help", *words).out == objslam(*words, "--help").out != ""
 
 
-def test_a_log_that_tells_no_shared_error_has_no_table_of_them(objslam: Objslam, log: Path, tmp_path: Path) -> None:
-    told = objslam("run", log, "-o", tmp_path / "out", *LEAN).out
+def test_a_log_that_tells_no_shared_error_has_no_table_of_them(
+    objslam: Objslam, run: tuple[Call, Path], log: Path, tmp_path: Path
+) -> None:
+    told = run[0].out
     assert "prior sigma" in told
     assert "its priors count" not in told
     few = tmp_path / "few"

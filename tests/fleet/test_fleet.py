@@ -1,16 +1,15 @@
 """The command `objslam fleet` on small logs: results by content, faults, sites, tables and the page."""
 
-import io
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
 from hashlib import sha256
 from pathlib import Path
 
+import commands
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -18,7 +17,6 @@ from fleet.fleet_logs import LAYOUT, write_logs
 from waiting import wait_for
 
 import objslam
-from objslam.cli import main
 from objslam.fleet.page import duration
 from objslam.fleet.record import Record, parse_seen
 from objslam.fleet.stores.open_store import open_store
@@ -36,12 +34,8 @@ def start(*arguments):
 
 def call(*arguments):
     """Run the command with one worker. Return its exit code, the JSON that it printed, and its errors."""
-    said, warned = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(warned):
-        patch.setattr(sys, "argv", ["objslam", "fleet", *map(str, arguments), *COMMAND, "-j", "1", "--json"])
-        with pytest.raises(SystemExit) as ended:
-            main()
-    return ended.value.code, json.loads(said.getvalue()) if said.getvalue() else None, warned.getvalue()
+    done = commands.call("fleet", *arguments, *COMMAND, "-j", "1", "--json")
+    return done.code, json.loads(done.out) if done.out else None, done.err
 
 
 @pytest.fixture(scope="module")

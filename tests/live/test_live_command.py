@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 import yaml
+from small_log import small_log
 from waiting import LIMIT, wait_for
 
 from objslam.config import Odometry, load_settings
@@ -32,6 +33,14 @@ def log(tmp_path_factory):
     folder = tmp_path_factory.mktemp("live") / "log"
     drive = preset("demo", frames=150, classes=12, false=0.0, localization=None, odometry=Odometry())
     write_log_folder(simulate(drive, 0), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """A drive with four objects, for the tests that are about files."""
+    folder = tmp_path_factory.mktemp("live") / "short"
+    write_log_folder(small_log(localization=None), folder)
     return folder
 
 
@@ -106,15 +115,15 @@ def test_ctrl_c_ends_with_a_whole_result(log, tmp_path):
     assert not (tmp_path / "out" / "journal.objslam").exists()
 
 
-def test_a_session_does_not_stand_beside_an_older_result(objslam, log, tmp_path):
+def test_a_session_does_not_stand_beside_an_older_result(objslam, short, tmp_path):
     out = tmp_path / "out"
-    done = objslam(*words(log, out, "--speed", "0", "--no-journal"))
+    done = objslam(*words(short, out, "--speed", "0", "--no-journal"))
     assert done.code == 0, done.err
     older = {f.name for f in out.iterdir()}
     (out / "mine.txt").touch()
     before = (out / "objects.json").stat().st_mtime_ns
     process = subprocess.Popen(
-        command(log, out, "--speed", "0.5", "--interval", "0.1", "--no-journal"), stderr=subprocess.PIPE
+        command(short, out, "--speed", "0.5", "--interval", "0.1", "--no-journal"), stderr=subprocess.PIPE
     )
     wait_for(lambda: not (out / "summary.json").exists() and (out / "objects.json").stat().st_mtime_ns > before)
     os.kill(process.pid, signal.SIGKILL)
@@ -122,28 +131,28 @@ def test_a_session_does_not_stand_beside_an_older_result(objslam, log, tmp_path)
     whole = {f.name for f in out.iterdir() if not f.name.startswith(".")}  # it may have been about to write another one
     assert whole == {"objects.json", "mine.txt"}
     assert all(name in told.decode() for name in older - {"objects.json"})
-    done = objslam(*words(log, out, "--speed", "0", "--no-journal"))
+    done = objslam(*words(short, out, "--speed", "0", "--no-journal"))
     assert done.code == 0, done.err
     assert older <= {f.name for f in out.iterdir()}
 
 
-def test_a_session_started_again_keeps_the_journal_that_was_there(objslam, log, tmp_path):
+def test_a_session_started_again_keeps_the_journal_that_was_there(objslam, short, tmp_path):
     out = tmp_path / "out"
     kept = journal_in(out)
-    done = objslam(*words(log, out, "--speed", "0"))
+    done = objslam(*words(short, out, "--speed", "0"))
     assert done.code == 0, done.err
     assert "--resume" in done.err
     assert (out / "journal.1.objslam").read_bytes() == kept
     assert "update p50" in done.out
-    done = objslam(*words(log, out, "--speed", "0", "--resume"))
+    done = objslam(*words(short, out, "--speed", "0", "--resume"))
     assert done.code == 0, done.err
     assert "update p50" not in done.out  # all was in the journal: nothing was measured
     newest = (out / "journal.objslam").read_bytes()
-    assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
+    assert len(read(out, Ledger()).odometry) == len(read(short, Ledger()).odometry)
     done = objslam(*words(out, out, "--speed", "0"))  # a session from the journal that it is about to write
     assert done.code == 0, done.err
     assert (out / "journal.2.objslam").read_bytes() == newest
-    assert len(read(out, Ledger()).odometry) == len(read(log, Ledger()).odometry)
+    assert len(read(out, Ledger()).odometry) == len(read(short, Ledger()).odometry)
 
 
 def test_a_live_recording_is_not_where_the_result_puts_its_own(objslam, log, tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mrclam import mapped
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -17,9 +18,7 @@ RADIUS = 2.0  # m; labels say who is whom, the error is what is asked
 @pytest.mark.parametrize("robot", [1, 3, 5])
 @pytest.mark.parametrize(("with_range", "position", "path"), [(False, 0.25, 0.35), (True, 0.10, 0.35)])
 def test_landmarks_and_path(data_dir, robot, with_range, position, path):
-    log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=robot, with_range=with_range))
-    ledger = Ledger()
-    result = pipeline.run(log, load_settings(None, ("mode=joint",)), ledger)
+    log, result, ledger = mapped(data_dir, robot, with_range)
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     found = evaluate(
         result.map, log.truth, Trajectory(stamps, result.map_T_base[first]), align="se2", radius=RADIUS

@@ -13,8 +13,8 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 _PRIOR = 20.0
-"""The number of pairs at which what was learnt weighs as much as what is assumed: no difference between one object and two
-objects, and no difference between labels. A larger number needs a longer log to learn from."""
+"""The number of pairs that weigh as much as the assumptions. It is assumed that boxes of one object are as alike as
+boxes of two, and that labels do not differ. A larger number needs a longer log to learn from."""
 _LEAST_APART = 0.3
 """The least distance between the two means, in standard deviations of the cosine of a box and an object with many boxes. A
 larger distance leaves more weak vectors unused. Random vectors are 0.1 apart in a log of a few hundred boxes."""
@@ -52,7 +52,8 @@ class Pairs:
 
 @dataclass(frozen=True)
 class CosineRatio:
-    """The two densities of cosines. same: of one object. different: of two objects of one label."""
+    """The densities of two kinds of cosines. same: between boxes of one object. different: between two objects of one
+    label."""
 
     same: Density
     different: Density
@@ -72,9 +73,10 @@ class CosineRatio:
         return bool(((self.same.mean - self.different.mean) > _LEAST_APART * np.sqrt(spread)).any())
 
     def log_ratio(self, cosine: Floats, label: Ints, one: Ints | float, other: Ints | float) -> Floats:
-        """Return the log likelihood ratio (E,) of one object over two, at most `MOST_RATIO` and at least its negative.
+        """Return the log likelihood ratio (E,) of one object over two. Its size is at most `MOST_RATIO`.
 
-        cosine: (E,) the mean cosine between `one` and `other` boxes of a label (E,). It never falls with the cosine.
+        A larger cosine never gives a smaller ratio. cosine: (E,) the mean cosine between two groups of boxes. one, other:
+        how many boxes each group has. label: (E,) the label of both groups.
         """
         s, d = self.same, self.different
         b = d.mean[label]

@@ -24,8 +24,8 @@ _AT_ONCE = 1 << 24  # The most numbers of vectors that are multiplied at once. A
 
 @dataclass(frozen=True)
 class Looks:
-    """What landmarks look like. ratio: of the log. total: (N, D) the sum of the vectors of each landmark's boxes. number:
-    (N,) of these vectors."""
+    """What landmarks look like. ratio: the densities of cosines, learnt from the log. total: (N, D) the sum of the vectors
+    of each landmark's boxes. number: (N,) how many vectors each landmark has."""
 
     ratio: CosineRatio
     total: Floats32
@@ -44,8 +44,8 @@ class Looks:
     def ray_odds(self, boxes: Boxes, ray: Ints, landmark: Ints, own: Bools) -> Floats:
         """Return the log odds (E,) that boxes show landmarks, and no other objects of their labels.
 
-        ray: (E,) the index of each box. own: (E,) whether the box is one of those of the landmark, which then does not count
-        as one of them. The odds are 0 if the box, or all other boxes of the landmark, have no vector.
+        ray: (E,) the index of each box. own: (E,) whether the box belongs to the landmark. Such a box is not compared with
+        itself. The odds are 0 if the box, or all other boxes of the landmark, have no vector.
         """
         feature, vectors = _vectors(boxes)
         others = self.number[landmark] - own

@@ -84,8 +84,8 @@ def add_few_ray_objects(
 
 @dataclass(frozen=True)
 class _Few:
-    """A search for more landmarks beside known ones. free: (F,) the rays that may show others. strays: of all rays. gate:
-    the largest squared deviation of a match."""
+    """A search for more landmarks beside known ones. free: (F,) the rays that may show others. strays: what is known of
+    stray rays. gate: the largest squared deviation of a match."""
 
     known: State
     free: Ints

@@ -44,8 +44,8 @@ _PRIOR = 0.5
 
 @dataclass(frozen=True)
 class _Density:
-    """The densities of the boxes of each label along one coordinate. low: of the first bin. width: of a bin. value:
-    (L, bins)."""
+    """The densities of the boxes of each label along one coordinate. low: where the first bin begins. width: the
+    width of a bin. value: (L, bins)."""
 
     low: float
     width: float
@@ -55,7 +55,7 @@ class _Density:
     def of(cls, x: Floats, label: Ints, labels: int, noise: Floats, reach: float = 0.0) -> "_Density":
         """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel. Values can reach `reach`.
 
-        Few boxes leave gaps between their kernels. So the fewer boxes lie in a kernel, the more a uniform density weighs.
+        Few boxes leave gaps between their kernels. So a uniform density weighs more where fewer boxes lie in a kernel.
         """
         pad = 2 * float(noise.max(initial=1e-6))
         low, high = (float(x.min()) - pad, float(x.max()) + pad) if len(x) else (-pad, pad)
@@ -72,7 +72,7 @@ class _Density:
         return cls(low, width, value / value.sum(axis=1, keepdims=True) / width)
 
     def at(self, x: Floats, label: Ints) -> Floats:
-        """Return the density at values x of any shape, among the boxes of labels of a shape that fits."""
+        """Return the density at values x among the boxes of labels. Both may have any shapes that broadcast together."""
         inside = np.abs((x - self.low) / self.width - _BINS / 2) <= _BINS / 2
         return np.where(inside, self.value[label, _bins(x, self.low, self.width)], _OUTSIDE)
 
@@ -135,7 +135,7 @@ class Strays:
         return np.asarray(np.maximum(number, 1.0) / max(self.frames, 1))
 
     def along(self, distance: Floats, label: Ints) -> Floats:
-        """Return the density, m^-1, of distances (E,) m at which there are boxes of a label (E,)."""
+        """Return the density (E,), m^-1, of boxes of a label (E,) at a distance (E,), m, from the camera."""
         anywhere = 1 / _LOG_RANGE
         if self.log_range is None:
             return anywhere / distance
@@ -152,7 +152,7 @@ def ray_odds(
     noise: Floats | float,
     gate: float,
 ) -> tuple[Floats, Floats]:
-    """Return the log odds (..., R) that each ray sees its point over being stray, and the density of strays, m^-2.
+    """Return the log odds (..., R) that each ray sees its point and is no stray, and the density of strays, m^-2.
 
     number: (..., R) strays of the label in the log. off2, distance: (..., R) m^2, m, of the point from the ray and from the
     camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs no more.

@@ -26,8 +26,9 @@ _DAMPING = 1e-6
 
 @dataclass(frozen=True)
 class SparseSearch:
-    """The settings of a search. strays: of the rays. number: of stray boxes of the label in the log. gate: largest squared
-    deviation of a pair. parallax: least angle (rad) of a pair. least: the least log odds of a point."""
+    """The settings of a search. strays: what is known of stray rays. number: how many stray boxes the label has in the log.
+    gate: largest squared deviation of a pair. parallax: least angle (rad) of a pair. least: the least log odds of a
+    point."""
 
     strays: Strays
     number: float

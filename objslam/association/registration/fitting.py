@@ -31,7 +31,10 @@ class Problem:
         self._heights = b.position[order, 2] + b.label[order] * 4 * self.apart
 
     def nearest(self, moved: Floats, index: Ints) -> Ints:
-        """Return the nearest object of b with the same label, for objects `index` (H, P) of a at `moved` (H, P, 3)."""
+        """Return the nearest object (H, P) of the map b for each object of the map a. Both have the same label.
+
+        index: (H, P) the objects of a. moved: (H, P, 3) m, their positions in the frame of b.
+        """
         at = np.concatenate([moved, self.a.label[index][..., None] * self.apart], axis=-1)
         return np.asarray(self._labelled.query(at.reshape(-1, 4))[1]).reshape(index.shape)
 
@@ -60,7 +63,10 @@ def move(x: Floats, points: Floats) -> Floats:
 
 
 def covariances(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
-    """Return the covariances (H, P, 3, 3) of the offsets between objects `a` (H, P) moved by x (H, 4) and objects `b`."""
+    """Return the covariances (H, P, 3, 3), m^2, of the offsets between moved objects and others.
+
+    a: (H, P) the objects that x (H, 4) moves. b: (H, P) the others.
+    """
     rotation = lift_se2(np.stack([x[:, 0], x[:, 1], x[:, 3]], axis=1))[:, None, :3, :3]
     return rotation @ problem.a.covariance[a] @ np.swapaxes(rotation, -1, -2) + problem.b.covariance[b]
 

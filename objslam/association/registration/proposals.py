@@ -78,8 +78,9 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
 
 
 def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
-    """Return how many neighbours (H,) of object i (H,) of a fall on a neighbour of object k (H,) of b with the same label.
+    """Return how many neighbours of an object fall on neighbours of another object when one is laid on the other: (H,).
 
+    i: (H,) the object of the map a. k: (H,) the object of the map b. Only neighbours with the same label count.
     yaw, turn_variance: (H,) rad and rad^2, the heading of each proposal and its variance.
     """
     (near_a, offset_a), (near_b, offset_b) = (_offsets(m) for m in (problem.a, problem.b))

@@ -23,9 +23,9 @@ from objslam.fleet.stores.store import StoreError
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The outcome of one task. value: what the function returned, None after a failure. message: of the failure.
+    """The outcome of one task. value: what the function returned, None after a failure. message: the words of a failure.
 
-    kind: of the failure, `memory`, `time`, `lost`, `store` or `error`, empty after a success.
+    kind: the kind of a failure, which is `memory`, `time`, `lost`, `store` or `error`. It is empty after a success.
     """
 
     argument: Any

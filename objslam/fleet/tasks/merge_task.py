@@ -37,7 +37,7 @@ _SESSION_FILES = (files.OBJECTS, files.VIEWS, files.RAYS)
 
 @dataclass(frozen=True, slots=True)
 class MergeTask:
-    """One node of a site. store: the URL of the output."""
+    """The merge at one node of the tree of a site. store: the URL of the output."""
 
     store: str
     node: Node
@@ -47,9 +47,9 @@ class MergeTask:
 class Placed:
     """A session in the frame of its island.
 
-    key: of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence for its place among the
-    earlier sessions, NaN for the first. If it is the first of a part of the site, the evidence is that of the whole part.
-    common: how many of its objects other sessions share, from the first merge with any.
+    key: the key of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence for its place among
+    the earlier sessions, NaN for the first. If it is the first of a part of the site, the evidence is that of the whole
+    part. common: how many of its objects other sessions share, from the first merge with any.
     """
 
     key: str

@@ -31,12 +31,13 @@ _STATE = "fleet.json"
 """The file of a site that says what its folder and its tables were made of."""
 _OBJECTS, _SESSIONS = "objects.parquet", "sessions.parquet"
 """The folders of the tables, with one file for each site and day."""
-_FILE = "part-0.parquet"  # The name of each of these files.
+_FILE = "part-0.parquet"  # The name of each file of a table.
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """A session of a site. key: of its result. path: of its log. begin: its first stamp, s. digest: of its job."""
+    """A session of a site. key: the key of its result. path: where its log is. begin: its first stamp, s. digest: the hash
+    of its job."""
 
     key: str
     path: str

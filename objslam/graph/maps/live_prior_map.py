@@ -51,7 +51,7 @@ def map_T_graph(graph: IncrementalGraph) -> Floats | None:
 
 
 def covariance_in_map(graph: IncrementalGraph, j: int) -> Floats:
-    """Return the covariance (3, 3), m^2, of F * L(j) in the map, turned into the axes of the graph. NaN if it is unknown."""
+    """Return the covariance (3, 3), m^2, of landmark j in the prior map, in the axes of the graph. NaN if it is unknown."""
     joint = graph.joint_covariance(F0, L0 + j)
     if joint is None:
         return np.full((3, 3), np.nan)

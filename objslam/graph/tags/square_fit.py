@@ -160,9 +160,9 @@ def _cost(residual: Floats, ahead: Bools, seen: Corners, count: int) -> Floats:
 def scatter(seen: Corners, squares: Squares, free: Bools, covariance: Floats) -> Floats:
     """Return the sums (H, 7, 7) of the squared gradients of each square's views. The corners of a view may share errors.
 
-    Between two inverses of the information, covariance (H, 7, 7), this is the covariance of a fit (cluster-robust; Liang and
-    Zeger 1986). A fit leaves smaller residuals than the errors are, most of all in the views that decide it. So the
-    residuals of each view are those of a fit without this view (Mancl and DeRouen 2001).
+    covariance: (H, 7, 7) the inverse C of the information. The covariance of a fit is C S C, where S is the returned sum
+    (cluster-robust; Liang and Zeger 1986). A fit leaves smaller residuals than the errors are, most of all in the views that
+    decide it. So the residuals of each view are those of a fit without this view (Mancl and DeRouen 2001).
     """
     flat, weighted, residual, _ = _jacobians(seen, squares, free)
     leverage = flat @ covariance[seen.square] @ np.swapaxes(weighted, 1, 2)

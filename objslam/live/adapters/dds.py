@@ -36,7 +36,7 @@ class _Publication:
 
 @dataclass
 class _Reader:
-    """A DDS reader for all publishers of one topic with one QoS kind. of: the publication of one of these publishers.
+    """A DDS reader for all publishers of one topic with one QoS kind. of: the publication of one of them.
 
     since: when the reader was made, s, by `time.monotonic`. lost: the number of lost messages that are already counted.
     """

@@ -67,7 +67,7 @@ class Calibrator:
     ) -> None:
         """Prepare for a session. record: writes a calibration to the journal, and returns whether it may be applied.
 
-        name: of the log. patient: whether the session may wait for the worker.
+        name: the name of the log. patient: whether the session may wait for the worker.
         """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
@@ -78,7 +78,7 @@ class Calibrator:
         self._replaying = False
 
     def expect(self, known: Iterable[CalibrationMessage]) -> None:
-        """Apply each of these calibrations of a journal at its keyframe. Start no new ones until `begin`."""
+        """Apply the calibrations of a journal, each at its keyframe. Start no new ones until `begin`."""
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:

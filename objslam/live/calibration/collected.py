@@ -18,11 +18,11 @@ from objslam.mapping.solution import seen_something
 class Collected:
     """The data of a session in the form of offline mapping.
 
-    keyframes, rays: as measured, the keyframes in time order. association: of the rays. ids: (N,) the session's ids of the
-    objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths and cameras. errors: gives the
-    keyframes and rays for any values of the shared errors. None if neither errors nor noise are estimated. theta: (P,) the
-    present values of the errors, None without `errors`. An error that the session knows and does not estimate is already
-    corrected in keyframes, rays and log.
+    keyframes, rays: as measured, the keyframes in time order. association: the object of each ray. ids: (N,) the session's
+    ids of the objects. map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths and cameras.
+    errors: gives the keyframes and rays for any values of the shared errors. None if neither errors nor noise are estimated.
+    theta: (P,) the present values of the errors, None without `errors`. An error that the session knows and does not
+    estimate is already corrected in keyframes, rays and log.
     """
 
     keyframes: Keyframes

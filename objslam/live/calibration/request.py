@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 class CalibrationRequest:
     """The input of a calibration. The solve starts at the values theta (P,) of the errors and at the poses map_T_camera.
 
-    errors: gives keyframes and rays for any values of the errors. association: of the rays. map_T_camera: (K, 4, 4).
+    errors: gives keyframes and rays for any values of the errors. association: the object of each ray. map_T_camera: (K, 4,
+    4).
     """
 
     errors: SharedErrors

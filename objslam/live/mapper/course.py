@@ -89,9 +89,9 @@ class Course:
     ) -> None:
         """Correct the odometry by new values of its errors, and move the pieces of the course and the keyframes accordingly.
 
-        errors: by name. corrected: the whole odometry, corrected by these errors. keyframes: with their new stamps and
-        map_T_base. This function changes their start_T_base and drift. A piece that is placed anew, not in the frame of the
-        piece before, keeps the pose of its first keyframe.
+        errors: the new values by name. corrected: the whole odometry, corrected by them. keyframes: with their new stamps
+        and map_T_base. This function changes their start_T_base and drift. A piece with a frame of its own keeps the pose of
+        its first keyframe.
         """
         said = self.driven.trajectory()
         self._correction = OdometryCorrection(errors, said, corrected)

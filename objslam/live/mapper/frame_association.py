@@ -152,7 +152,7 @@ def _possible(
 
 
 def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) -> Ints:
-    """Return the candidate of each ray (n,), or -1, such that the total cost is least.
+    """Return the candidate of each ray (n,), or -1, in the assignment with the least total cost.
 
     cost: (E,) of the edges, which may be negative. rays, places: the numbers of rays and of candidates. unmatched: the cost
     of a ray without a candidate.

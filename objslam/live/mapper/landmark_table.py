@@ -58,7 +58,8 @@ def covariances(landmarks: LandmarkTable, rows: Ints) -> Floats:
 def in_view(
     landmarks: LandmarkTable, camera: Camera, map_T_camera: Floats, margin: float = _INNER, reach: float = 0.0
 ) -> Bools:
-    """Return which landmarks (N,) a camera should see: those inside its image, not much further away than ever observed.
+    """Return which landmarks (N,) a camera should see. They are in its image, and not much further away than in any
+    observation.
 
     map_T_camera: (4, 4). margin: the share of the image along its edge that is excluded. A negative margin extends the
     image. reach: m, the distance up to which every landmark should be seen.

@@ -32,7 +32,7 @@ class LandmarkUpdate:
 
 
 def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
-    """Count which landmarks the newest keyframe should show and which it shows. Update the latter by its rays."""
+    """Count which landmarks the newest keyframe should show, and which it shows. Update those that it shows by its rays."""
     landmarks, keyframes, rays, rows = m.landmarks, m.keyframes, update.rays, update.rows
     pose = m.graph.pose(int(keyframes.id[-1]))
     seen = in_view(landmarks, m.cameras[keyframes.camera[-1]], pose)

@@ -69,7 +69,7 @@ def chain_keyframes(m: MapState) -> None:
 
 
 def _move_onto(m: MapState, row: int, map_T_base: Floats) -> None:
-    """Move the whole map such that the robot has the pose map_T_base (4, 4) at the keyframe in a row."""
+    """Move the whole map, so that the robot has the pose map_T_base (4, 4) at the keyframe of a row."""
     m.graph.update()
     there = map_T_base @ m.keyframes.base_T_camera[row] @ inverse(m.graph.pose(int(m.keyframes.id[row])))
     m.graph.drop_absolute()

@@ -112,8 +112,8 @@ class PathTable(GrowingTable):
     def _thin(self, asked: Floats) -> None:
         """Keep one pose per period, and the poses at gaps. The period doubles until few enough poses stay.
 
-        A period above max_gap / 4 does not apply to poses near `asked` or near the end of the path. If so many of these stay
-        that the others would have to be fewer than _LEAST, the limit doubles instead.
+        A period above max_gap / 4 does not apply to poses near `asked` or near the end of the path. If such poses leave room
+        for fewer than _LEAST others, the limit doubles instead.
         """
         near = self._near(asked)
         self._spacing = self._spacing or min(2 * float(self.stamp[-1] - self.stamp[0]) / len(self), self._widest)

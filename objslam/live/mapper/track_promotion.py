@@ -80,8 +80,8 @@ def fit_if_observable(
 ) -> PointFit | None:
     """Triangulate rays in map, or return None.
 
-    It is None if fewer inliers than `least` or a smaller share of inliers than `share` is found, if the position is
-    uncertain, or if the parallax is low without ranges. early: whether less parallax suffices if the position is certain.
+    There are three reasons for None. The inliers are fewer than `least`, or a smaller share than `share`. The position is
+    uncertain. The parallax is low and there are no ranges. early: whether less parallax suffices if the position is certain.
     """
     fit = fit_point(obs, rng, SLACK)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:

@@ -70,7 +70,7 @@ class BodyEstimator:
     def update(self, m: MapState, covariances: dict[int, Floats]) -> None:
         """Take the bodies of a fit that has ended, or begin a fit.
 
-        covariances: (3, 3) m^2 in the graph of the landmarks that may have a body, by their ids.
+        covariances: the covariance (3, 3), m^2, of each landmark that may have a body, by its id.
         """
         now = time.monotonic()
         if self._worker.busy:

@@ -39,12 +39,12 @@ _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memo
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
 _POSES = 10_000
-"""The newest poses of each path that are kept to recognise poses that come again, as from a program that starts anew with
-messages that it sent already. A larger number recognises a longer repetition and costs memory, 0.3 kB a pose."""
+"""The number of newest poses of each path that are kept. They show when a program starts again and repeats its messages. A
+larger number recognises a longer repetition and costs memory, 0.3 kB a pose."""
 _SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. A larger value only costs care.
 _WAIT = 2.0
 """A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
-larger value misses more of these stamps."""
+larger value misses more such stamps."""
 _AHEAD = 60.0  # The longest lead of a frame over the path, s. A larger value lets a frame with a wrong stamp wait longer.
 _ALONE = "with a stamp far ahead, which the next ones did not confirm"
 _KINDS = {CameraMessage: "cameras", MountMessage: "mounts", FrameMessage: "frames", NoteMessage: "notes"}

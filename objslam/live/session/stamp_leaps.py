@@ -45,7 +45,7 @@ class _Stream(Generic[T]):
         return stamp + (_APART if usual is None else max(_LAG, _STEPS * usual))
 
     def leaps(self, stamp: float, clock: float, alone: bool) -> bool:
-        """Return whether a stamp is too far ahead of the stream, and of the clock of the others."""
+        """Return whether a stamp is too far ahead of its stream, and of the clock of the other streams."""
         if clock == -float("inf") and not (alone and self.last is not None):  # There is nothing to compare it with.
             return False
         return stamp > clock + _LAG and (self.last is None or stamp > self.reach(self.last))
@@ -99,7 +99,7 @@ class StampLeaps(Generic[T]):
             s.steps.clear()
             return s.pass_on(chain), s.empty()
         s.hear(stamp)
-        if not s.waiting or (before is not None and stamp <= before):  # A late message says nothing of those ahead.
+        if not s.waiting or (before is not None and stamp <= before):  # A late message says nothing about messages ahead.
             return [message], []
         earlier = s.near(stamp)
         return [*earlier, message, *s.near(s.reach(stamp))], s.empty()

@@ -39,9 +39,9 @@ larger share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simu
 def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution) -> BoxEdges | None:
     """Return the edges of the cut off boxes that belong to bodies, None if there are none.
 
-    A box belongs to a body of its label if it is near the predicted box, and if no other body is near the box and no other
-    box of the image is near the body or belongs to it. bodies: n, of the objects (n,) in the association of the solution.
-    boxes: the whole boxes of the bodies.
+    A box belongs to a body of its label under three conditions. It is near the predicted box. No other body is near the box.
+    No other box of the image is near the body or belongs to it. bodies: n, of the objects (n,) in the association of the
+    solution. boxes: the whole boxes of the bodies.
     """
     cut = solution.rays.cut
     if cut is None or not len(cut):

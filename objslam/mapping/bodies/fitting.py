@@ -24,9 +24,9 @@ from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 FEWEST = 5
 """The least number of boxes of a body. With a larger number, more objects stay points."""
 _CLEAR = 1.0
-"""The angle between the centre of a body and that of its box, in standard deviations of the error that boxes share, above
-which the position is the centre of the body. It is 4 for a cabinet from close by, and below 0.6 for things on a table that a
-noisy detector sees. With a larger value, more objects stay where their rays meet."""
+"""The least angle between the centre of a body and the centre of its box, in standard deviations of the boxes' shared error.
+Above it, the position is the centre of the body. The angle is 4 for a cabinet from close by. It is below 0.6 for things on a
+table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
@@ -69,7 +69,7 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
 
 @dataclass(frozen=True)
 class _Views:
-    """The boxes of objects with a point. objects: (n,) the objects, ray: (B,) the used rays. boxes: of these rays."""
+    """The boxes of objects with a point. objects: (n,) the objects. ray: (B,) the used rays. boxes: their boxes."""
 
     objects: Ints
     ray: Ints

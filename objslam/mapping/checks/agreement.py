@@ -25,7 +25,7 @@ _WINDOWS = 6
 _WAY, _TURN = 5.0, 5.0
 """The distance (m) and the turn (rad) that a window covers. Larger values see objects from more places, with more drift."""
 _DRIFT_YAW, _DRIFT_XY = 0.015, 0.03
-"""The errors (rad, m) of odometry within a window that a ray may have. With larger values, wrong input may fit too."""
+"""The errors (rad, m) that the odometry may have within a window. With larger values, wrong input may fit too."""
 _SIGMAS = 3.0
 """The deviation of a ray from its point, in standard deviations, up to which it fits. A larger value lets false rays fit."""
 _COST = 3.0

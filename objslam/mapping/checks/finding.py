@@ -10,8 +10,8 @@ class Finding:
 
     name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the fault makes
     the positions of a map unreliable. It does if the error is not corrected. basis: the evidence. "log" is the input itself.
-    The other values stand for the agreement of boxes at the given poses: of all "boxes", in the "halves" of the log, or in
-    single "frames". A joint solve may refute these.
+    The other values say which boxes do not agree at the given poses: all "boxes", those of the two "halves" of the log, or
+    those of single "frames". A joint solve may refute a finding with such evidence.
     """
 
     name: str

@@ -17,7 +17,7 @@ _OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.
 _SIDES = {"ahead": 0, "to the left": 90, "back": 180, "to the right": -90}
 """The usual directions of a camera (degrees)."""
 _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
-"""The tried sizes of the images of the boxes, as multiples of the image size in the calibration."""
+"""The tried sizes of the images in which the boxes were found, as multiples of the image size in the calibration."""
 _SQUARES = (320, 416, 512, 640)
 """The sides (px) of square images that detectors often use."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])

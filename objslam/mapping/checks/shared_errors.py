@@ -82,11 +82,10 @@ def _uncorrected(calibration: Calibration, bounds: Floats) -> list[Finding]:
 
 
 def _with_most_noise(noise: NoiseFactors) -> list[Finding]:
-    """Return a finding for each noise that ended at its bound. With so much noise, wrong input fits too.
+    """Return a finding for each noise that ended at its bound. With noise at its bound, wrong input fits too.
 
-    Wheels may slip so much, or a depth image may be so bad. But no detector is off by so many pixels, and depths and
-    odometry are not both so bad. So the noise of the boxes spoils the positions. The noise of depths and odometry together
-    spoils them too.
+    Wheels may slip that far, and a depth image may be that bad, but hardly both in one log. No detector errs by that many
+    pixels. So the positions are spoilt if the noise of the boxes ends at its bound, or that of both depths and odometry.
     """
     ended = [name for name in _NOISES if getattr(noise, name) >= 0.999 * MOST_NOISE]
     depths, odometry = ([name for name in names if name in ended] for names in (_DEPTHS, _ODOMETRY))

@@ -29,7 +29,7 @@ def widened(
 ) -> ObjectMap:
     """Return the objects with the covariance of small calibration errors added, if the run did not correct such errors.
 
-    association: of the rays. weight: (R,) their robust weights.
+    association: the object of each ray. weight: (R,) their robust weights.
     """
     errors = diagnosis.errors
     if errors is None:

@@ -10,7 +10,7 @@ a group by chance. A larger value finds fewer groups."""
 
 
 def crowded(inside: Floats | Ints, around: Floats | Ints, share: float, tried: int) -> Floats:
-    """Return the log odds that so many lie inside a region by more than chance.
+    """Return the log odds that a region holds more boxes than it would by chance.
 
     Without a group, those around it lie evenly, so the number inside is binomial (scan statistic with the surroundings as
     the estimate of the density).

@@ -29,8 +29,8 @@ many rays pass by chance. A larger angle counts places nearer to the path."""
 _PAIRS = 3000
 """The number of tried pairs of rays of a label. More pairs find groups of fewer rays, and take longer."""
 _NEXT = 30
-"""Half of the pairs are at most so many boxes apart in time, because a place is seen for a while. A smaller number finds
-small groups in long logs better, with less parallax."""
+"""Half of the pairs are at most this number of boxes apart in time, because a place is seen for a while. A smaller number
+finds small groups in long logs better, with less parallax."""
 _PLACES, _SAMPLE = 600, 3000
 """The most places that are tried for a label, and the most rays that count there. More find smaller groups, and take
 longer."""
@@ -78,7 +78,7 @@ def _of_label(evidence: Evidence, mine: Ints, reach: float) -> Iterator[Ints]:
         scale = int(standing_out[0])
         place = int(odds[scale].argmax())
         open_[scale, place] = False
-        loose = np.flatnonzero(number[:, place] > _LOOSE * number[scale, place])  # The narrow crowd is a part of these.
+        loose = np.flatnonzero(number[:, place] > _LOOSE * number[scale, place])  # They include the narrow crowd.
         scale = max([scale, *loose.tolist()])
         group = _gathered(obs, mine, free, places[place], inside[scale, place], _SCALES[scale] * radius)
         if group.sum() >= _FEWEST:

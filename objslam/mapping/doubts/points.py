@@ -14,8 +14,8 @@ from objslam.core.statistics import grouped_median
 from objslam.mapping.doubts.evidence import Evidence
 
 MISSED = 3.0
-"""The least median deviation, in standard deviations, of rays that pass a point instead of meeting there. The median of rays
-that meet is 1.2. A larger number says of fewer groups that their rays do not meet."""
+"""The median deviation, in standard deviations, above which the rays of a group do not meet in a point. It is 1.2 for rays
+that meet. With a larger number, fewer groups have rays that do not meet."""
 _NEAR, _FAR = 0.2, 100.0
 """The least and the greatest distance (m) of the point where a fit starts. Larger values suit larger places."""
 _PAIRS = 64

@@ -33,8 +33,8 @@ def site_covariances(solved: JointFrames, rows: list[Row], shared: Sequence[Floa
     """Return the covariances (N, 3, 3) m^2 of the tracks, and their correlated part as a factor (N, 3, m) m.
 
     Errors repeat from session to session: those of an object's boxes, and the scale of a robot's odometry. Many sessions do
-    not average them out. So the own error of an object is at least that of the session that knew it best, and the size of
-    the site is at least as uncertain as in the session that knew it best.
+    not average them out. So the own error of an object is at least its error in the best session. The size of the site is
+    at least as uncertain as in the best session.
     """
     measured = measured_objects([(s, k, replace(o, life=None)) for s, k, o in rows], shared)
     assert measured.roots is not None

@@ -33,7 +33,7 @@ _CHUNK = 1 << 20  # The bytes of one read. A larger number makes fewer reads.
 
 @dataclass(frozen=True)
 class Segment:
-    """A file of a journal. number: from 1 on. header: None if it is damaged or the file is missing."""
+    """A file of a journal. number: the first file has 1. header: None if it is damaged or the file is missing."""
 
     path: Path
     number: int
@@ -103,7 +103,7 @@ def contents(path: Path, ledger: Ledger) -> Iterator[tuple[str, bytes]]:
 
 
 def sealed(file: Path, identity: bytes, number: int) -> Path:
-    """Return the path of an earlier segment before it is compressed."""
+    """Return the path that an earlier segment has until it is compressed."""
     return file.with_name(f"journal-{identity.hex()}.{number:06d}.objslam")
 
 

@@ -63,7 +63,7 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     moved = odometry.child if odometry else next((_main_pair(topic)[1] for topic in _pose_topics(pool.survey)), "")
     base = find_base(tree.frames, base_frame, moved)
     if base_frame is None and moved not in ("", base):
-        ledger.warn(f"the path is that of the frame {moved!r}, which is not in tf: {base!r} is taken as the same frame")
+        ledger.warn(f"the poses are of the frame {moved!r}, which is not in tf; it is taken for the frame {base!r}")
     if odometry is not None:
         odometry = _moved_to(base, odometry, tree, ledger)
     elif pool.choices.of("odometry") != [NONE]:

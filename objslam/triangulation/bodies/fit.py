@@ -15,8 +15,8 @@ from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 _ITERATIONS = 40
 """The most steps of a fit. Ten are usual. More steps are slower."""
 STILL = 1e-9
-"""The fit of a body ends when the linear model of a step predicts a smaller decrease of the cost, half the sum of squared
-deviations. A larger decrease ends sooner."""
+"""The least decrease of the cost for which the fit of a body goes on. The cost is half the sum of squared deviations. The
+decrease is that of the linear model of a step. A larger value ends sooner."""
 _UPHILL = 1e-3
 """The share by which a step may raise the cost. The derivatives leave out that the distance to a body changes, so steps near
 the optimum may raise the cost slightly. A larger share accepts worse steps."""
@@ -74,7 +74,7 @@ def fit(
     still: float = STILL,
     most: int = _ITERATIONS,
 ) -> Fit:
-    """Return the most probable bodies of one kind. start: (N, 7). still: as `STILL`. most: the most steps."""
+    """Return the most probable bodies of one kind. start: (N, 7). still: see `STILL`. most: the most steps."""
     values, now = start.copy(), residuals(edges, start, kind)
     moving = np.arange(len(start))
     damping = np.full(len(start), _DAMPING[0])
