@@ -195,7 +195,10 @@ class JointState:
             return self
         assert state.association is not None
         assert state.estimate is not None
-        return self.better(state.alternated(state.estimate.map_T_base, (state.association, state.estimate.positions)))
+        turns = state.alternated(state.estimate.map_T_base, (state.association, state.estimate.positions))
+        if turns.explained < state.explained:  # Close landmarks may merge in one round and part in the next.
+            turns = replace(turns.continued_from(state), settled=turns.settled)
+        return self.better(turns)
 
     def attempt(self) -> Self:
         """Return a state for rounds that may be discarded."""
