@@ -1,11 +1,11 @@
-"""Corrections of a whole path, derived from the corrections of its keyframes, and the drift between keyframes."""
+"""Corrections of a whole path, derived from the corrections of its keyframes."""
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse, log_se3, twist_lengths
 from objslam.core.rotation import rotation_vector
-from objslam.core.types import Keyframes, Trajectory
+from objslam.core.types import Trajectory
 
 _SPAN = 0.4
 """The time, s, over which a speed is averaged. It spans several poses of slow odometry. A longer time smooths more."""
@@ -52,22 +52,3 @@ def correct_poses(stamps: Floats, poses: Floats, keyframe_stamps: Floats, before
     correction = after[first] @ inverse(before[first])
     at, _ = interpolate(known, correction, np.clip(stamps, known[0], known[-1]), np.inf)
     return at @ poses
-
-
-def turned_since(keyframes: Keyframes, assigned: Ints) -> Floats:
-    """Return the standard deviations (K,), rad, of the heading's drift between a keyframe and the nearest assigned one.
-
-    assigned: indices of keyframes with an assigned ray. The result is 0 with a localisation, and if no odometry connects the
-    keyframe with an assigned one.
-    """
-    since = np.full(len(keyframes.stamps), np.inf)
-    if keyframes.drift is None or keyframes.localized_every or len(assigned) == 0:
-        return np.zeros(len(since))
-    heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
-    stretch = np.zeros(len(since), dtype=np.int64) if keyframes.stretch is None else keyframes.stretch
-    known = np.unique(assigned)
-    after = np.minimum(np.searchsorted(known, np.arange(len(since))), len(known) - 1)
-    for end in (known[after], known[np.maximum(after - 1, 0)]):
-        linked = (stretch == stretch[end]) & (stretch >= 0)
-        since = np.minimum(since, np.where(linked, np.abs(heading - heading[end]), np.inf))
-    return np.sqrt(np.where(np.isfinite(since), since, 0.0))

@@ -62,10 +62,15 @@ def test_one_object_taken_as_two_may_be_one():
     mine = np.flatnonzero(objects == 4)
     later = objects.copy()
     later[mine[len(mine) // 2 :]] = count
-    found = only(reassociated(result, later))
+    doubtful = reassociated(result, later)
+    found = only(doubtful)
     assert (found.kind, set(found.objects)) == ("pair", {4, count})
     assert found.numbers["probability"] > 0.5
     assert set(found.rays) == set(mine)
+    before, after = (one.summary["assessment"] for one in (result, doubtful))
+    assert (before["level"], after["level"]) == ("good", "check")
+    assert after["reasons"][0].startswith("1 object may be a double")
+    assert after["reasons"][1:] == before["reasons"][1:]
 
 
 def test_objects_that_frames_show_together_are_two():

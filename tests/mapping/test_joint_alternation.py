@@ -9,8 +9,7 @@ import pytest
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
-from objslam.core.trajectory import turned_since
-from objslam.core.types import Association, Keyframes, Trajectory
+from objslam.core.types import Association, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
@@ -18,31 +17,6 @@ from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import seen_something
 from objslam.simulation import DepthNoise, preset, simulate
-
-
-def keyframes_with_drift(heading):
-    """Keyframes whose heading has gathered a variance (K,), rad^2."""
-    count = len(heading)
-    drift = np.zeros((count, 6, 6))
-    drift[:, 2, 2] = heading
-    poses = np.broadcast_to(np.eye(4), (count, 4, 4))
-    none = np.zeros(count, dtype=np.int64)
-    return Keyframes(np.arange(count, dtype=float), none, none, poses, poses, odom_T_base=poses, drift=drift)
-
-
-def test_drift_counts_from_the_nearest_keyframe_with_an_assigned_ray():
-    frames = keyframes_with_drift(np.array([0.0, 1.0, 2.0, 6.0, 7.0, 20.0]))
-    np.testing.assert_allclose(turned_since(frames, np.array([1, 4, 4])) ** 2, [1, 0, 1, 1, 0, 13])
-
-
-def test_no_drift_is_allowed_where_no_odometry_leads_to_an_assigned_ray():
-    frames = keyframes_with_drift(np.arange(4.0))
-    some = np.array([0])
-    assert not turned_since(frames, some[:0]).any()
-    assert not turned_since(replace(frames, drift=None), some).any()
-    assert not turned_since(replace(frames, localized_every=1.0), some).any()
-    parts = replace(frames, stretch=np.array([0, 0, 1, -1]))
-    np.testing.assert_allclose(turned_since(parts, some), [0, 1, 0, 0])
 
 
 def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry():
@@ -65,7 +39,7 @@ def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry
     first = state.alternated(mine.map_T_base, None).association
     cut = state.solve("association", replace(first, object=np.where(early, first.object, -1)))
     plain = cut.alternated(cut.estimate.map_T_base, (cut.association, cut.estimate.positions))
-    followed = cut.drift_followed()
+    followed = cut.relocalized()
     assert followed.association.count == 8
     assert followed.agree.all()
     assert plain.agree.mean() < 0.95
@@ -105,7 +79,7 @@ def taking_turns(monkeypatch, turns, errors=None):
         estimate = SimpleNamespace(weight=weight, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
         return replace(state, association=association, estimate=estimate)
 
-    monkeypatch.setattr(JointState, "_associate", lambda state, *_: turns[len(state.rounds)])
+    monkeypatch.setattr(JointState, "_associate", lambda state, *_, rough: turns[len(state.rounds)])
     monkeypatch.setattr(JointState, "merged", lambda state: state)
     monkeypatch.setattr(JointState, "solve", solve)
     return replace(begin, association=Association(np.full(30, -1), np.zeros(0, dtype=np.int64))), held

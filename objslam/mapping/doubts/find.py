@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from objslam.core.result import DOUBT_KINDS, RunResult
 from objslam.mapping.doubts.evidence import evidence_of
@@ -10,6 +11,9 @@ from objslam.mapping.doubts.groups import BoxGroups, find_groups
 from objslam.mapping.doubts.pairs import Pairs, find_pairs
 from objslam.mapping.doubts.splits import Splits, find_splits
 from objslam.mapping.doubts.words import in_words
+
+_DOUBLE = 0.5
+"""The probability from which a pair that may be one counts in the assessment. With a larger value, more maps are good."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +33,24 @@ def find_doubts(result: RunResult) -> Doubts:
 
 
 def with_doubts(result: RunResult) -> RunResult:
-    """Return the result with its doubts in words, and their counts by kind in the summary."""
+    """Return the result with its doubts in words, and their counts by kind in the summary. A map with objects that are more
+    likely doubles than not is not called good."""
     found = find_doubts(result)
     doubts = in_words(result, found.pairs, found.splits, found.groups)
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
-    return replace(result, doubts=doubts, summary={**result.summary, "doubts": counts})
+    summary = {**result.summary, "doubts": counts}
+    doubles = int((found.pairs.probability >= _DOUBLE).sum())
+    if doubles and "assessment" in summary:
+        summary["assessment"] = _assessed(summary["assessment"], doubles)
+    return replace(result, doubts=doubts, summary=summary)
+
+
+def _assessed(assessment: dict[str, Any], doubles: int) -> dict[str, Any]:
+    """Return the assessment of a map that may have doubles."""
+    if assessment["level"] == "bad":
+        return assessment
+    reason = f"{doubles} objects may be doubles of neighbours: `objslam explain` names them."
+    if doubles == 1:
+        reason = "1 object may be a double of a neighbour: `objslam explain` names it."
+    others = assessment["reasons"][assessment["level"] == "good" :]  # The first reason of a good map praises it.
+    return {**assessment, "level": "check", "reasons": [reason, *others]}

@@ -1,0 +1,89 @@
+"""Find the most likely path of a robot through a map of landmarks, when each ray may belong to any landmark.
+
+A path that is bent onto wrong landmarks fits them well, so no small change of it or of one ray helps. This search is global:
+it moves whole visits from landmarks to their neighbours. It is Markov localisation on a grid (Fox, Burgard and Thrun 1999).
+The states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays tell how well a state
+fits the map, and the odometry tells how well the states of two stretches fit together. Dynamic programming finds the most
+likely states of all stretches (Viterbi 1967).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.association.path_search.ray_costs import MapLandmarks, Sight
+from objslam.association.path_search.state_grid import Grid, stretches
+from objslam.association.path_search.viterbi import Motions, most_likely_states
+from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import lift_se2
+from objslam.core.trajectory import correct_poses
+from objslam.core.types import Keyframes, Rays
+
+_STEPS_APART = 4.0
+"""The number of grid steps between neighbouring landmarks of one label. With a larger number, the grid is finer and reaches
+less far: it reaches `_SHIFTS` / `_STEPS_APART` neighbours."""
+_MOST_TURN = np.radians(1.0)
+"""The largest grid step (rad) in yaw. The step of shifts is this turn at the median distance of landmarks. A larger value
+reaches farther: the heading of a solved path errs by 14 degrees at most."""
+
+
+@dataclass(frozen=True)
+class LikelyPath:
+    """The most likely path. map_T_base: (K, 4, 4). turn, shift: rad and m, about the standard deviations of its poses,
+    because of the steps of the grid."""
+
+    map_T_base: Floats
+    turn: float
+    shift: float
+
+    @property
+    def pose_covariance(self) -> Floats:
+        """(6, 6) of each pose, rotation first."""
+        return np.diag([self.turn**2] * 3 + [self.shift**2] * 3)
+
+
+def most_likely_path(
+    keyframes: Keyframes, rays: Rays, map_T_base: Floats, positions: Floats, label: Ints, rate: Floats
+) -> LikelyPath | None:
+    """Return the most likely path through a map, None if no label has two landmarks to confuse.
+
+    Corrections are planar, as the drift of wheels, and reach a few neighbouring landmarks far. A landmark that is rarely
+    detected costs more, so a second copy of a landmark loses its rays. Frames may give two rays to one landmark.
+
+    keyframes: with odometry. map_T_base: (K, 4, 4) the present path. positions, label: (N, 3) m and (N,) of the landmarks,
+    NaN without a position. rate: (N,) the share of the frames in view of each landmark that detect it.
+    """
+    known = np.flatnonzero(np.isfinite(positions[:, 0]) & (rate > 0))
+    spacing = _spacing(positions[known], label[known])
+    if not len(rays) or not np.isfinite(spacing):
+        return None
+    origin, direction = rays.in_map(map_T_base @ keyframes.base_T_camera)
+    nearest = np.linalg.norm(positions[known] - origin[:, None], axis=2).min(axis=1)
+    distance = float(np.median(np.where(np.isfinite(rays.range), rays.range, nearest)))
+    turn = min(max(spacing / _STEPS_APART / distance, float(np.median(rays.sigma))), _MOST_TURN)
+    grid = Grid(turn * distance, turn)
+    stretch = stretches(keyframes, grid)
+    bounds = np.searchsorted(stretch, np.arange(stretch[-1] + 2))
+    middle = (bounds[:-1] + bounds[1:] - 1) // 2
+    base = map_T_base[middle]
+    pivot = base[:, :3, 3]
+    sight = Sight(rays, origin, direction, stretch[rays.keyframe], pivot, grid)
+    landmarks = MapLandmarks(positions[known], label[known], -2 * np.log(rate[known] / rate[known].max()))
+    best = most_likely_states(Motions.of(keyframes, middle, base, grid), sight.costs(landmarks), grid)
+    correction = lift_se2(best)
+    correction[:, :3, 3] += pivot - np.einsum("gij,gj->gi", correction[:, :3, :3], pivot)
+    path = correct_poses(keyframes.stamps, map_T_base, keyframes.stamps[middle], base, correction @ base)
+    return LikelyPath(path, grid.turn / 2, grid.shift / 2)
+
+
+def _spacing(positions: Floats, label: Ints) -> float:
+    """Return the median distance (m) from a landmark to the nearest other one of its label, inf without any two."""
+    from scipy.spatial import cKDTree
+
+    nearest = [np.zeros(0)]
+    for one in np.unique(label):
+        mine = positions[label == one]
+        if len(mine) > 1:
+            nearest.append(np.asarray(cKDTree(mine).query(mine, k=2)[0])[:, 1])
+    each = np.concatenate(nearest)
+    return float(np.median(each)) if len(each) else np.inf

@@ -1,0 +1,96 @@
+"""The most likely states of all stretches of a path, by dynamic programming (Viterbi 1967)."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from objslam.association.path_search.state_grid import Cells, Grid
+from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import adjoint, inverse, log_se3
+from objslam.core.types import Keyframes
+
+_LEAST_DRIFT = 0.6
+"""The least standard deviation of the drift between two stretches, in grid steps. Below half a step, states could not follow
+a slow drift. A larger value trusts the odometry less."""
+_SLIP = 20.0
+"""The largest cost of a motion, in squared deviations, because wheels can slip more than a Gaussian allows. A larger value
+lets fewer motions disagree with the odometry."""
+_LEVELS = 250
+"""The number of levels between 0 and `_SLIP` at which costs are stored, one byte each. A larger number is more exact."""
+
+
+@dataclass(frozen=True)
+class Motions:
+    """The motions between G stretches. error: (G - 1, 3) of the present path against the odometry in x, y (m) and yaw (rad),
+    along the axes of map. variance: (G - 1, 3) that the odometry lets it have. way: (G - 1, 2) m, from pivot to pivot."""
+
+    error: Floats
+    variance: Floats
+    way: Floats
+
+    @classmethod
+    def of(cls, keyframes: Keyframes, middle: Ints, base: Floats, grid: Grid) -> Self:
+        """Compare the path at keyframes `middle` (G,), base (G, 4, 4), with the odometry."""
+        assert keyframes.drift is not None
+        assert keyframes.odom_T_base is not None
+        odometry = keyframes.odom_T_base[middle]
+        measured, moved = (inverse(poses[:-1]) @ poses[1:] for poses in (odometry, base))
+        twist = log_se3(inverse(measured) @ moved)
+        to_base = adjoint(inverse(odometry[1:]))
+        drift = to_base @ np.diff(keyframes.drift[middle], axis=0) @ np.swapaxes(to_base, 1, 2)
+        turn = base[1:, :3, :3]
+        shift = np.einsum("gij,gj->gi", turn, twist[:, 3:])[:, :2]
+        spread = np.diagonal(turn @ drift[:, 3:, 3:] @ np.swapaxes(turn, 1, 2), axis1=1, axis2=2)[:, :2]
+        least = (_LEAST_DRIFT * np.array([grid.shift, grid.shift, grid.turn])) ** 2
+        return cls(
+            error=np.column_stack([shift, np.einsum("gj,gj->g", turn[:, 2], twist[:, :3])]),
+            variance=np.maximum(np.column_stack([spread, drift[:, 2, 2]]), least),
+            way=np.diff(base[:, :2, 3], axis=0),
+        )
+
+    def costs(self, k: int, grid: Grid) -> tuple[Cells, Cells, Cells]:
+        """Return the costs of motion `k` by x (Y, X, X), by y (Y, X, X) and by yaw (Y, Y). The last two axes are the states
+        before and after. The drift in x, y and yaw counts as independent."""
+        before, after = grid.shifts[:, None], grid.shifts
+        cos, sin, way = np.cos(grid.turns) - 1, np.sin(grid.turns), self.way[k]
+        carried = cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]  # A turn about one pivot shifts the next one.
+        x, y = (
+            (after - before - carried[axis][:, None, None] + self.error[k, axis]) ** 2 / self.variance[k, axis]
+            for axis in (0, 1)
+        )
+        yaw = (grid.turns - grid.turns[:, None] + self.error[k, 2]) ** 2 / self.variance[k, 2]
+        return x.astype(np.float32), y.astype(np.float32), yaw.astype(np.float32)
+
+
+def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> Floats:
+    """Return the states (G, 3) of x, y (m) and yaw (rad) with the least total cost. costs: (Y, X, X) of each stretch.
+
+    No state on the best path costs `_SLIP` more than the best state of its stretch, because a slip from there costs less. So
+    a byte stores the cost above the best one.
+    """
+    stored, total = list[NDArray[np.uint8]](), np.zeros(0, dtype=np.float32)
+    for k, seen in enumerate(costs):
+        if k:
+            x, y, yaw = motions.costs(k - 1, grid)
+            total = (total[:, :, None, :] + x[:, :, :, None]).min(axis=1)
+            total = (total[:, :, :, None] + y[:, None, :, :]).min(axis=2)
+            total = (total[:, None] + yaw[:, :, None, None]).min(axis=0)
+            total = np.minimum(total, _SLIP) + seen
+        else:
+            total = seen
+        total = total - total.min()
+        stored.append(np.minimum(np.rint(total * (_LEVELS / _SLIP)), _LEVELS + 1).astype(np.uint8))
+    found = np.zeros((len(stored), 3))
+    at = np.unravel_index(np.argmin(total), total.shape)
+    for k in range(len(stored) - 1, -1, -1):
+        found[k] = grid.shifts[at[1]], grid.shifts[at[2]], grid.turns[at[0]]
+        if k:
+            x, y, yaw = motions.costs(k - 1, grid)
+            before = stored[k - 1] * np.float32(_SLIP / _LEVELS)
+            from_there = before + x[:, :, at[1], None] + y[:, None, :, at[2]] + yaw[:, at[0], None, None]
+            slipped = from_there.min() > _SLIP
+            at = np.unravel_index(np.argmin(before if slipped else from_there), before.shape)
+    return found

@@ -1,0 +1,163 @@
+"""Joint mode: where the rounds of association and solve begin, and which of their results counts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.association.nearest_neighbour import associate_by_label
+from objslam.core.geometry import inverse
+from objslam.core.noise import NoiseFactors
+from objslam.core.types import Association
+from objslam.frontend.turning_clocks import clocks_of_turns
+from objslam.mapping.joint_alternation import JointState
+from objslam.mapping.labels import (
+    angles_to_objects,
+    clock_explains,
+    labels_tell,
+    may_be_by_label,
+    noise_explains,
+    shows_second_object,
+    warn_of_noise,
+)
+
+if TYPE_CHECKING:
+    from objslam.core.estimate import Estimate
+    from objslam.graph.init_unknown_correspondences import InitialEstimate
+
+_NOISIER = 1.5
+"""The factor on the noise of rays or odometry, found by a solve, above which a looser odometry is tried as well.
+A larger factor explores fewer logs twice."""
+_CLEAR = 0.95
+"""The share of agreeing rays above which a log is not explored again, whatever its noise. A larger share explores more logs
+twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: a
+real robot in a forest has its log explored twice for nothing."""
+_LOOSE = 3.0
+"""The factor on the noise of the odometry in the second exploration, if the solve found only the rays to be noisy. A larger
+factor suits worse odometry, and loses more objects of good odometry."""
+
+
+def solve_joint(
+    state: JointState, start: InitialEstimate | None
+) -> tuple[Association, Estimate, tuple[dict[str, int], ...]]:
+    """Associate and solve a log, and return the association, the estimate, and the counts of each round.
+
+    start: a known start. With it, the log is not explored, and labels are not trusted.
+    """
+    state = _with_clocks(state)
+    if start is None and may_be_by_label(state.settings, state.all_rays):
+        state, agree = _by_label(state)
+        if agree and state.settings.association.method == "auto":
+            state, agree = _with_doubles(state)
+        if agree:
+            assert state.association is not None
+            assert state.estimate is not None
+            return state.association, state.estimate, ()
+        state = replace(state, association=None, estimate=None)
+    if start is not None or state.keyframes.localized_every:
+        state = _from_start(state, start).relocalized()
+    else:
+        explored = _from_start(*_explored(state))
+        state, noisier = explored.relocalized(), _with_loose_odometry(explored)
+        if noisier is not None:
+            state = state.better(_from_start(*_explored(noisier)).relocalized())
+    if not state.settled:
+        rounds = state.settings.joint.max_rounds
+        state.ledger.warn(f"the association still changes after {rounds} rounds (joint.max_rounds)")
+    assert state.association is not None
+    if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
+        state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
+    assert state.association is not None
+    assert state.estimate is not None
+    return state.association, state.estimate, state.rounds
+
+
+def _with_clocks(state: JointState) -> JointState:
+    """Return the state that begins at the clocks which the robot's turns show."""
+    if state.errors is None or state.theta is not None:
+        return state
+    theta = clocks_of_turns(state.errors)
+    keyframes, rays, _ = state.errors.at(theta)
+    return replace(state, theta=theta, keyframes=keyframes, rays=rays)
+
+
+def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
+    """Return the state after rounds from a start, or from the poses of the keyframes."""
+    map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
+    guess = None if start is None else (start.association, start.positions)
+    return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
+
+
+def _by_label(state: JointState) -> tuple[JointState, bool]:
+    """Return the state with one object per label, and whether the rays agree with it. If they disagree at a few labels only,
+    the shared errors and the noise of the state are still better than the nominal values."""
+    association, errors = associate_by_label(state.rays), state.errors
+    solved = state.solve("labels", association)
+    assert solved.estimate is not None
+    if state.settings.association.method == "by_label" or labels_tell(association, solved.estimate):
+        return solved, True
+    if solved.errors is None or errors is None:
+        return solved, False
+    noisier = noise_explains(association, solved.estimate, solved.errors, partial(solved.solve_once, association))
+    if noisier is not None:
+        warn_of_noise(solved.errors, noisier, state.ledger)
+        return solved.solve("labels", association, noisier.map_T_base @ solved.keyframes.base_T_camera), True
+    begin = clock_explains(association, errors, lambda at: solved.solve_once(association, errors, begin=at))
+    if begin is None:
+        return solved, False
+    return replace(solved, errors=errors, theta=begin).solve("labels", association), True
+
+
+def _with_doubles(state: JointState) -> tuple[JointState, bool]:
+    """Return the state of one object per label with the nearest box of each label and keyframe, and whether the other boxes
+    show no second object of any label."""
+    assert state.association is not None
+    assert state.estimate is not None
+    if (state.association.object >= 0).all():
+        return state, True
+    nearest = associate_by_label(state.rays, angles_to_objects(state.rays, state.estimate, state.solved_poses))
+    if not np.array_equal(nearest.object, state.association.object):
+        state = state.solve("labels", nearest, state.solved_poses)
+    assert state.estimate is not None
+    solved = state.rays, nearest, state.estimate, state.keyframes, state.solved_poses
+    return state, not shows_second_object(*solved, state.settings)
+
+
+def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
+    """Explore a log without a localisation. Return the state and a first association. If the filter for logs with ranges is
+    sure of the association, the state is solved with it and holds the shared errors."""
+    from objslam.graph import ekf_exploration
+    from objslam.graph.init_unknown_correspondences import initialize_unknown
+
+    exploring = partial(state.progress, "explore")
+    start: InitialEstimate | None = None
+    if np.isfinite(state.rays.range).any():
+        start = ekf_exploration.explore(state.keyframes, state.rays, state.settings, exploring, state.errors)
+    if start is None or not ekf_exploration.is_sure(start):
+        return state, initialize_unknown(state.keyframes, state.rays, state.cameras, state.settings, exploring)
+    solved = state.solve("association", start.association)
+    assert solved.estimate is not None
+    start = replace(start, map_T_camera=solved.solved_poses, positions=solved.estimate.positions)
+    return replace(solved, hold=True, association=None), start
+
+
+def _with_loose_odometry(state: JointState) -> JointState | None:
+    """Return an attempt with the noise of the odometry that the last solve suggests.
+
+    None if this noise is about nominal, if the settings fix it, or if nearly all rays agree. The solve finds this noise, but
+    the exploration needs it before. A wrong map can hide it in the noise of the rays.
+    """
+    if state.errors is None or "odometry" not in state.errors.unknown_noise or state.agree.mean() >= _CLEAR:
+        return None
+    found, values = state.errors.noise, state.theta
+    if max(found.along, found.turning) <= _NOISIER:
+        if found.rays <= _NOISIER:
+            return None
+        found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), None
+    errors = state.errors.with_noise(replace(found, shrinkage=0.0))
+    keyframes, rays, _ = errors.at(errors.mean if values is None else values)
+    unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
+    return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)

@@ -1,0 +1,140 @@
+"""The most likely path: visits that were matched one post aside come back, and copies of posts lose their rays."""
+
+import numpy as np
+import pytest
+
+from objslam.association.path_search.most_likely_path import most_likely_path
+from objslam.core.geometry import inverse, lift_se2
+from objslam.core.types import Keyframes, Rays
+
+BASE_T_CAMERA = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
+TURN, RANGE = 0.006, 0.05  # rad, m: the noise of the rays
+YAW_STEP, STEP = 0.01, 0.01  # rad, m: the noise of the odometry from keyframe to keyframe
+
+
+def rows_of_posts():
+    """Four rows of three posts, 0.25 m apart, around a room of 6 x 6 m: (12, 3) m."""
+    row = np.array([[0.0, -0.25], [0.0, 0.0], [0.0, 0.25]])
+    places = []
+    for angle in np.arange(4) * np.pi / 2:
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        places.append((row + np.array([3.0, 0.0])) @ turn.T)
+    return np.column_stack([np.concatenate(places), np.full(12, 0.3)])
+
+
+def drive(rng, posts, ranges=True, labels=1):
+    """Return true poses (K, 4, 4) of a robot that turns three times, its keyframes, its rays, and the post of each ray."""
+    count = 144
+    yaw = np.linspace(0.0, 6 * np.pi, count)
+    place = 0.3 * np.column_stack([np.cos(yaw / 3), np.sin(yaw / 3)])
+    true = lift_se2(np.column_stack([place, yaw]))
+    noise = rng.normal(0, 1, (count - 1, 3)) * [STEP, STEP, YAW_STEP]
+    steps = inverse(true[:-1]) @ true[1:] @ lift_se2(noise)
+    odometry = [true[0]]
+    for step in steps:
+        odometry.append(odometry[-1] @ step)
+    variance = np.zeros((count, 6, 6))
+    variance[:, [2, 3, 4], [2, 3, 4]] = np.arange(count)[:, None] * np.array([YAW_STEP, STEP, STEP]) ** 2
+    none = np.zeros(count, dtype=np.int64)
+    keyframes = Keyframes(
+        np.arange(count, dtype=float),
+        none,
+        np.arange(count),
+        np.broadcast_to(BASE_T_CAMERA, (count, 4, 4)),
+        np.stack(odometry),
+        odom_T_base=np.stack(odometry),
+        drift=variance,
+    )
+    poses = true @ BASE_T_CAMERA
+    local = np.einsum("kji,knj->kni", poses[:, :3, :3], posts - poses[:, None, :3, 3])
+    seen, whose = np.nonzero(local[..., 2] > 0.8 * np.linalg.norm(local, axis=2))
+    to = local[seen, whose]
+    distance = np.linalg.norm(to, axis=1)
+    direction = to / distance[:, None] + rng.normal(0, TURN, to.shape)
+    size = len(seen)
+    rays = Rays(
+        keyframe=seen,
+        direction=direction / np.linalg.norm(direction, axis=1, keepdims=True),
+        sigma=np.full(size, TURN),
+        range=distance + rng.normal(0, RANGE, size) if ranges else np.full(size, np.nan),
+        range_sigma=np.full(size, RANGE),
+        range_bias=np.zeros(size),
+        label=whose % labels,
+        score=np.ones(size),
+        box=np.zeros((size, 4)),
+        track_id=np.full(size, -1),
+        label_names=tuple(f"post {i}" for i in range(labels)),
+    )
+    return true, keyframes, rays, whose
+
+
+def one_post_aside(true):
+    """The path, of which the second round is turned by the angle between two posts."""
+    wrong = true.copy()
+    second = slice(len(true) // 3, 2 * len(true) // 3)
+    wrong[second] = lift_se2(np.array([0.0, 0.0, np.arctan2(0.25, 3.0)])) @ true[second]
+    return wrong
+
+
+def right(rays, poses, posts, whose):
+    """Return the share of rays to which their own post is the nearest."""
+    origins, directions = rays.in_map(poses @ BASE_T_CAMERA)
+    to = posts - origins[:, None]
+    off = np.linalg.norm(np.cross(to, directions[:, None]), axis=2) + 10.0 * (np.einsum("rnk,rk->rn", to, directions) < 0)
+    return (off.argmin(axis=1) == whose).mean()
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_visit_one_post_aside_comes_back(seed, ranges):
+    posts = rows_of_posts()
+    true, keyframes, rays, whose = drive(np.random.default_rng(seed), posts, ranges)
+    wrong = one_post_aside(true)
+    found = most_likely_path(keyframes, rays, wrong, posts, np.zeros(12, dtype=np.int64), np.ones(12))
+    assert right(rays, wrong, posts, whose) < 0.8
+    assert right(rays, found.map_T_base, posts, whose) > 0.98
+    left = inverse(true) @ found.map_T_base
+    assert np.median(np.abs(np.arctan2(left[:, 1, 0], left[:, 0, 0]))) < 2 * found.turn
+    assert np.median(np.linalg.norm(left[:, :2, 3], axis=1)) < 2 * found.shift
+
+
+def test_copies_of_posts_that_are_rarely_detected_lose_their_rays():
+    """A wrong visit has made copies of all posts, which explain it without any deviation."""
+    posts = rows_of_posts()
+    true, keyframes, rays, whose = drive(np.random.default_rng(0), posts)
+    wrong = lift_se2(np.array([0.0, 0.0, 0.04])) @ true
+    wrong = np.where((np.arange(len(true)) % 48 < 8)[:, None, None], wrong, true)  # Eight keyframes of each round.
+    copies = posts @ lift_se2(np.array([0.0, 0.0, 0.04]))[:3, :3].T
+    both, label = np.concatenate([posts, copies]), np.zeros(24, dtype=np.int64)
+    assert right(rays, wrong, both, whose) < 0.9
+    found = most_likely_path(keyframes, rays, wrong, both, label, np.repeat([0.9, 0.1], 12))
+    assert right(rays, found.map_T_base, both, whose) > 0.98
+    equal = most_likely_path(keyframes, rays, wrong, both, label, np.ones(24))
+    assert right(rays, equal.map_T_base, both, whose) < right(rays, found.map_T_base, both, whose)
+
+
+def test_a_ray_belongs_to_a_landmark_of_its_label():
+    posts = rows_of_posts()
+    true, keyframes, rays, whose = drive(np.random.default_rng(0), posts, labels=3)
+    wrong, ones = one_post_aside(true), np.ones(12)
+    found = most_likely_path(keyframes, rays, wrong, posts, np.arange(12) % 3, ones)
+    assert right(rays, found.map_T_base, posts, whose) > 0.98
+    swapped = most_likely_path(keyframes, rays, wrong, posts, (np.arange(12) + 1) % 3, ones)
+    assert right(rays, swapped.map_T_base, posts, whose) < 0.5
+
+
+def test_without_two_landmarks_of_a_label_there_is_nothing_to_search():
+    posts = rows_of_posts()
+    true, keyframes, rays, _ = drive(np.random.default_rng(0), posts, labels=12)
+    assert most_likely_path(keyframes, rays, true, posts, np.arange(12), np.ones(12)) is None
+    lost = np.where(np.arange(12)[:, None] > 0, np.nan, posts)
+    assert most_likely_path(keyframes, rays, true, lost, np.zeros(12, dtype=np.int64), np.ones(12)) is None
+
+
+def test_rays_taken_in_parts_give_the_same_path(monkeypatch):
+    posts = rows_of_posts()
+    true, keyframes, rays, _ = drive(np.random.default_rng(1), posts)
+    ask = keyframes, rays, one_post_aside(true), posts, np.zeros(12, dtype=np.int64), np.ones(12)
+    whole = most_likely_path(*ask)
+    monkeypatch.setattr("objslam.association.path_search.ray_costs._RAYS_AT_ONCE", 7)
+    np.testing.assert_array_equal(most_likely_path(*ask).map_T_base, whole.map_T_base)
