@@ -37,4 +37,5 @@ class CalibrationSettings(Section):
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
     focal: NotNegative = 0.0
-    """share by which the focal length of each camera is too long or too short."""
+    """share by which the focal length of each camera is too long or too short. If it is not set, and the checks of a fixed
+    run find a wrong focal length, the run estimates it with 0.05."""
