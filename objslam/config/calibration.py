@@ -40,4 +40,5 @@ class CalibrationSettings(Section):
     """share by which all fiducials of a given size are smaller or larger than the settings say. A printer, a ruler, the lens
     and the detector of the corners each add to it. It is estimated in joint mode only."""
     focal: NotNegative = 0.0
-    """share by which the focal length of each camera is too long or too short."""
+    """share by which the focal length of each camera is too long or too short. If it is not set, and the checks of a fixed
+    run find a wrong focal length, the run estimates it with 0.05."""

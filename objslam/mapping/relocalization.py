@@ -32,6 +32,8 @@ def relocalize(
     Objects stay as they are, but may lose all their rays. None if no label has two objects to confuse.
     """
     position = estimate.positions
+    if not len(position):
+        return None
     held = np.where((estimate.weight > 0) & np.isfinite(position[:, 0])[association.object], association.object, -1)
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, rays.sigma, 0.0)

@@ -10,7 +10,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.noise import NoiseFactors
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.mapping import pipeline
+from objslam.mapping import pipeline, refuted
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
@@ -86,6 +86,29 @@ def names(log):
 def room(seed, **changes):
     noise = {"pixel_sigma": 2.0, "missed": 0.1, "false": 0.01, "odometry": Odometry(), "localization": None}
     return simulate(preset("demo", **{"objects": 10, "classes": 10, "frames": 300, **noise, **changes}), seed)
+
+
+@pytest.mark.parametrize(
+    ("noise", "corrected", "kept"),
+    [
+        (NoiseFactors(rays=10.5, along=20.0), NoiseFactors(along=2.9), True),  # a MRCLAM robot with the identity for a mount
+        (NoiseFactors(rays=4.7), NoiseFactors(rays=0.7, along=5.2), True),  # a simulated robot with six times the drift
+        (NoiseFactors(rays=1.0, along=3.0), NoiseFactors(along=2.9), False),  # a path that bends as much
+        (NoiseFactors(rays=10.5, along=20.0), NoiseFactors(rays=3.0), False),  # boxes that do not fit either
+    ],
+)
+def test_bad_wheels_do_not_refute_a_wrong_mount(clean, monkeypatch, noise, corrected, kept):
+    """The corrected log explains the boxes, but only with noisy odometry, because the robot has noisy odometry."""
+    frames = build_keyframes(clean, SETTINGS, Ledger())
+    rays = build_rays(clean, frames, SETTINGS, Ledger())
+    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
+    half = np.where(np.arange(len(rays)) % 2 == 0, solution.estimate.weight, 0.0)
+    wrong = replace(solution, estimate=replace(solution.estimate, weight=half, noise=noise))
+    other = replace(solution, estimate=replace(solution.estimate, noise=corrected))
+    monkeypatch.setattr(refuted, "_solved", lambda *_: other)
+    trial = Trial(Hypothesis("mount", "the mount set", "the mount is not set", lambda log: log), 1.0, 1.0, None)
+    found = Diagnosis((Finding("mount", "the mount is not set", basis="boxes"),), (trial,))
+    assert bool(without_refuted(found, wrong, clean, SETTINGS, nothing).findings) == kept
 
 
 def test_objects_that_one_half_sees_under_little_parallax_are_no_mistake():

@@ -28,11 +28,13 @@ _LONG = 200
 def check_boxes(log: Log, ledger: Ledger) -> list[Finding]:
     """Return the findings about the boxes of a log, from their corners alone.
 
-    ledger: of the reading of the log, because a reader drops the boxes that have no area.
+    ledger: of the reading of the log, because most readers drop the boxes that have no area.
     """
     found: list[Finding] = []
-    flat = ledger.dropped.get(NO_AREA, 0)
-    boxes = flat + sum(len(c.detections) for c in log.cameras if c.detections is not None)
+    read = [c.detections.boxes for c in log.cameras if c.detections is not None]
+    dropped = ledger.dropped.get(NO_AREA, 0)
+    boxes = dropped + sum(map(len, read))
+    flat = dropped + sum(int((b[:, 2:] <= b[:, :2]).any(axis=1).sum()) for b in read)
     if boxes >= _FEWEST and flat > _WITHOUT_AREA * boxes:
         found.append(
             Finding(

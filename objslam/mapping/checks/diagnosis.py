@@ -1,7 +1,7 @@
 """Run all checks of the input of a log: the checks of the log itself, and the checks of how well its boxes agree."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from objslam.frontend.known_errors import coarse, estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.gain import gain_in_sigmas
 from objslam.mapping.checks.halves import check_halves
 from objslam.mapping.checks.hypotheses import later
 from objslam.mapping.checks.mixture import check_mixture
@@ -26,7 +27,10 @@ from objslam.mapping.checks.trials import Trial, crooked, try_hypotheses, verdic
 from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
-"""If fewer than this share of the boxes fit, a run tries hypotheses. A larger share costs more runs a few seconds."""
+"""A run tries hypotheses if the score (`Agreement.score`) at poses of a localisation is below this. With wrong input, most
+boxes may still fit, but only with several points for each thing, and each point costs a part of the score. Poses by odometry
+need a point for each thing in each window, so their share of fitting boxes is compared instead. A larger value costs more
+runs a few seconds."""
 _FITTING = 0.82
 """If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9. A
 larger value costs more runs a few seconds."""
@@ -52,18 +56,23 @@ _GAIN_MOVED = 0.03
 _GAIN = 0.02
 """The least growth of the score by a clock offset of `_CLOCKS`, and by the removal of the errors that the run does not
 estimate. A larger value reports fewer errors."""
+_SURE = 4.0
+"""The least gain of the fit by the removal of these errors, in standard deviations, if the score grows by less than `_GAIN`.
+Exact boxes fit anyway, so their score hardly grows. A larger value reports fewer errors."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
     """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
 
-    errors: small errors of the calibration that a run does not correct, None if there are none.
+    errors: small errors of the calibration that a run does not correct, None if there are none. priors: the standard
+    deviations, by settings of `calibration`, with which a run estimates small errors that the settings keep at 0.
     """
 
     findings: tuple[Finding, ...] = ()
     trials: tuple[Trial, ...] = ()
     errors: SmallErrors | None = None
+    priors: dict[str, float] = field(default_factory=dict)
 
     @property
     def spoilt(self) -> bool:
@@ -83,6 +92,10 @@ class Diagnosis:
     def refutable(self) -> bool:
         """Whether a solve that explains the boxes may refute one of the findings."""
         return any(finding.basis != "log" for finding in self.findings)
+
+    def settings_of(self, settings: Settings) -> Settings:
+        """Return the settings of a run that estimates the errors of `priors`."""
+        return settings.model_copy(update={"calibration": settings.calibration.model_copy(update=self.priors)})
 
     def with_findings(self, more: Sequence[Finding]) -> Self:
         """Return the diagnosis with more findings."""
@@ -106,7 +119,9 @@ def diagnose(
     stamps = check_stamps(log)
     if stamps is not None and stamps.spoils:
         raise LogError(stamps.message, where=log.name, hint="write all stamps in s")
-    findings = [*([stamps] if stamps else []), *check_path(log), *check_boxes(log, ledger)]
+    of_path = check_path(log)
+    impossible = any(finding.spoils for finding in of_path)
+    findings = [*([stamps] if stamps else []), *of_path, *check_boxes(log, ledger)]
     if not any(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None):
         return Diagnosis(tuple(findings))
     part = bounded_part(log, settings)
@@ -116,32 +131,56 @@ def diagnose(
     trials: list[Trial] = []
     if part.boxes >= _FEWEST:
         odd = bool(findings) or crooked(log) or _misfits(part, found, settings)
-        if odd or thorough:
+        if thorough or (odd and not impossible):
             trials = try_hypotheses(part, log, found, settings, progress)
-            named = verdict(trials, part)
+            named = None if impossible else verdict(trials, part, _corrected_score(part, found, settings))
             if named is not None:
                 return Diagnosis((named, *findings), tuple(trials))
     errors: SmallErrors | None = None
+    priors: dict[str, float] = {}
+    if impossible:  # Boxes at such poses agree with anything by chance.
+        return Diagnosis(tuple(findings), tuple(trials))
     if found is not None and part.boxes >= _FEWEST:
         mixed = check_mixture(found, part)
         findings += [mixed] if mixed else _halves(part, found, settings)
         if not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
             if errors is not None:
+                priors = errors.own_priors(settings)
                 cause = f"at the given poses the boxes fit best with {errors.in_words()}: {errors.causes()}"
+                how = "a run estimates it" if priors else f"{errors.remedy(settings)} estimates it"
                 # The objects get the covariance that such an error causes.
-                findings.append(Finding("calibration", f"{cause} ({errors.remedy(settings)} estimates it)", spoils=False))
+                findings.append(Finding("calibration", f"{cause} ({how})", spoils=False))
         ranges = check_ranges(found, part)
         findings += [ranges] if ranges else []
-    return Diagnosis(tuple(findings), tuple(trials), errors)
+    return Diagnosis(tuple(findings), tuple(trials), None if priors else errors, priors)
 
 
 def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
     """Return whether few boxes fit, whether the fitting boxes fit poorly, or whether another clock fits better."""
-    if found is None or found.share < _ALARM or found.fit.sum() < _FITTING * (found.point >= 0).sum():
+    if found is None or (found.share if part.drifts else found.score) < _ALARM:
+        return True
+    if found.fit.sum() < _FITTING * (found.point >= 0).sum():
         return True
     trials = agreements(part, (later(part.log, offset) for offset in _ALARM_CLOCKS), settings)
     return any(trial is not None and trial.score > found.score for trial in trials)
+
+
+def _corrected_score(part: Part, found: Agreement | None, settings: Settings) -> float:
+    """Return the score of a log without the small errors that a run in this mode estimates from given poses, 0 if there are
+    none."""
+    estimated = _estimated(part, settings)
+    if found is None or part.drifts or settings.mode == "joint" or not estimated:
+        return 0.0
+    errors = find_small_errors(part.log, found, settings, pose_noise(part, settings))
+    after = None if errors is None else agreement(part, errors.corrected(part.log, estimated), settings)
+    return 0.0 if after is None else after.score
+
+
+def _estimated(part: Part, settings: Settings) -> frozenset[str]:
+    """Return the names of the errors that a run estimates."""
+    wanted = estimates(settings, part.log.odometry is not None, part.log.localization is not None)
+    return frozenset(possible(part.log, settings) if wanted else ())
 
 
 def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErrors | None:
@@ -161,16 +200,17 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
         errors = with_clock(errors, best, part.log, found, settings)
     if errors is None:
         return None
-    localized = part.log.localization is not None
-    estimated = estimates(settings, part.log.odometry is not None, localized)
-    errors = replace(errors, estimated=frozenset(possible(part.log, settings) if estimated else ()))
+    errors = replace(errors, estimated=_estimated(part, settings))
     if not errors.harmful:
         return None
     # What the run corrects itself is no reason for a warning. Only what the harmful errors explain beyond it counts.
     corrected = errors.corrected(part.log, errors.estimated), errors.corrected(part.log)
     before, after = agreements(part, corrected, settings)
     least = found.score if before is None else max(found.score, before.score)
-    return errors if after is not None and after.score > least + _GAIN else None
+    if after is None or after.score <= least:
+        return None
+    sure = gain_in_sigmas(found if before is None else before, after) > _SURE
+    return errors if sure or after.score > least + _GAIN else None
 
 
 def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:

@@ -14,7 +14,10 @@ FASTEST = 40.0
 """The typical speed (m/s) above which poses are not in metres: the speed of a car on a motorway. A larger speed warns less
 often."""
 _FASTEST_TURN = 8.0
-"""The typical turn rate (rad/s) above which headings are not in radians. A larger rate warns less often."""
+"""The turn rate (rad/s) above which headings are not in radians, if the moving robot exceeds it in a tenth of its steps. A
+larger rate warns less often."""
+_TURN_TIME = 0.1
+"""The time (s) over which turn rates are measured. A longer time suits noisy headings, and hides short turns."""
 _JUMP = 5.0
 """The speed (m/s) above which a step of an otherwise slow path may be a jump. It equals live.max_speed."""
 _JUMP_TURN = 20.0
@@ -88,7 +91,7 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
     if moving.sum() < _FEWEST_STEPS:
         return
     speed, rate = way / seconds, angle / seconds
-    usual, usual_rate = float(np.median(speed[moving])), float(np.median(rate[moving]))
+    usual, turning = float(np.median(speed[moving])), float(np.quantile(_turn_rates(path)[moving], 0.9))
     if usual > FASTEST:
         unit = "the positions are probably in mm instead of m" if usual < 1e4 else "the stamps are probably not in s"
         yield Finding(
@@ -96,10 +99,10 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
             f"the {name} moves at {usual:.0f} m/s, which no robot does: {unit}",
         )
         return
-    if usual_rate > _FASTEST_TURN:
+    if turning > _FASTEST_TURN:
         yield Finding(
             f"{name} turns too fast",
-            f"the {name} turns at {usual_rate:.0f} rad/s, as no robot does: the yaw is probably in degrees instead of rad",
+            f"the {name} turns at {turning:.0f} rad/s, as no robot does: the yaw is probably in degrees instead of rad",
         )
         return
     fast = float(np.quantile(speed[moving], 0.9)), float(np.quantile(rate[moving], 0.9))
@@ -166,8 +169,24 @@ def _boxes_move(log: Log, start: float, end: float) -> bool:
 def steps(poses: Floats) -> tuple[Floats, Floats]:
     """Return the distance (N-1,), m, and the angle (N-1,), rad, of each step of a path."""
     way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turn = rotation_vector(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
-    return way, np.asarray(np.linalg.norm(turn, axis=1))
+    return way, np.asarray(np.linalg.norm(_turns(poses), axis=1))
+
+
+def _turns(poses: Floats) -> Floats:
+    """Return the rotation vector (N-1, 3) of each step of a path in base, rad."""
+    return rotation_vector(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
+
+
+def _turn_rates(path: Trajectory) -> Floats:
+    """Return the turn rate (N-1,), rad/s, from each pose but the last on, over at least `_TURN_TIME`.
+
+    Steps are added with their directions, so the noise of headings averages out.
+    """
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(_turns(path.poses), axis=0)])
+    first = np.arange(len(path) - 1)
+    last = np.clip(np.searchsorted(path.stamps, path.stamps[:-1] + _TURN_TIME), first + 1, len(path) - 1)
+    turn, seconds = turned[last] - turned[first], path.stamps[last] - path.stamps[first]
+    return np.asarray(np.linalg.norm(turn, axis=1) / seconds)
 
 
 def straightness(path: Trajectory) -> float | None:

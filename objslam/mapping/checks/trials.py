@@ -61,14 +61,19 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
     return [first, *sorted(trials, key=lambda trial: -trial.score)]
 
 
-def verdict(trials: list[Trial], part: Part) -> Finding | None:
-    """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log."""
+def verdict(trials: list[Trial], part: Part, corrected: float) -> Finding | None:
+    """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log.
+
+    corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
+    better than this: a mount with another order of its quaternion may look like one that is tilted a little.
+    """
     first, rest = trials[0], trials[1:]
+    before = max(first.score, corrected)
     times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
 
     def holds(trial: Trial) -> bool:
-        more = trial.score > max(times * first.score, first.score + least)
-        more &= (trial.score - first.score) * part.boxes > _MORE_BOXES
+        more = trial.score > max(times * before, before + least)
+        more &= (trial.score - before) * part.boxes > _MORE_BOXES
         # Better boxes are no reason to make a straight path crooked.
         return bool(more and not (_is_straight(first) and trial.straight is not None and trial.straight < _CROOKED))
 
