@@ -172,7 +172,7 @@ class JointState:
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return self
-        state = self.attempt()
+        state = best = self.attempt()
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"most likely path, round {number + 1}", 0, 0)
             assert state.association is not None
@@ -185,19 +185,16 @@ class JointState:
             association = state._associate(path, (objects, state.estimate.positions), rough=True)
             if rays_moved(before.object, association.object) <= _STILL * len(state.rays):
                 break
-            after = (
-                state.counted(association).solve("association", association, path @ state.keyframes.base_T_camera).merged()
-            )
-            if after.explained <= state.explained:
-                break
-            state = after
-        if state.association is self.association:
+            start = path @ state.keyframes.base_T_camera
+            state = state.counted(association).solve("association", association, start).merged()
+            best = max(best, state, key=lambda one: one.explained)  # Close objects may merge in one round, and part again.
+        if best.association is self.association:
             return self
-        assert state.association is not None
-        assert state.estimate is not None
-        turns = state.alternated(state.estimate.map_T_base, (state.association, state.estimate.positions))
-        if turns.explained < state.explained:  # Close landmarks may merge in one round and part in the next.
-            turns = replace(turns.continued_from(state), settled=turns.settled)
+        assert best.association is not None
+        assert best.estimate is not None
+        turns = best.alternated(best.estimate.map_T_base, (best.association, best.estimate.positions))
+        if turns.explained < best.explained:
+            turns = replace(turns.continued_from(best), settled=turns.settled)
         return self.better(turns)
 
     def attempt(self) -> Self:

@@ -58,12 +58,12 @@ def solve_joint(
             return state.association, state.estimate, ()
         state = replace(state, association=None, estimate=None)
     if start is not None or state.keyframes.localized_every:
-        state = _from_start(state, start).relocalized()
+        state = _relocalized(_from_start(state, start))
     else:
         explored = _from_start(*_explored(state))
-        state, noisier = explored.relocalized(), _with_loose_odometry(explored)
+        state, noisier = _relocalized(explored), _with_loose_odometry(explored)
         if noisier is not None:
-            state = state.better(_from_start(*_explored(noisier)).relocalized())
+            state = state.better(_relocalized(_from_start(*_explored(noisier))))
     if not state.settled:
         rounds = state.settings.joint.max_rounds
         state.ledger.warn(f"the association still changes after {rounds} rounds (joint.max_rounds)")
@@ -89,6 +89,16 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
     map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
     guess = None if start is None else (start.association, start.positions)
     return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
+
+
+def _relocalized(state: JointState) -> JointState:
+    """Return the state after searches for the most likely path, until the rays are no better explained."""
+    for _ in range(state.settings.joint.max_rounds):
+        found = state.relocalized()
+        if found is state:
+            break
+        state = found
+    return state
 
 
 def _by_label(state: JointState) -> tuple[JointState, bool]:
