@@ -15,9 +15,8 @@ from objslam.core.geometry import lift_se2
 from objslam.core.types import Log, Trajectory
 from objslam.errors import LogError
 from objslam.mapping import pipeline
-from objslam.mapping.checks.agreement import bounded_part
+from objslam.mapping.checks.agreement import bounded_part, gain_in_sigmas
 from objslam.mapping.checks.diagnosis import diagnose
-from objslam.mapping.checks.gain import gain_in_sigmas
 from objslam.mapping.checks.hypotheses import Hypothesis
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.stamps import check_stamps

@@ -12,10 +12,9 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
-from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
+from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, gain_in_sigmas, pose_noise
 from objslam.mapping.checks.boxes import check_boxes
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.gain import gain_in_sigmas
 from objslam.mapping.checks.halves import check_halves
 from objslam.mapping.checks.hypotheses import later
 from objslam.mapping.checks.mixture import check_mixture
