@@ -1,0 +1,224 @@
+"""Measure whether maps are honest on robots whose errors come from hardware, not from the noise model of the package.
+
+    python tools/bench_robots.py [--kinds wheels gyro vio slow] [--robots 8] [--first 0]
+
+Each robot drives to random points of a room, with stops. wheels: encoders with ticks, wrong radii, a wrong track width, slip
+and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
+wheels, but only one or two odometry poses in a second. The camera has a wrong clock, yaw, tilt and roll. Boxes are rounded
+to pixels, sit beside the object by a share of its size that depends on the side, and 1 % have a wrong name. Robots with an
+even number measure depths too. All settings are the defaults of joint mode. A line for each robot, then for each kind.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+
+from objslam.config import load_settings
+from objslam.core.arrays import Floats
+from objslam.core.camera import Camera, project
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import inverse, lift_se2, make_pose
+from objslam.core.rotation import rotation_from_vector
+from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.errors import ObjslamError
+from objslam.evaluation.evaluate import evaluate
+from objslam.mapping import pipeline
+
+KINDS = ("wheels", "gyro", "vio", "slow")
+STEP = 0.005  # s, of the simulated motion
+SIDES = 0.04  # the offset of a box from its object, as a share of the size of the object, for each of five terms
+SLIPS = 90.0  # s between sudden slips, on average
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--robots", type=int, default=8, help="robots of each kind")
+    parser.add_argument("--first", type=int, default=0, help="the seed of the first robot")
+    options = parser.parse_args()
+    settings = load_settings(None, ("mode=joint", "output.recording=false"))
+    for kind in options.kinds:
+        rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
+        for seed in range(options.first, options.first + options.robots):
+            log, ranged, begin = robot(seed, kind), seed % 2 == 0, time.process_time()
+            try:
+                result = pipeline.run(log, settings, Ledger())
+            except ObjslamError as error:
+                print(f"{kind} {seed}: {error}")
+                continue
+            seconds = time.process_time() - begin
+            assert log.truth is not None
+            found = evaluate(result.map, log.truth, align="se2", radius=3.0).to_dict()
+            inside, squared = found["inside_95_3d"] * found["matched"], found["mahalanobis_median"]
+            rows[ranged].append(
+                (found["matched"], len(log.truth.objects), found["false"], inside, found["position_rmse"], squared, seconds)
+            )
+            print(
+                f"{kind} {seed}, {'range' if ranged else 'bearings'}: {found['matched']} of {len(log.truth.objects)} "
+                f"objects, {found['false']} false, {inside:.0f} inside 95 %, RMSE {found['position_rmse']:.3f} m, "
+                f"squared Mahalanobis median {squared:.2f}, {seconds:.1f} s of CPU",
+                flush=True,
+            )
+        for ranged, of in rows.items():
+            if of:
+                matched, objects, false, inside, rmse, squared, seconds = np.array(of).T
+                print(
+                    f"== {kind}, {'range' if ranged else 'bearings'}: {len(of)} robots, {matched.sum():.0f} of "
+                    f"{objects.sum():.0f} objects, {false.sum():.0f} false, inside 95 %: "
+                    f"{inside.sum() / matched.sum():.1%}, "
+                    f"RMSE median {np.median(rmse):.3f} m, largest {rmse.max():.3f} m, {np.median(seconds):.1f} s of CPU",
+                    flush=True,
+                )
+
+
+def robot(seed: int, kind: str) -> Log:
+    """Draw a robot of a kind, a room and a drive. The same seed and kind give the same log."""
+    rng = np.random.default_rng([seed, 1 + KINDS.index(kind)])
+    room, speed, seconds = rng.uniform(5, 15, 2), rng.uniform(0.2, 1.0), rng.uniform(120, 500)
+    stamps, path, forward, turning = drive(rng, room, speed, seconds)
+    if kind == "vio":
+        odometry = vio(rng, stamps, path, float(rng.choice([10, 20, 30])))
+    else:
+        rate = float(rng.choice([1, 2]) if kind == "slow" else rng.choice([10, 20, 50]))
+        odometry = wheels(rng, stamps, forward, turning, kind == "gyro", rate)
+    camera, base_T_camera = mounted(rng)
+    clock = rng.normal(0, 0.08)
+    rate = float(rng.choice([2, 5, 10, 15]))
+    fired = np.arange(1.0, seconds - 1.0, 1 / rate)
+    fired = fired + rng.uniform(0, 0.004, len(fired))
+    map_T_base = lift_se2(np.column_stack([np.interp(fired, stamps, column) for column in path.T]))
+    number = int(rng.integers(8, 20))
+    places = np.column_stack([rng.uniform(-room / 2 - 1.5, room / 2 + 1.5, (number, 2)), rng.uniform(0, 1.6, number)])
+    names = tuple(f"thing_{i}" for i in range(number))
+    detections = boxes_of(rng, camera, map_T_base @ base_T_camera, places, fired - clock, names, ranged=seed % 2 == 0)
+    truth = Truth(
+        objects=tuple(TruthObject(i, name, place) for i, (name, place) in enumerate(zip(names, places, strict=True))),
+        trajectory=Trajectory(fired - clock, map_T_base),
+    )
+    return Log(f"{kind}{seed}", (CameraLog(camera, detections),), odometry=odometry, truth=truth)
+
+
+def drive(rng: np.random.Generator, room: Floats, speed: float, seconds: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Drive to random points of a room (2,), m. Returns stamps (n,), the path (n, 3) x, y, yaw, and both speeds (n,)."""
+    count = int(seconds / STEP)
+    path, forward, turning = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
+    x, y, yaw, v, w, wait = 0.0, 0.0, rng.uniform(-np.pi, np.pi), 0.0, 0.0, 1.0
+    goal, fastest = rng.uniform(-0.5, 0.5, 2) * room, rng.uniform(0.6, 1.5)
+    for i in range(count):
+        path[i], forward[i], turning[i] = (x, y, yaw), v, w
+        to = goal - (x, y)
+        if np.hypot(*to) < 0.4:
+            goal = rng.uniform(-0.5, 0.5, 2) * room
+            if rng.random() < 0.4:
+                wait = rng.uniform(1, 5)
+        off = (np.arctan2(to[1], to[0]) - yaw + np.pi) % (2 * np.pi) - np.pi
+        wanted_w, wanted_v = np.clip(1.5 * off, -fastest, fastest), speed * max(np.cos(off), 0.0) ** 2
+        if wait > 0:
+            wait, wanted_w, wanted_v = wait - STEP, 0.0, 0.0
+        v += np.clip(wanted_v - v, -0.8 * STEP, 0.8 * STEP)
+        w += np.clip(wanted_w - w, -3 * STEP, 3 * STEP)
+        x, y, yaw = x + v * np.cos(yaw) * STEP, y + v * np.sin(yaw) * STEP, yaw + w * STEP
+    return np.arange(count) * STEP, path, forward, turning
+
+
+def wheels(
+    rng: np.random.Generator, stamps: Floats, forward: Floats, turning: Floats, gyro: bool, rate: float
+) -> Trajectory:
+    """The odometry of two wheels, with the heading of a gyroscope if there is one. rate: poses in a second."""
+    track, slip, tick = rng.uniform(0.2, 0.6), rng.uniform(0.003, 0.02), rng.uniform(0.0005, 0.003)
+    both, wide = rng.normal(0, 0.015), 1 + rng.normal(0, 0.03)
+    moved = []
+    for side in (-1, 1):
+        way = (forward + side * turning * track / 2) * STEP
+        way = way * (1 + both + rng.normal(0, 0.01)) + slip * np.sqrt(np.abs(way)) * rng.normal(size=len(way))
+        moved.append(np.diff(np.floor(np.cumsum(way) / tick) * tick, prepend=0.0))
+    ahead, turn, aside = (moved[0] + moved[1]) / 2, (moved[1] - moved[0]) / (track * wide), np.zeros(len(stamps))
+    slipped = np.flatnonzero((rng.random(len(stamps)) < STEP / SLIPS) & (forward > 0.05))
+    turn[slipped] += rng.normal(0, np.radians(2), len(slipped))
+    aside[slipped] += rng.normal(0, 0.02, len(slipped))
+    if gyro:
+        noise = rng.uniform(0.0005, 0.003) * np.sqrt(STEP) * rng.normal(size=len(turn))
+        turn = (turning * (1 + rng.normal(0, 0.01)) + rng.normal(0, 0.002)) * STEP + noise
+    yaw = np.cumsum(turn)
+    c, s = np.cos(yaw - turn / 2), np.sin(yaw - turn / 2)
+    pose = np.column_stack([np.cumsum(ahead * c - aside * s), np.cumsum(ahead * s + aside * c), yaw])
+    every = max(round(1 / (rate * STEP)), 1)
+    return Trajectory(stamps[::every], lift_se2(pose[::every]))
+
+
+def vio(rng: np.random.Generator, stamps: Floats, path: Floats, rate: float) -> Trajectory:
+    """A path with a wrong scale, and with drift in all six directions."""
+    every = max(round(1 / (rate * STEP)), 1)
+    poses = lift_se2(path[::every])
+    steps = inverse(poses[:-1]) @ poses[1:]
+    root = np.sqrt(np.linalg.norm(steps[:, :3, 3], axis=1) + 1e-6)[:, None]
+    turn = rng.uniform(0.001, 0.003) * root * rng.normal(size=(len(steps), 3)) * [0.3, 0.3, 1]
+    way = rng.uniform(0.002, 0.01) * root * rng.normal(size=(len(steps), 3)) * [1, 1, 0.5]
+    steps[:, :3, 3] *= 1 + rng.normal(0, 0.01)
+    found = [poses[0]]
+    for step in steps @ make_pose(rotation_from_vector(turn), way):
+        found.append(found[-1] @ step)
+    return Trajectory(stamps[::every], np.array(found))
+
+
+def mounted(rng: np.random.Generator) -> tuple[Camera, Floats]:
+    """A camera that looks ahead, as its calibration says, and where it really is (4, 4) on the robot."""
+    focal, height = rng.uniform(350, 700), rng.uniform(0.2, 1.2)
+    roll, tilt, yaw = rng.normal(0, [0.01, 0.015, 0.02])
+    ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    turns = rotation_from_vector(np.array([[0, 0, yaw], [0, tilt, 0], [roll, 0, 0]]))
+    place = np.array([0.15, 0.0, height])
+    matrix = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
+    camera = Camera("front", 640, 480, matrix, base_T_camera=make_pose(ahead, place))
+    return camera, make_pose(turns[0] @ turns[1] @ turns[2] @ ahead, place)
+
+
+def boxes_of(
+    rng: np.random.Generator,
+    camera: Camera,
+    map_T_camera: Floats,
+    places: Floats,
+    stamps: Floats,
+    names: tuple[str, ...],
+    *,
+    ranged: bool,
+) -> Detections:
+    """The boxes of objects at places (N, 3), m, in images from poses (F, 4, 4). stamps: (F,) s, of the images."""
+    number = len(places)
+    size, noise = rng.uniform(0.08, 0.6, number), rng.uniform(1, 3)
+    away = places[None] - map_T_camera[:, None, :3, 3]
+    local, distance = np.einsum("kji,knj->kni", map_T_camera[:, :3, :3], away), np.linalg.norm(away, axis=2)
+    with np.errstate(all="ignore"):
+        pixels = project(camera, local.reshape(-1, 3)).reshape(*local.shape[:2], 2)
+    side = np.arctan2(-away[..., 1], -away[..., 0])
+    waves = np.stack([np.ones_like(side), np.cos(side), np.sin(side), np.cos(2 * side), np.sin(2 * side)])
+    beside = SIDES * size[:, None] * np.einsum("wkn,nwa->kna", waves, rng.normal(size=(number, 5, 2)))
+    focal = camera.matrix[0, 0]
+    pixels = pixels + beside * focal / distance[..., None] + noise * rng.normal(size=pixels.shape)
+    half = (size * focal / distance / 2)[..., None]
+    whole = ((pixels - half > 1) & (pixels + half < camera.size - 2)).all(axis=2)
+    frame, thing = np.nonzero((local[..., 2] > 0.3) & (distance < 7) & whole & (rng.random(distance.shape) < 0.8))
+    at, reach, depth = pixels[frame, thing], half[frame, thing], local[frame, thing, 2]
+    measured: Any = np.full(len(frame), np.nan)
+    if ranged:
+        measured = depth * (1 + rng.normal(0, 0.01)) + np.hypot(0.02, 0.01 * depth) * rng.normal(size=len(frame))
+        measured = measured + np.where(rng.random(len(frame)) < 0.05, rng.uniform(0.2, 2, len(frame)), 0.0)
+    wrong = rng.random(len(frame)) < 0.01
+    return Detections(
+        frame_stamps=stamps,
+        frame=frame,
+        boxes=np.concatenate([at - reach, at + reach], axis=1).round(),
+        label=np.where(wrong, rng.integers(0, number, len(frame)), thing),
+        scores=np.ones(len(frame)),
+        depths=measured,
+        track_ids=np.full(len(frame), -1),
+        label_names=names,
+    )
+
+
+if __name__ == "__main__":
+    main()
