@@ -12,7 +12,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
-from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, gain_in_sigmas, pose_noise
+from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.halves import check_halves
@@ -55,9 +55,6 @@ _GAIN_MOVED = 0.03
 _GAIN = 0.02
 """The least growth of the score by a clock offset of `_CLOCKS`, and by the removal of the errors that the run does not
 estimate. A larger value reports fewer errors."""
-_SURE = 4.0
-"""The least gain of the fit by the removal of these errors, in standard deviations, if the score grows by less than `_GAIN`.
-Exact boxes fit anyway, so their score hardly grows. A larger value reports fewer errors."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +205,7 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
     least = found.score if before is None else max(found.score, before.score)
     if after is None or after.score <= least:
         return None
-    sure = gain_in_sigmas(found if before is None else before, after) > _SURE
-    return errors if sure or after.score > least + _GAIN else None
+    return errors if after.score > least + _GAIN else None
 
 
 def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
