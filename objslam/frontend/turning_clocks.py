@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Floats
 from objslam.core.calibration import kind
 from objslam.core.types import Trajectory
 from objslam.frontend.shared_errors import SharedErrors
@@ -12,7 +12,7 @@ _STEP = 0.02
 _LONGEST = 1.0
 """The longest time (s) between two bearings that are compared. Over a longer time, the robot drives past the object, and its
 bearing changes without a turn."""
-_MOST = 20_000
+_MOST = 3000
 """The most pairs of bearings of a camera that are compared, spread over the log. A larger number is slower."""
 _SURE = 5.0
 """The least log odds of an offset against the expected one. With a smaller value, robots that hardly turn begin at an offset
@@ -28,17 +28,17 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
     of turns takes the place of the clock.
     """
     theta, odometry, cameras = errors.mean.copy(), errors.log.odometry, [one.camera.name for one in errors.log.cameras]
-    if odometry is None or errors.keyframes.odom_T_base is None:
+    if odometry is None or len(odometry) < 2 or errors.keyframes.odom_T_base is None:
         return theta
     limit = errors.settings.calibration.max_clock
     offsets = np.arange(-limit, limit + _STEP / 2, _STEP)
     for k, name in enumerate(errors.names):
         if kind(name) != "clock":
             continue
-        stamps, turned, weight = _pairs(errors, cameras.index(name.rpartition(".")[0]))
+        stamps, bearings, weight = _pairs(errors, cameras.index(name.rpartition(".")[0]))
         if not len(stamps):
             continue
-        missed = _missed(odometry, stamps, turned, np.append(offsets, theta[k]))
+        missed = _missed(odometry, stamps, bearings, np.append(offsets, theta[k]))
         floor = float(np.median(errors.rays.sigma))
         cost = weight * np.log(missed + floor)
         cost += (np.append(offsets, theta[k]) - errors.mean[k]) ** 2 / (2 * errors.prior[k, k])
@@ -49,7 +49,7 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
 
 
 def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
-    """Return the stamps (n, 2), s, of pairs of bearings of one label, and how far (n,), rad, the bearing turned in base.
+    """Return the stamps (n, 2), s, of pairs of bearings of one label, and the bearings (n, 2, 3), unit, in base.
 
     The last value is the number of independent pairs: pairs of the same images share the turn, and each image is in two.
     Labels with several boxes in an image have no pairs there.
@@ -61,37 +61,38 @@ def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
     )
     single = mine[first[number == 1]]  # In the order of the labels, then of the keyframes.
     one, two = single[:-1], single[1:]
-    stamps = np.column_stack([keyframes.stamps[rays.keyframe[one]], keyframes.stamps[rays.keyframe[two]]])
-    apart = stamps[:, 1] - stamps[:, 0]
+    apart = keyframes.stamps[rays.keyframe[two]] - keyframes.stamps[rays.keyframe[one]]
     near = np.flatnonzero((rays.label[one] == rays.label[two]) & (apart > 0) & (apart <= _LONGEST))
     images = len(np.unique(rays.keyframe[two[near]]))
-    share = min(_MOST / max(len(near), 1), 1.0)
-    near = near[np.unique(np.round(np.linspace(0, len(near) - 1, int(share * len(near)))).astype(np.int64))]
-    azimuth = _azimuths(errors, single)
-    return stamps[near], _wrapped(azimuth[near + 1] - azimuth[near]), images / 2
+    if len(near) > _MOST:
+        near = near[np.linspace(0, len(near) - 1, _MOST).astype(np.int64)]
+    pair = np.column_stack([one[near], two[near]])
+    turn = keyframes.base_T_camera[rays.keyframe[pair], :3, :3]
+    return keyframes.stamps[rays.keyframe[pair]], np.einsum("npij,npj->npi", turn, rays.direction[pair]), images / 2
 
 
-def _azimuths(errors: SharedErrors, which: Ints) -> Floats:
-    """Return the directions (n,), rad, of rays (n,) about the vertical axis of base."""
-    rays = errors.rays
-    turn = errors.keyframes.base_T_camera[rays.keyframe[which], :3, :3]
-    in_base = np.einsum("nij,nj->ni", turn, rays.direction[which])
-    return np.arctan2(in_base[:, 1], in_base[:, 0])
+def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Floats) -> Floats:
+    """Return the mean angle (m,), rad, between second bearings and first ones that turn against the odometry.
 
-
-def _missed(odometry: Trajectory, stamps: Floats, turned: Floats, offsets: Floats) -> Floats:
-    """Return the mean absolute difference (m,), rad, between the turns of bearings and those of the odometry.
-
-    stamps: (n, 2) s and turned: (n,) rad, of `_pairs`. offsets: (m,) s, of the clock.
+    stamps: (n, 2) s and bearings: (n, 2, 3), of `_pairs`. offsets: (m,) s, of the clock.
     """
-    heading = np.unwrap(np.arctan2(odometry.poses[:, 1, 0], odometry.poses[:, 0, 0]))
     found = np.zeros(len(offsets))
     for i, offset in enumerate(offsets.tolist()):
-        before, after = np.interp(stamps.T + offset, odometry.stamps, heading)
-        found[i] = np.abs(_wrapped(turned + after - before)).mean()
+        before, after = (_turned(odometry, stamps[:, k] + offset) for k in (0, 1))
+        fixed = np.einsum("nij,nj->ni", before, bearings[:, 0])
+        told = np.einsum("nji,nj->ni", after, fixed)
+        cross = np.linalg.norm(np.cross(told, bearings[:, 1]), axis=1)
+        found[i] = np.arctan2(cross, np.einsum("ni,ni->n", told, bearings[:, 1])).mean()
     return found
 
 
-def _wrapped(angles: Floats) -> Floats:
-    """Return angles in [-pi, pi)."""
-    return np.asarray((angles + np.pi) % (2 * np.pi) - np.pi)
+def _turned(odometry: Trajectory, stamps: Floats) -> Floats:
+    """Return the rotations (n, 3, 3) of the odometry at stamps (n,), s, interpolated linearly between its poses.
+
+    The result is a little shorter than a rotation, which an angle does not show. It takes a tenth of the time.
+    """
+    after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, len(odometry) - 1)
+    begin, end = odometry.stamps[after - 1], odometry.stamps[after]
+    share = np.clip((stamps - begin) / (end - begin), 0.0, 1.0)[:, None, None]
+    rotations = odometry.poses[:, :3, :3]
+    return np.asarray((1 - share) * rotations[after - 1] + share * rotations[after])

@@ -1,12 +1,15 @@
 """The clocks of cameras from turns alone, on simulated drives whose clocks are wrong by a known offset."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from objslam.config import load_settings
 from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import lift_se2, make_pose
+from objslam.core.geometry import inverse, lift_se2, make_pose
 from objslam.core.types import CameraLog, Detections, Log, Trajectory
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
@@ -77,6 +80,17 @@ def test_wrong_labels_and_other_shared_errors_do_not_hide_the_clock():
     log = add_shared_errors(drive(3, clock=0.2, false=0.1), wrong)
     errors = errors_of(log)
     assert clock_of(errors, clocks_of_turns(errors)) == pytest.approx(0.2, abs=0.06)
+
+
+def test_the_axes_of_base_and_of_the_odometry_do_not_matter():
+    """The base of a visual odometry may have the axes of a camera, and its world those of the first image."""
+    log = drive(2, clock=0.16)
+    odometry, camera = log.odometry, log.cameras[0]
+    other_T_base, world_T_odom = (make_pose(Rotation.random(rng=seed).as_matrix(), np.zeros(3)) for seed in (1, 2))
+    poses = world_T_odom @ odometry.poses @ inverse(other_T_base)
+    mounted = replace(camera, camera=replace(camera.camera, base_T_camera=other_T_base @ camera.camera.base_T_camera))
+    errors = errors_of(replace(log, odometry=Trajectory(odometry.stamps, poses), cameras=(mounted,)))
+    assert clock_of(errors, clocks_of_turns(errors)) == pytest.approx(0.16, abs=0.06)
 
 
 def test_a_robot_that_does_not_turn_shows_no_clock():
