@@ -50,8 +50,6 @@ def solve_joint(
     state = _with_clocks(state)
     if start is None and may_be_by_label(state.settings, state.all_rays):
         state, agree = _by_label(state)
-        if agree and state.settings.association.method == "auto":
-            state, agree = _with_doubles(state)
         if agree:
             assert state.association is not None
             assert state.estimate is not None
@@ -107,7 +105,12 @@ def _by_label(state: JointState) -> tuple[JointState, bool]:
     association, errors = associate_by_label(state.rays), state.errors
     solved = state.solve("labels", association)
     assert solved.estimate is not None
-    if state.settings.association.method == "by_label" or labels_tell(association, solved.estimate):
+    if state.settings.association.method == "by_label":
+        return solved, True
+    told = labels_tell(association, solved.estimate)
+    if (association.object < 0).any():  # Noise or a wrong clock do not draw two boxes of one label.
+        return _with_doubles(solved) if told else (solved, False)
+    if told:
         return solved, True
     if solved.errors is None or errors is None:
         return solved, False
@@ -126,8 +129,6 @@ def _with_doubles(state: JointState) -> tuple[JointState, bool]:
     show no second object of any label."""
     assert state.association is not None
     assert state.estimate is not None
-    if (state.association.object >= 0).all():
-        return state, True
     nearest = associate_by_label(state.rays, angles_to_objects(state.rays, state.estimate, state.solved_poses))
     if not np.array_equal(nearest.object, state.association.object):
         state = state.solve("labels", nearest, state.solved_poses)
