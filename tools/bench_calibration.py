@@ -27,7 +27,7 @@ CHI2_95 = 7.815  # chi-squared, 3 degrees of freedom
 PRIORS = {
     "odometry.scale": 0.03,
     "odometry.turn_scale": 0.05,
-    "odometry.turn_bias": 0.001,
+    "odometry.turn_bias": 0.003,
     "front.clock": 0.1,
     "front.roll": 0.02,
     "front.tilt": 0.02,

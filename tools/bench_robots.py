@@ -134,7 +134,7 @@ def wheels(
     moved = []
     for side in (-1, 1):
         way = (forward + side * turning * track / 2) * STEP
-        way = way * (1 + both + rng.normal(0, 0.01)) + slip * np.sqrt(np.abs(way)) * rng.normal(size=len(way))
+        way = way * (1 + both + rng.normal(0, 0.003)) + slip * np.sqrt(np.abs(way)) * rng.normal(size=len(way))
         moved.append(np.diff(np.floor(np.cumsum(way) / tick) * tick, prepend=0.0))
     ahead, turn, aside = (moved[0] + moved[1]) / 2, (moved[1] - moved[0]) / (track * wide), np.zeros(len(stamps))
     slipped = np.flatnonzero((rng.random(len(stamps)) < STEP / SLIPS) & (forward > 0.05))
