@@ -203,9 +203,7 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
     corrected = errors.corrected(part.log, errors.estimated), errors.corrected(part.log)
     before, after = agreements(part, corrected, settings)
     least = found.score if before is None else max(found.score, before.score)
-    if after is None or after.score <= least:
-        return None
-    return errors if after.score > least + _GAIN else None
+    return errors if after is not None and after.score > least + _GAIN else None
 
 
 def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
