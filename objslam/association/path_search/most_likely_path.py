@@ -53,12 +53,14 @@ def most_likely_path(
     keyframes: with odometry. map_T_base: (K, 4, 4) the present path. positions, label: (N, 3) m and (N,) of the landmarks,
     NaN without a position. rate: (N,) the share of the frames in view of each landmark that detect it.
     """
+    from scipy.spatial import cKDTree
+
     known = np.flatnonzero(np.isfinite(positions[:, 0]) & (rate > 0))
     spacing = _spacing(positions[known], label[known])
     if not len(rays) or not np.isfinite(spacing):
         return None
     origin, direction = rays.in_map(map_T_base @ keyframes.base_T_camera)
-    nearest = np.linalg.norm(positions[known] - origin[:, None], axis=2).min(axis=1)
+    nearest, _ = cKDTree(positions[known]).query(origin)  # All distances at once would not fit into memory on a long log.
     distance = float(np.median(np.where(np.isfinite(rays.range), rays.range, nearest)))
     turn = min(max(spacing / _STEPS_APART / distance, float(np.median(rays.sigma))), _MOST_TURN)
     grid = Grid(turn * distance, turn)
