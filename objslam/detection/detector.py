@@ -12,7 +12,8 @@ import numpy as np
 from objslam import config
 from objslam.config.detector import Role
 from objslam.core.arrays import Array, Floats
-from objslam.detection.infer_recipe import input_size, settle, with_description
+from objslam.detection.infer_recipe import DESCRIPTION, USER_ONLY, input_size, settle
+from objslam.detection.model_description import with_description
 from objslam.detection.onnx_model import Network, open_network
 from objslam.detection.output_layouts import Output
 from objslam.detection.postprocess import decode
@@ -98,7 +99,7 @@ def load_detector(model: Path, settings: config.Detector) -> Detector:
     unknown layout. In this last case, the message lists the outputs and says how to describe them.
     """
     network = open_network(model, settings)
-    settings = with_description(network, settings)
+    settings = with_description(network, settings, DESCRIPTION, USER_ONLY)
     size = input_size(network, settings)
     image = np.zeros((network.image.batch or 1, 3, size.height, size.width), dtype=np.float32)
     values = network.run(image)

@@ -1,6 +1,5 @@
 """The image encoder, which makes an appearance vector of the crop of each box."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from objslam import config
 from objslam.core.appearance.features import MAX_FEATURES
 from objslam.core.arrays import Array, Floats
+from objslam.detection.model_description import with_description
 from objslam.detection.onnx_model import Network, open_network
 from objslam.detection.preprocess import Fit, fill
 from objslam.detection.recipe import IMAGENET, EncoderRecipe
@@ -56,7 +56,7 @@ def load_encoder(model: Path, settings: config.Settings) -> Encoder:
     Raises ConfigError if the settings do not fit the model.
     """
     network = open_network(model, settings.detector)
-    chosen = _with_description(network, settings.encoder)
+    chosen = with_description(network, settings.encoder, DESCRIPTION, _USER_ONLY)
     image = network.image
     width, height = chosen.size or (image.width or _SIZE, image.height or _SIZE)
     if (width, height) != (image.width or width, image.height or height):
@@ -74,22 +74,6 @@ def load_encoder(model: Path, settings: config.Settings) -> Encoder:
     batch = chosen.batch if image.batch is None else max(image.batch, 1)
     trial = np.zeros((image.batch or (1 if image.batch == 0 else 2), 3, height, width), dtype=np.float32)
     return Encoder(network, recipe, _vector_output(network, chosen.output, network.run(trial), len(trial)), batch)
-
-
-def _with_description(network: Network, settings: config.Encoder) -> config.Encoder:
-    """Return the settings, with unset values filled in from the model's own description, if its metadata has one."""
-    text = network.metadata.get(DESCRIPTION)
-    if text is None:
-        return settings
-    try:
-        described = config.Encoder.model_validate(json.loads(text))
-        if beyond := described.model_fields_set & _USER_ONLY:
-            raise ValueError(f"only the user can set {min(beyond)}")
-    except (ValueError, RecursionError) as error:  # The errors of pydantic and json are ValueErrors.
-        message = f"{DESCRIPTION} in the model's metadata is wrong: {'; '.join(str(error).splitlines()[:3])}"
-        raise DetectorError(message, where=str(network.path)) from error
-    unset = (key for key in described.model_fields_set if getattr(settings, key) is None)
-    return settings.model_copy(update={key: getattr(described, key) for key in unset})
 
 
 def _vector_output(network: Network, name: str | None, values: Sequence[Array], count: int) -> int:

@@ -18,31 +18,14 @@ from objslam.errors import ConfigError, DetectorError
 
 DESCRIPTION = "objslam.detector"
 """The metadata key of a model's own description, which is JSON with keys of the `detector` settings."""
-
-_USER_ONLY = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
+USER_ONLY = frozenset({"classes", "min_score", "iou", "max_boxes", "size", "device", "threads", "batch"})
+"""The settings that no model may describe, because they depend on the user and on the computer."""
 _SIZE = 640  # The width and height of an input of free size, px, if the settings and the metadata have no size.
 _LARGEST = 8192  # The largest width or height, px, that is accepted from the metadata. The limit bounds memory.
 _STRIDE = 32  # The stride of an input of free size, px, if the metadata has no stride.
 _PAD = 114  # The grey value of the padding if the settings have no value.
 _QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.
 _UNNAMED = "the model names no classes: they are numbered (set detector.names)"
-
-
-def with_description(network: Network, settings: config.Detector) -> config.Detector:
-    """Return the settings, with unset values filled in from the model's own description, if its metadata has one. Raises
-    DetectorError if the description is invalid."""
-    text = network.metadata.get(DESCRIPTION)
-    if text is None:
-        return settings
-    try:
-        described = config.Detector.model_validate(json.loads(text))
-        if beyond := described.model_fields_set & _USER_ONLY:
-            raise ValueError(f"only the user can set {min(beyond)}")
-    except (ValueError, RecursionError) as error:  # The errors of pydantic and json are ValueErrors.
-        message = f"{DESCRIPTION} in the model's metadata is wrong: {'; '.join(str(error).splitlines()[:3])}"
-        raise DetectorError(message, where=str(network.path)) from error
-    unset = (key for key in described.model_fields_set if getattr(settings, key) is None)
-    return settings.model_copy(update={key: getattr(described, key) for key in unset})
 
 
 def input_size(network: Network, settings: config.Detector) -> InputSize:
