@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Protocol, Self
 
 import gtsam
 import numpy as np
@@ -21,8 +21,28 @@ from objslam.graph.factors.rays import ray_factors
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import build_graph
 from objslam.graph.tags.corner_rays import TagCorners
+from objslam.graph.tags.square_rows import SquareRows
 from objslam.graph.tags.squares import add_squares
 from objslam.graph.variables import make_values
+
+
+class RowsOfKind(Protocol):
+    """The factors of one kind as arrays: n factors with r rows each, on c columns each.
+
+    The columns are those of `JointRows`: three for each landmark of the graph, then six for each pose.
+    """
+
+    @property
+    def rows_each(self) -> int:
+        """r, the number of rows of a factor."""
+
+    @property
+    def columns(self) -> Ints:
+        """(n, c) the columns that all rows of a factor share."""
+
+    def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:
+        """Return the whitened residuals (n, r) at poses (P, 4, 4) and positions (m, 3), m, their derivatives (n, r, c), and
+        the cost. Roots of robust weights are in the first two."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +104,18 @@ class Measurements:
         if self.tags is not None:
             factors += add_squares(self.tags, landmarks, positions, values, self.settings.joint.prior_sigma)
         return build_graph(factors), values
+
+    def further_rows(self, rays: Rays, owner: Ints, landmarks: Ints) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
+        """Return the kinds of factors that bring their own rows.
+
+        `JointGraph` has the rows of bearings, ranges, weak priors, motions and poses. Each further kind stands here.
+
+        Args:
+            rays: the n rays in the graph.
+            owner: (n,) the landmark of each ray.
+            landmarks: (m,) the landmarks in the graph, in increasing order.
+        """
+        return (SquareRows.of(self.tags, landmarks),)
 
     def odometry(self) -> tuple[Floats, Floats]:
         """Return the motions (P-1, 4, 4) and their covariances (P-1, 6, 6). ValueError without odometry."""

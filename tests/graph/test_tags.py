@@ -14,10 +14,10 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, make_pose
 from objslam.core.result import RunResult
 from objslam.graph.factors.tags import tag_ties
-from objslam.graph.least_squares.square_rows import SquareRows
 from objslam.graph.tags.placement import place
 from objslam.graph.tags.shapes import CLOCKWISE, COUNTER_CLOCKWISE, goes_clockwise, squares_of
 from objslam.graph.tags.square_fit import Corners, Squares, costs, fit, independent, poses_of_views, with_pose_noise
+from objslam.graph.tags.square_rows import SquareRows
 from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 from objslam.mapping import pipeline
 
@@ -207,9 +207,11 @@ def test_rows_of_squares_are_the_ties_without_the_pose(known: bool) -> None:
     truth, rng = squares(3, seed=8), np.random.default_rng(8)
     sides = truth.side if known else np.full(3, np.nan)
     rows = SquareRows(np.arange(3), np.arange(12).reshape(3, 4), truth.shape, sides)
-    assert np.abs(rows.rows(truth.corners.reshape(-1, 3))[0]).max() < 1e-6
+    no_poses = np.zeros((0, 4, 4))
+    assert np.abs(rows.rows(no_poses, truth.corners.reshape(-1, 3))[0]).max() < 1e-6
     bent = truth.corners.reshape(-1, 3) + 1e-4 * rng.normal(size=(12, 3))
-    residual, derivative = rows.rows(bent)
+    residual, derivative, told = rows.rows(no_poses, bent)
+    assert told == pytest.approx((residual**2).sum() / 2)
     for t in range(3):
         made = tag_ties(np.array([t]), rows.corner[t : t + 1], truth.shape[:1], sides[t : t + 1], truth.side[t : t + 1], 1e3)
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -226,7 +228,7 @@ def test_rows_of_squares_are_the_ties_without_the_pose(known: bool) -> None:
         for c in range(12):
             step = np.zeros((12, 3))
             step.reshape(3, 12)[t, c] = 1e-7
-            change = (rows.rows(bent + step)[0] - rows.rows(bent - step)[0])[t] / 2e-7
+            change = (rows.rows(no_poses, bent + step)[0] - rows.rows(no_poses, bent - step)[0])[t] / 2e-7
             np.testing.assert_allclose(change, derivative[t][:, c], atol=2e-2 * np.abs(derivative[t]).max())
 
 

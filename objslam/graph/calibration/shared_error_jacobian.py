@@ -235,7 +235,7 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
     def poses(measured: Floats) -> Floats:
         return np.einsum("kij,kj->ki", absolute_root, log_se3(inverse(measured) @ absolute))
 
-    squares, landmarks = graph.squares, of.positions[of.landmarks]
+    (squares, *_), landmarks = graph.further, of.positions[of.landmarks]
 
     def sides(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
         tags = of.measured.tags
@@ -254,5 +254,5 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
             lambda keyframes, rays, settings: (keyframes.map_T_camera[: len(absolute)],),
             poses,
         ),
-        _Part(len(of.rows.residual) - 12 * len(squares.tag), sides, lambda side: squares.by_sides(landmarks, side)),
+        _Part(graph.first_further, sides, lambda side: squares.by_sides(landmarks, side)),
     )

@@ -16,17 +16,17 @@ from objslam.core.geometry import adjoint, inverse, log_se3
 from objslam.core.rotation import skew
 from objslam.core.statistics import CAUCHY_K, HUBER_K
 from objslam.core.types import Association, Rays
-from objslam.graph.assembly import Measurements
+from objslam.graph.assembly import Measurements, RowsOfKind
 from objslam.graph.factors.bearing import EQ1_SIGMA, ray_jacobians, ray_residuals, residual_axes
 from objslam.graph.factors.localization import localization_covariance
 from objslam.graph.factors.odometry import JUMP
 from objslam.graph.factors.priors import ANCHOR
-from objslam.graph.least_squares.square_rows import SquareRows
+from objslam.graph.tags.square_rows import SquareRows
 
 
 @dataclass(frozen=True)
 class JointRows:
-    """A graph at some values: M rows in the order of `Measurements.factors`, then twelve for each fiducial with corners.
+    """A graph at some values: M rows in the order of `Measurements.factors`, then those of `Measurements.further_rows`.
 
     The robust weights are in the rows.
     jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. residual: (M,) whitened.
@@ -42,17 +42,17 @@ class JointRows:
 class JointGraph:
     """The measurements of a joint solve with Huber's loss.
 
-    which: (n,) the rays in the graph, of the rays of `measured`. rays: these rays. landmark: (n,) the row of each ray's
-    landmark in `weak`. weak: (m, 3) m, the means of the landmarks' weak priors. squares: fiducials, whose corners are
-    landmarks. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each row.
+    which: (n,) the rays in the graph, of the rays of `measured`. rays: these rays. landmarks: (m,) the landmarks in the
+    graph. landmark: (n,) the row of each ray's landmark in `landmarks`. weak: (m, 3) m, the means of the landmarks' weak
+    priors. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each row.
     """
 
     measured: Measurements
     which: Ints
     rays: Rays
+    landmarks: Ints
     landmark: Ints
     weak: Floats
-    squares: SquareRows
     pattern: tuple[Ints, Ints]
 
     @classmethod
@@ -60,15 +60,18 @@ class JointGraph:
         """Make the graph of the rays `used` (R,). Landmarks without a position (N, 3) are not in it."""
         which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
         landmark = np.searchsorted(landmarks, association.object[which])
-        squares = SquareRows.of(measured.tags, landmarks)
         rays = measured.rays.take(which)
-        pattern = _pattern(measured, rays, landmark, len(landmarks), squares)
-        return cls(measured, which, rays, landmark, positions[landmarks], squares, pattern)
+        pattern = _pattern(measured, rays, landmark, landmarks)
+        return cls(measured, which, rays, landmarks, landmark, positions[landmarks], pattern)
 
     def measuring(self, measured: Measurements) -> Self:
         """Return the graph of the same rays and landmarks with other measured values."""
-        squares = self.squares.sized(measured.tags)
-        return replace(self, measured=measured, rays=measured.rays.take(self.which), squares=squares)
+        return replace(self, measured=measured, rays=measured.rays.take(self.which))
+
+    @cached_property
+    def further(self) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
+        """The kinds of factors that bring their own rows. The first are the fiducials, whose corners are landmarks."""
+        return self.measured.further_rows(self.rays, self.landmarks[self.landmark], self.landmarks)
 
     @cached_property
     def ranged(self) -> Ints:
@@ -89,6 +92,12 @@ class JointGraph:
     def first_motion(self) -> int:
         """The first row of the motions."""
         return self.first_range + len(self.ranged) + self.weak.size
+
+    @property
+    def first_further(self) -> int:
+        """The first row of the kinds in `further`."""
+        absolute = len(self.measured.keyframes) if self.measured.keyframes.localized_every else 1
+        return self.first_motion + 6 * (len(self.steps) + absolute)
 
     @cached_property
     def motion_roots(self) -> Floats:
@@ -169,20 +178,21 @@ class JointGraph:
         on_landmark = (map_T_camera[rays.keyframe, :3, :3][ray] @ by_seen[..., None])[..., 0]
         seen_rows = np.hstack([on_landmark, np.cross(by_seen, seen[ray]), -by_seen])
         way, move_rows, move_cost = self._motion_rows(map_T_camera)
-        bent, by_corner = self.squares.rows(landmarks)
+        further = [kind.rows(map_T_camera, landmarks) for kind in self.further]
         apart, absolute_roots, absolute_cost = self.absolute_roots(map_T_camera)
         held = (absolute_roots @ apart[..., None]).ravel()
         weak = (landmarks - self.weak).ravel() / self.measured.settings.joint.prior_sigma
         by_weak = np.full(weak.size, 1 / self.measured.settings.joint.prior_sigma)
         by_absolute = (absolute_roots @ _by_end(apart)).ravel()
-        data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute, by_corner.ravel()])
+        by_further = [derivatives.ravel() for _, derivatives, _ in further]
+        data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute, *by_further])
         columns, first = self.pattern
         jacobian = sparse.csr_matrix((data, columns.copy(), first.copy()), shape=(len(first) - 1, len(self.blocks)))
         jacobian.eliminate_zeros()  # On a plane, half of the entries are zero.
         past = range_root * (distance - rays.range[ranged])
-        residual = np.concatenate([(roots * off).ravel(), past, weak, way, held, bent.ravel()])
-        squared = (weak @ weak + (bent**2).sum()) / 2
-        cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + move_cost.sum() + squared
+        residual = np.concatenate([(roots * off).ravel(), past, weak, way, held, *(off.ravel() for off, _, _ in further)])
+        cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + move_cost.sum() + weak @ weak / 2
+        cost += sum(cost for _, _, cost in further)
         return JointRows(jacobian, residual, float(cost))
 
     def motion_weights(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
@@ -222,9 +232,9 @@ def _steps(measured: Measurements) -> Ints:
     return np.flatnonzero(measured.keyframes.measured)
 
 
-def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: int, squares: SquareRows) -> tuple[Ints, Ints]:
+def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: Ints) -> tuple[Ints, Ints]:
     """Return the columns of all entries of the Jacobian, row by row, and the first entry of each row."""
-    first_pose = 3 * landmarks
+    first_pose = 3 * len(landmarks)
     on_landmark = 3 * landmark[:, None] + np.arange(3)
     seen = np.hstack([on_landmark, first_pose + 6 * rays.keyframe[:, None] + np.arange(6)])
     moved = first_pose + 6 * _steps(measured)[:, None] + np.arange(12)
@@ -236,7 +246,10 @@ def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: int,
         np.arange(first_pose)[:, None],
         np.repeat(moved, 6, axis=0),
         np.repeat(absolute, 6, axis=0),
-        np.repeat(squares.columns, 12, axis=0),
+        *(
+            np.repeat(kind.columns, kind.rows_each, axis=0)
+            for kind in measured.further_rows(rays, landmarks[landmark], landmarks)
+        ),
     )
     lengths = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
     columns = np.concatenate([part.ravel() for part in parts])

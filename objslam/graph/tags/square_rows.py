@@ -41,12 +41,18 @@ class SquareRows:
         return self if tags is None else replace(self, side=tags.side[self.tag])
 
     @property
+    def rows_each(self) -> int:
+        """The rows of a square: three for each corner."""
+        return 12
+
+    @property
     def columns(self) -> Ints:
         """(T, 12) the columns of the corners of each square."""
         return (3 * self.corner[:, :, None] + np.arange(3)).reshape(-1, 12)
 
-    def rows(self, landmarks: Floats) -> tuple[Floats, Floats]:
-        """Return the whitened residuals (T, 12) at landmarks (m, 3), m, and their derivatives (T, 12, 12) by the corners."""
+    def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:
+        """Return the whitened residuals (T, 12) at landmarks (m, 3), m, their derivatives (T, 12, 12) by the corners, and
+        the cost. The poses (P, 4, 4) do not count."""
         corners = landmarks[self.corner]
         rotation, centre, found = squares_of(corners, self.shape)
         free = np.isnan(self.side)
@@ -57,7 +63,8 @@ class SquareRows:
         by_square[:, :, 6] *= free[:, None]
         off = np.eye(12) - by_square @ np.linalg.pinv(by_square)
         sigma = self._sigma(side)
-        return (corners - square).reshape(-1, 12) / sigma[:, None], off / sigma[:, None, None]
+        bent = (corners - square).reshape(-1, 12) / sigma[:, None]
+        return bent, off / sigma[:, None, None], float((bent**2).sum() / 2)
 
     def by_sides(self, landmarks: Floats, sides: Floats) -> Floats:
         """Return the whitened residuals (T, 12) at sides (T,), m, with the noise of the present sides. A free side has 0."""
