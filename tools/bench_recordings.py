@@ -1,0 +1,194 @@
+"""Map recorded drives with default settings, and compare each map with its truth and with its own sigmas.
+
+    python tools/bench_recordings.py [--parts named short cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
+
+named: UTIAS MRCLAM 6 and 7 (15 landmarks, the odometry of wheels) and Lost in the Woods (17 posts, one observation a
+second), each landmark with a label of its own, from bearings and with ranges. short: parts of the MRCLAM drives of two to
+five minutes. unnamed: the same drives with ranges, and one label for all landmarks. cube: a cabinet of TUM fr3 at the poses
+of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses.
+
+Maps from odometry are compared after SE(2) alignment. The truth is inside a 95 % ellipsoid in 95 % of the cases, if the
+covariances are right. Times are of the processor, for the map alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "real"))
+from log_parts import part
+from lost_in_the_woods import read_lost_in_the_woods
+from ycbv import RUNS, read_ycbv
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
+from objslam.core.types import Log, Trajectory
+from objslam.errors import ObjslamError
+from objslam.evaluation.evaluate import evaluate
+from objslam.mapping import pipeline
+from objslam.sources import SourceOptions, read
+
+RADIUS = 2.0
+"""The radius of a match, m, of landmarks whose labels identify them. A large error must not count as a missed landmark."""
+UNNAMED_RADIUS = 0.5
+"""The radius of a match, m, where all labels are equal. The landmarks are 0.1 m and more apart."""
+DRIVES = (("mrclam_ds6", (1, 3, 5)), ("mrclam_ds7", (1, 3)))
+PARTS = ((0, 300), (300, 600), (600, 900), (200, 320), (800, 1000))
+"""The begins and ends, s, of the parts of a drive."""
+CABINET = np.array([-1.520, 0.454])
+"""The x and y, m, of the cabinet's centre in the depth images, fused with the true poses."""
+
+
+def drives(data: Path, only: str, with_range: bool) -> Iterator[tuple[str, Log]]:
+    """Read the drives whose name contains `only`: 6-1, ..., 7-3, woods."""
+    for folder, robots in DRIVES:
+        for robot in robots:
+            name = f"{folder[-1]}-{robot}"
+            if only in name:
+                yield name, read(data / folder, Ledger(), SourceOptions(robot=robot, with_range=with_range))
+    if only in "woods":
+        yield "woods", read_lost_in_the_woods(data / "lost_in_the_woods", with_range=with_range)
+
+
+def solve(log: Log, overrides: list[str]) -> tuple[RunResult, float]:
+    """Return the result in joint mode, and the seconds of the processor."""
+    begin = time.process_time()
+    settings = load_settings(None, ("mode=joint", "output.recording=false", *overrides))
+    return pipeline.run(log, settings, Ledger()), time.process_time() - begin
+
+
+def judged(log: Log, result: RunResult, radius: float = RADIUS, align: str = "se2") -> dict:
+    """Compare the map and the path with the truth."""
+    stamps, first = np.unique(result.keyframes.stamps, return_index=True)
+    path = Trajectory(stamps, result.map_T_base[first])
+    return evaluate(result.map, log.truth, path, align=align, radius=radius).to_dict()
+
+
+def compare(data: Path, only: str, overrides: list[str], names: bool) -> None:
+    """Print a line for each drive."""
+    print(
+        "whole drives, each landmark with its own label"
+        if names
+        else "whole drives with ranges, one label for all landmarks"
+    )
+    print(
+        f"{'drive':<7}{'range':>6}{'right':>7}{'false':>7}{'missed':>8}{'RMSE m':>8}{'without scale':>15}{'inside 95 %':>13}"
+        f"{'median Mahalanobis^2':>22}{'ATE m':>8}{'s':>7}"
+    )
+    for with_range in (False, True) if names else (True,):
+        for name, log in drives(data, only, with_range):
+            log = log if names else unnamed(log)
+            result, seconds = solve(log, overrides)
+            found = judged(log, result, RADIUS if names else UNNAMED_RADIUS)
+            scaled = judged(log, result, RADIUS if names else UNNAMED_RADIUS, "sim2")
+            inside = f"{round(found['inside_95_3d'] * found['matched'])} of {found['matched']}"
+            print(
+                f"{name:<7}{'yes' if with_range else 'no':>6}{found['matched']:7d}{found['false']:7d}{found['missed']:8d}"
+                f"{found['position_rmse']:8.3f}{scaled['position_rmse']:15.3f}{inside:>13}{found['mahalanobis_median']:22.2f}"
+                f"{found['ate']:8.3f}{seconds:7.1f}",
+                flush=True,
+            )
+
+
+def unnamed(log: Log) -> Log:
+    """The same log with one label."""
+    assert log.truth is not None
+    cameras = []
+    for camera in log.cameras:
+        assert camera.detections is not None
+        zeros = np.zeros_like(camera.detections.label)
+        cameras.append(replace(camera, detections=replace(camera.detections, label=zeros, label_names=("landmark",))))
+    objects = tuple(replace(one, label="landmark") for one in log.truth.objects)
+    return replace(log, cameras=tuple(cameras), truth=replace(log.truth, objects=objects))
+
+
+def short(data: Path, only: str, overrides: list[str]) -> None:
+    """Landmarks of parts of the MRCLAM drives, without and with range."""
+    print("parts of UTIAS MRCLAM 6 and 7, each landmark with its own label")
+    print(
+        f"{'range':>6}{'parts':>7}{'landmarks':>11}{'inside 95 %':>13}{'median Mahalanobis^2':>22}{'RMSE m':>8}{'s a part':>10}"
+    )
+    for with_range in (False, True):
+        inside, squared, errors, times = 0, [], [], []
+        for name, whole in drives(data, only, with_range):
+            for begin, end in PARTS if name != "woods" else ():
+                log = part(whole, begin, end)
+                try:
+                    result, seconds = solve(log, overrides)
+                except ObjslamError as error:  # One robot saw no landmark in one part.
+                    print(f"{name}, {begin} to {end} s: {error}", file=sys.stderr)
+                    continue
+                found = judged(log, result)
+                inside += round(found["inside_95_3d"] * found["matched"])
+                squared.append(found["mahalanobis_median"])
+                errors += [one["error"] for one in found["objects"]]
+                times.append(seconds)
+        if errors:
+            print(
+                f"{'yes' if with_range else 'no':>6}{len(squared):7d}{len(errors):11d}{inside / len(errors):13.1%}"
+                f"{np.median(squared):22.2f}{np.sqrt(np.mean(np.square(errors))):8.3f}{np.mean(times):10.1f}",
+                flush=True,
+            )
+
+
+def cube(data: Path, overrides: list[str]) -> None:
+    """The cabinet's horizontal error, poses fixed, with depths and without."""
+    print("TUM fr3_cabinet (cube_slam), fixed")
+    print(f"{'depth':>6}{'horizontally m':>16}{'height m':>10}{'rays':>6}{'rms deg':>9}{'s':>7}")
+    for use in ("true", "false"):
+        log = read(data / "cube_slam", Ledger(), SourceOptions(label="cabinet"))
+        result, seconds = solve(log, ["mode=fixed", f"depth.use={use}", *overrides])
+        for cabinet in result.map.resolved():
+            off = np.linalg.norm(cabinet.position[:2] - CABINET)
+            yes = "yes" if use == "true" else "no"
+            print(f"{yes:>6}{off:16.4f}{cabinet.position[2]:10.3f}{cabinet.rays:6d}{cabinet.rms_deg:9.2f}{seconds:7.1f}")
+
+
+def ycbv(data: Path, overrides: list[str]) -> None:
+    """The error of one object a run, against its covariance, poses fixed."""
+    print("DOPE on YCB-Video, fixed")
+    print(f"{'run':<24}{'error m':>9}{'sigma m':>9}{'Mahalanobis^2 (95 %: 7.81)':>28}{'s':>7}")
+    for name, run in RUNS:
+        log = read_ycbv(data / "ycbv_dope", name, run)
+        result, seconds = solve(log, ["mode=fixed", *overrides])
+        assert log.truth is not None
+        for one in result.map.resolved():
+            off = one.position - log.truth.objects[0].position
+            squared = off @ np.linalg.solve(one.covariance, off)
+            sigma = np.sqrt(np.trace(one.covariance))
+            print(f"{name + ' ' + run:<24}{np.linalg.norm(off):9.4f}{sigma:9.4f}{squared:28.2f}{seconds:7.1f}", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = ("named", "short", "cube", "ycbv", "unnamed")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
+    parser.add_argument("--only", default="", help="only the drives whose name contains this, such as 6-1 or woods")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs")
+    arguments = parser.parse_args()
+    folder = os.environ.get("OBJSLAM_DATA")
+    if folder is None or not Path(folder).is_dir():
+        sys.exit("OBJSLAM_DATA names no folder with the recordings")
+    data, only, overrides = Path(folder), arguments.only, arguments.set
+    work = {
+        "named": lambda: compare(data, only, overrides, names=True),
+        "short": lambda: short(data, only, overrides),
+        "cube": lambda: cube(data, overrides),
+        "ycbv": lambda: ycbv(data, overrides),
+        "unnamed": lambda: compare(data, only, overrides, names=False),
+    }
+    for name in arguments.parts:
+        work[name]()
+
+
+if __name__ == "__main__":
+    main()
