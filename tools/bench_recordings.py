@@ -115,7 +115,8 @@ def short(data: Path, only: str, overrides: list[str]) -> None:
     """Landmarks of parts of the MRCLAM drives, without and with range."""
     print("parts of UTIAS MRCLAM 6 and 7, each landmark with its own label")
     print(
-        f"{'range':>6}{'parts':>7}{'landmarks':>11}{'inside 95 %':>13}{'median Mahalanobis^2':>22}{'RMSE m':>8}{'s a part':>10}"
+        f"{'range':>6}{'parts':>7}{'landmarks':>11}{'inside 95 %':>13}{'median Mahalanobis^2':>22}{'RMSE m':>8}"
+        f"{'s a part':>10}"
     )
     for with_range in (False, True):
         inside, squared, errors, times = 0, [], [], []
