@@ -20,16 +20,33 @@ if TYPE_CHECKING:
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
     """Show a progress bar if stderr is a terminal. Yield a function that updates the bar.
-    It takes the stage name, the number of finished items, and the total number of items, 0 if unknown. The clock of the bar
-    shows the time of the stage."""
+
+    It takes the stage name, the number of finished items, and the total number of items, 0 if unknown. The bar shows the
+    time since the stage began, and how many items it finishes in a second.
+    """
     screen = console(stderr=True)
     if not screen.is_terminal:
         yield lambda stage, done, total: None
         return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        SpinnerColumn,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+    from rich.text import Text
 
     words = TextColumn("{task.description}", markup=False)
-    columns = (SpinnerColumn(), words, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+
+    class Rate(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text(f"{task.speed:.1f}/s" if task.speed else "")
+
+    columns = (SpinnerColumn(), words, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Rate())
     with Progress(*columns, console=screen, transient=True) as bar:
         shown = "reading"
         task = bar.add_task(shown, total=None)
@@ -38,7 +55,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
             nonlocal shown, task
             if stage != shown:  # rich stops the clock of a finished task, and never forgets a total.
                 bar.remove_task(task)
-                shown, task = stage, bar.add_task(printable(stage), total=None)
+                shown, task = stage, bar.add_task(printable(stage), total=total or None)
             bar.update(task, completed=done, total=total or None)
 
         yield show

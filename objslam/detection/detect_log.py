@@ -1,7 +1,6 @@
 """Detection in a log: the detector finds the boxes in each rgb image."""
 
 import hashlib
-import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -52,12 +51,10 @@ def detect_log(
         )
     for warning in detector.warnings:
         ledger.warn(warning)
-    done, begin = count(1), time.perf_counter()
+    done = count(1)
 
     def step() -> None:
-        number = next(done)
-        rate = number / max(time.perf_counter() - begin, 1e-6)
-        progress(f"detecting, {rate:.1f} frames/s", number, total)
+        progress("detecting", next(done), total)
 
     progress("detecting", 0, total)
     with nullcontext() if cache is None else DetectionCache(cache, detector.key, ledger) as store:

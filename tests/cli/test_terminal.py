@@ -119,6 +119,25 @@ def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before(monkeypatch):
     assert "220" not in after
 
 
+def test_the_bar_of_a_stage_shows_its_count_from_the_start_and_its_rate(monkeypatch):
+    screen = Tty()
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("TERM", "xterm")
+    terminal.console.cache_clear()
+    try:
+        with terminal.progress_bar() as show:
+            mark = len(screen.getvalue())
+            for done in range(221):
+                show("detecting", done, 220)
+    finally:
+        terminal.console.cache_clear()
+    after = screen.getvalue()[mark:]
+    assert "/?" not in after
+    assert "220/220" in after
+    assert "/s" in after
+
+
 def test_the_status_line_says_why_most_was_dropped(monkeypatch):
     """Also what the adapter dropped, and apart from it what the settings leave unused."""
     monkeypatch.setattr("objslam.cli.live_command.status._LINES", 0.0)

@@ -89,7 +89,7 @@ def test_every_image_is_a_frame_with_its_boxes(log, tmp_path, batch):
     assert (detections.track_ids == -1).all()
     assert not ledger.lines()
     assert [step[1:] for step in told] == [(done, FRAMES) for done in range(FRAMES + 1)]
-    assert all("frames/s" in stage for stage, _, _ in told[1:])
+    assert {stage for stage, _, _ in told} == {"detecting"}  # A new name would start the clock of the bar again.
     assert log.cameras[0].detections is None  # the log that came in is as it was
 
 
