@@ -3,10 +3,10 @@
     python tools/bench_association.py [--seeds 20] [--parts scenes speed drift ...] [--picture PNG]
 
 scenes: simulated drives with known poses. speed: the time and memory for a short and a long log. drift: simulated drives
-from odometry alone, whose poses and objects are estimated together. mrclam: the recording UTIAS MRCLAM 6 without identities,
-in the folder OBJSLAM_DATA. unnamed: drives of peers/drives.py, mapped with and without the names of their landmarks.
-street: poles seen from a few places with the noise of GPS, beside a Markov random field. appearance: clusters of objects of
-one label, with and without appearance vectors, of which a fifth confuse the object.
+from odometry alone, whose poses and objects are estimated together. unnamed: drives of peers/drives.py, mapped with and
+without the names of their landmarks (tools/bench_recordings.py has more recordings without names). street: poles seen from
+a few places with the noise of GPS, beside a Markov random field. appearance: clusters of objects of one label, with and
+without appearance vectors, of which a fifth confuse the object.
 """
 
 from __future__ import annotations
@@ -37,10 +37,9 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import pipeline
 from objslam.output.plot.map_plot import draw_map
 from objslam.simulation import AppearanceNoise, DriveSettings, PoseNoise, pair, preset, simulate
-from objslam.sources import SourceOptions, read
 from objslam.triangulation.triangulate import triangulate
 
-PARTS = ("scenes", "speed", "drift", "mrclam", "unnamed", "street", "appearance")
+PARTS = ("scenes", "speed", "drift", "unnamed", "street", "appearance")
 UNNAMED = ("lost in the woods", "Victoria Park")
 """The drives of the part `unnamed`."""
 STEP_DRIFT = {
@@ -173,25 +172,6 @@ def drift(seeds: int, picture: Path | None) -> None:
         print(f"{seed:<14}{f1:>7.3f}{ate:>9.3f}{before:>18.3f}{ate / before:>7.2f}{seconds:>7.1f}")
     worse = int((np.array(ratios) > 1 / 3).sum())
     print(f"{'mean':<14}{np.mean(scores):>7.3f}{'':>27}{np.mean(ratios):>7.2f}   above a third: {worse} of {seeds}")
-
-
-def mrclam() -> None:
-    """Print what is found of the 15 landmarks of MRCLAM 6 when all are called the same."""
-    folder = Path(os.environ.get("OBJSLAM_DATA", "")) / "mrclam_ds6"
-    if not folder.is_dir():
-        print(f"mrclam: {folder} is not there (OBJSLAM_DATA)")
-        return
-    print(f"{'MRCLAM 6, anonymous':<22}{'matched':>9}{'of':>4}{'false':>7}{'RMSE m':>9}{'s':>7}")
-    for robot, with_range in ((1, True), (3, True), (5, True), (1, False), (5, False)):
-        log = read(folder, Ledger(), SourceOptions(robot=robot, anonymous=True, with_range=with_range))
-        begin = time.perf_counter()
-        result = pipeline.run(log, Settings.model_validate({"mode": "joint"}), Ledger())
-        seconds = time.perf_counter() - begin
-        assert log.truth is not None
-        found = evaluate(result.map, log.truth, result.path_after, align="se2", radius=0.3).objects
-        error = float(np.sqrt(np.mean([(m.offset**2).sum() for m in found.matches]))) if found.matches else np.nan
-        name = f"robot {robot}, " + ("with range" if with_range else "bearings")
-        print(f"{name:<22}{len(found.matches):>9}{15:>4}{len(found.false):>7}{error:>9.3f}{seconds:>7.1f}")
 
 
 def unnamed() -> None:
@@ -394,8 +374,6 @@ def main() -> None:
             speed(frames)
     if "drift" in arguments.parts:
         drift(seeds, arguments.picture)
-    if "mrclam" in arguments.parts:
-        mrclam()
     if "unnamed" in arguments.parts:
         unnamed()
     if "street" in arguments.parts:
