@@ -178,6 +178,8 @@ def read_features(file: Path) -> RayFeatures:
 
     try:
         table = pq.read_table(file, columns=["ray", "features"], partitioning=None)
+        if not pa.types.is_integer(table.schema.field("ray").type) or table["ray"].null_count:
+            raise ValueError("the rays are not whole numbers")
         ray, column = np.asarray(table["ray"].to_numpy(), dtype=np.int64), table["features"].combine_chunks()
         flat = np.asarray(column.flatten().to_numpy(zero_copy_only=False))
         vectors = flat.reshape(len(ray), column.type.list_size)

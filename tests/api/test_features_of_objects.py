@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import objslam
@@ -83,6 +85,15 @@ def test_a_log_without_vectors_has_a_result_without(drive: objslam.Log, result: 
     result.save(tmp_path / "out")
     assert "features.parquet" in bare.save(tmp_path / "out")
     assert load_features(tmp_path / "out") is None
+
+
+@pytest.mark.parametrize("rays", [[0.5, 1.0], [float("nan"), 1.0], [None, 1]])
+def test_vectors_of_rays_without_a_whole_number_are_refused(tmp_path: Path, rays: list[float | None]) -> None:
+    vectors = pa.FixedSizeListArray.from_arrays(pa.array(np.eye(2, dtype=np.float32).ravel()), 2)
+    pq.write_table(pa.table({"ray": rays, "features": vectors}), tmp_path / "features.parquet")
+    (tmp_path / "objects.json").touch()
+    with pytest.raises(objslam.ObjslamError, match="not whole numbers"):
+        load_features(tmp_path)
 
 
 def test_vectors_of_another_length_are_named_or_left_out() -> None:

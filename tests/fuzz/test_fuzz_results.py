@@ -22,17 +22,18 @@ from objslam.config import Output, Settings
 from objslam.core.result import Doubt
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
 from objslam.io.odometry_parquet import Motions, dump_motions
+from objslam.io.rays_parquet import RayFeatures, dump_features
 from objslam.output.export import write_export
 from objslam.output.export.formats import FORMATS
 from objslam.output.report import write_report
 from objslam.output.result_folder import write_result
 from objslam.results import files
-from objslam.results.read import load_trajectory
+from objslam.results.read import load_features, load_trajectory
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A whole result with ground truth, evaluation, shared errors and motions."""
+    """A whole result with ground truth, evaluation, shared errors, motions and appearance vectors."""
     out = tmp_path_factory.mktemp("result")
     positions, labels = clusters()
     plain = Settings(mode="joint", output=Output(recording=False, picture=False))
@@ -59,13 +60,15 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     steps = len(stamps) - 1
     motions = Motions(stamps[:-1], stamps[1:], np.tile(np.eye(4), (steps, 1, 1)), np.tile(1e-4 * np.eye(6), (steps, 1, 1)))
     (out / files.MOTIONS).write_bytes(dump_motions(motions))
-    assert read_everything(out) == [True] * (2 + len(FORMATS))
+    (out / files.FEATURES).write_bytes(dump_features(RayFeatures(rays, np.eye(5, 8, dtype=np.float32))))
+    assert read_everything(out) == [True] * (3 + len(FORMATS))
     return out
 
 
 def read_everything(out: Path) -> list[bool]:
     """Read a result folder with every command, and return which commands take it."""
     taken = [survives(lambda: write_report(out, crops=0)), survives(lambda: evaluate_folder(out))]
+    taken += [survives(lambda: load_features(out))]
     return taken + [survives(lambda name=name: write_export(out, name)) for name in FORMATS]  # type: ignore[misc]
 
 
@@ -78,6 +81,7 @@ def with_file(result: Path, name: str, data: bytes) -> Path:
 
 
 JSON_FILES = (files.SUMMARY, files.EVALUATION, files.OBJECTS, files.TRUTH_OBJECTS, files.DOUBTS)
+TABLES = (files.RAYS, files.MOTIONS, files.FEATURES)
 
 
 @pytest.mark.parametrize("name", JSON_FILES)
@@ -96,7 +100,7 @@ def test_optional_keys_that_are_missing(result: Path) -> None:
     assert Result.load(out).assessment.reasons == ()
 
 
-@pytest.mark.parametrize("name", [*JSON_FILES, files.TRAJECTORY, files.CONFIG, files.RAYS, files.MOTIONS])
+@pytest.mark.parametrize("name", [*JSON_FILES, files.TRAJECTORY, files.CONFIG, *TABLES])
 def test_mutated_bytes(result: Path, name: str) -> None:
     for data in mutated((result / name).read_bytes(), 4):
         read_everything(with_file(result, name, data))
@@ -105,7 +109,7 @@ def test_mutated_bytes(result: Path, name: str) -> None:
 CELLS = [None, 0.0, -1.0, 1e8, 1e300, float("nan"), float("inf"), "x", b"x", 2**62, True, [], [1.0], [1.0] * 16, [None] * 3]
 
 
-@pytest.mark.parametrize("name", [files.RAYS, files.MOTIONS])
+@pytest.mark.parametrize("name", TABLES)
 @settings(max_examples=12 * ROUNDS)
 @given(data=st.data())
 def test_altered_tables(result: Path, name: str, data: st.DataObject) -> None:
