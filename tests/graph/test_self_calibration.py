@@ -17,7 +17,7 @@ from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import linearise
-from objslam.graph.calibration.variance_components import TOGETHER
+from objslam.graph.calibration.variance_components import correlation_time
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import make_values, read_poses, with_points
 from objslam.io.calibration_yaml import dump_calibration
@@ -168,7 +168,8 @@ def test_errors_that_hang_together_make_the_gradient_less_certain():
     white = rng.standard_normal(len(system.residual))
     k = errors.names.index("front.yaw")
     assert correlation_factors(state, replace(system, residual=white))[k] < 1.4
-    window = np.floor((rows - made.keyframes.stamps[0]) / TOGETHER).astype(int)
+    stamps = made.keyframes.stamps
+    window = np.floor((rows - stamps[0]) / correlation_time(stamps)).astype(int)
     pushes = system.sides[:, k] + system.jacobian @ system.reduce().sensitivity[:, k]  # what poses and places leave of it
     together = white.copy()
     together[: len(rows)] = rng.standard_normal(window.max() + 1)[window] * np.sign(pushes[: len(rows)])

@@ -12,7 +12,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.batch_solver import solve_joint
-from objslam.graph.calibration.variance_components import _azimuth_elevation
+from objslam.graph.calibration.variance_components import _azimuth_elevation, correlation_time
 from objslam.simulation import DepthNoise, preset, simulate
 
 HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "clock", "range_scale"))
@@ -77,6 +77,14 @@ def test_the_map_has_the_size_of_the_odometry():
     """Bearings alone, odometry three times as noisy as the default: joint solves shrink without the correction."""
     scales = np.array([scale_of(*solved(3.0, seed=seed, frames=300)) for seed in range(6)])
     assert abs(scales.mean() - 1) < 3 * scales.std() / np.sqrt(len(scales)) + 0.01
+
+
+@pytest.mark.parametrize(("duration", "told"), [(0.0, 3.0), (40.0, 3.0), (150.0, 5.0), (900.0, 10.0)])
+def test_a_longer_log_finds_slower_errors(duration, told):
+    stamps = 1.7e9 + np.array([0.0, duration / 3, duration])
+    assert correlation_time(stamps) == pytest.approx(told)
+    assert correlation_time(stamps[::-1]) == pytest.approx(told)  # clocks can change the order of images
+    assert correlation_time(np.zeros(0)) == 3.0
 
 
 def test_bearings_are_split_into_azimuth_and_elevation():

@@ -9,21 +9,21 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
-from objslam.graph.calibration.variance_components import TOGETHER
+from objslam.graph.calibration.variance_components import correlation_time
 
 
 def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
 
-    A factor is the standard deviation by sums over windows of `TOGETHER` seconds, divided by the one for white noise.
-    system: the linear system of the graph `of`.
+    A factor is the standard deviation by sums over windows of `correlation_time` seconds, divided by the one for white
+    noise. system: the linear system of the graph `of`.
     """
     jacobian = system.jacobian
     told = np.column_stack([system.residual, system.instruments, system.sides])
     left = told - jacobian @ system.normal.solve(jacobian.T @ told)
     count = system.sides.shape[1]
     parts, reduced = left[:, 1 : 1 + count] * left[:, :1], left[:, 1 + count :]
-    window = np.floor(_seconds(of, system) / TOGETHER).astype(np.int64)
+    window = np.floor(_seconds(of, system) / correlation_time(of.measured.keyframes.stamps)).astype(np.int64)
     sums = np.zeros((int(window.max(initial=0)) + 1, count))
     np.add.at(sums, window, parts)
     white = np.maximum((reduced**2).sum(axis=0), 1e-300)
