@@ -23,27 +23,31 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
 
     Only scales of the odometry and clocks have such noise. For a scale, it is the product of the noise in the instrument and
     in the eliminated side. Neighbours have independent noise, but the poses that are eliminated spread the noise of a motion
-    over the residuals of its neighbours. For a clock, it is the square of the noise in the eliminated side. The products are
-    traces, which random probes measure (Hutchinson 1990). A probe is a random walk at the stamps of the odometry, because
-    keyframes between two stamps share a step. The noise is at most as rough as the measured motions, and leaves at most the
-    residuals of the solution. Commanded motions are smooth: their residuals come from the robot and not from the
-    measurement, so the sides have no noise.
+    over the residuals of its neighbours. For a clock, it is the square of the noise in the eliminated side, but not of ties:
+    the path is their instrument. The products are traces, which random probes measure (Hutchinson 1990). A probe is a random
+    walk at the stamps of the odometry, because keyframes between two stamps share a step. The noise is at most as rough as
+    the measured motions, and leaves at most the residuals of the solution. Commanded motions are smooth: their residuals
+    come from the robot and not from the measurement, so the sides have no noise.
     """
     names, clocks = errors.names, {} if system.clocks is None else system.clocks.moved
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}
-    motions, stamps, steps = system.motions, of.measured.keyframes.stamps, of.graph.steps
+    motions, stamps, (before, after) = system.motions, of.measured.keyframes.stamps, of.graph.moves
     if motions is None or not (scales or clocks):
         return np.zeros(len(names))
-    sigma = np.sqrt(np.einsum("kii->ki", motions.covariance)) / np.sqrt(np.maximum(motions.seconds, 1e-9))[:, None]
+    sigma = motions.by_odometry * np.sqrt(np.einsum("kii->ki", motions.covariance))
+    sigma /= np.sqrt(np.maximum(motions.seconds, 1e-9))[:, None]
+    chain = motions.ties.start - motions.rows.start
     walks = _random_walks(errors.odometry_stamps)
-    walk = np.diff(walks(stamps), axis=0)[steps]
+    at = walks(stamps)
+    walk = at[after] - at[before]
     rates = {}
     for k, mine in clocks.items():
         step = errors.steps[k]
-        rates[k] = np.diff(mine[:, None] * (walks(stamps + step) - walks(stamps - step)) / (2 * step), axis=0)[steps]
+        rate = mine[:, None] * (walks(stamps + step) - walks(stamps - step)) / (2 * step)
+        rates[k] = rate[after] - rate[before]
     odometry = of.measured.keyframes.odom_T_base
     assert odometry is not None
-    said = log_se3(inverse(odometry[:-1]) @ odometry[1:])[steps] / sigma
+    said = log_se3(inverse(odometry[before]) @ odometry[after]) / sigma
     residual = system.left(system.residual[:, None])[motions.rows]
     products = np.zeros(len(names))
     for axis in (2, 3, 4):
@@ -58,7 +62,9 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
         probes[motions.rows] = rows(np.hstack([walk, *rates.values()]))
         left = system.left(probes)[motions.rows]
         along = rows(np.ones((len(sigma), 1)))
-        fits = _energy(along * residual) / max(_energy(along * left[:, :_PROBES]), 1e-12)
+        fits = _energy(np.repeat(motions.by_odometry[:, axis], 6)[:, None] * along * residual) / max(
+            _energy(along * left[:, :_PROBES]), 1e-12
+        )
         rough = _roughness(said[:, [axis]], motions.seconds) / max(_roughness(walk, motions.seconds), 1e-12)
         size = min(rough**2, fits)
         for k, axes in scales.items():
@@ -69,7 +75,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
                 products[k] += size * float((told * left[:, :_PROBES]).sum()) / _PROBES
         for i, k in enumerate(rates):
             part = slice(_PROBES * (i + 1), _PROBES * (i + 2))
-            products[k] += size * float((probes[motions.rows, part] * left[:, part]).sum()) / _PROBES
+            products[k] += size * float((probes[motions.rows, part] * left[:, part])[:chain].sum()) / _PROBES
     information = (system.left(system.sides) ** 2).sum(axis=0)
     shares = products / np.maximum(information, 1e-300)
     shares[list(clocks)] = np.clip(shares[list(clocks)], 0.0, 1.0)
