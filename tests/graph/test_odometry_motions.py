@@ -18,7 +18,7 @@ from objslam.graph.optimizers import build_graph
 from objslam.graph.variables import make_values
 from objslam.simulation import preset, simulate
 
-X = 3  # The axis of the twist along x.
+YAW, X, Y = 2, 3, 4  # Axes of a twist.
 ALONG = 1e-4  # m^2 of the odometry's noise in a step
 
 
@@ -96,6 +96,17 @@ def test_a_motion_between_interpolated_poses_has_the_variance_of_both():
     _, covariance = motions(keyframes_at([0.25, 0.75, 1.75, 4.0, 4.5]), Settings())
     known = ALONG * np.array([0.5, 1.0, 2.25, 0.5]) + Settings().odometry.floor_xy ** 2
     assert_allclose(covariance[:, X, X] - known, 4e-3 * np.array([0.25, 0.375, 0.1875, 0.25]), rtol=1e-9)
+
+
+def test_an_unknown_heading_at_the_first_keyframe_turns_the_whole_way():
+    """Both ends of two metres are in the middle of a step."""
+    keyframes = keyframes_at([0.5, 2.5], 0.0)
+    keyframes.wander[:, YAW] = 4e-3
+    _, covariance = motions(keyframes, Settings())
+    of = Settings().odometry
+    assert covariance[0, YAW, YAW] - of.floor_yaw**2 == pytest.approx(2 * 1e-3)
+    assert covariance[0, Y, Y] - of.floor_xy**2 == pytest.approx(1e-3 * 2**2)
+    assert abs(covariance[0, YAW, Y]) == pytest.approx(1e-3 * 2)
 
 
 def test_only_what_was_measured_is_a_motion():

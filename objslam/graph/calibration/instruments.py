@@ -24,7 +24,8 @@ class Motions:
 
     to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. weight: (s,) robust. covariance: (s, 6, 6) of the
     twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their standard deviations. The rest is
-    of the interpolated path. seconds: (s,) durations. rows: of the motions in the linear system. ties: the last of them.
+    of the interpolated path. seconds: (s,) durations. rows: of the motions in the linear system. tied: the share of the
+    motions between keyframes that are below ties.
     """
 
     to_twist: Floats
@@ -33,7 +34,7 @@ class Motions:
     by_odometry: Floats
     seconds: Floats
     rows: slice
-    ties: slice
+    tied: float
 
     @classmethod
     def of(cls, of: Linearised) -> Self:
@@ -50,9 +51,8 @@ class Motions:
         noise = np.einsum("kij,kjl,kil->ki", to_base, odometry.noise, to_base)
         by_odometry = np.sqrt(noise / np.einsum("kii->ki", covariance))
         first = of.graph.first_motion
-        end = first + 6 * len(after)
-        rows, ties = slice(first, end), slice(end - 6 * len(odometry.loose), end)
-        return cls(to_twist, robust, _alike(near, covariance), by_odometry, seconds, rows, ties)
+        rows = slice(first, first + 6 * len(after))
+        return cls(to_twist, robust, _alike(near, covariance), by_odometry, seconds, rows, odometry.tied)
 
     def twists(self, columns: Floats) -> Floats:
         """Return the twists (s, 6, n) of columns (M, n) of the linear system."""

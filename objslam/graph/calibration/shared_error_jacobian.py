@@ -55,18 +55,10 @@ class LinearSystem:
     longer: Floats
 
     def with_noise(self, noise: Floats) -> Self:
-        """Return the system whose sides contain the shares (P,) of noise. They change the instruments of clocks.
-
-        The solved path is the instrument of ties. An interpolated pose has a mean of the noise of two poses of the odometry,
-        so clocks that move the ends of ties away from these poses seem better. Along a chain of motions this cancels,
-        because its keyframes have all shares of a step. The ends of ties do not, if the rates of images and odometry fit. On
-        simulated wheels that slip, with one pose in a second, the sides as instruments moved a clock by 0.09 s.
-        """
+        """Return the system whose sides contain the shares (P,) of noise. They change the instruments of clocks."""
         instruments, columns = self.instruments.copy(), [] if self.clocks is None else list(self.clocks.moved)
         sides = self.sides[:, columns]
         instruments[:, columns] = sides + noise[columns] * (self.by_path - sides)
-        if self.motions is not None:
-            instruments[self.motions.ties, columns] = self.by_path[self.motions.ties]
         return replace(self, instruments=instruments, noise=noise)
 
     def left(self, columns: Floats) -> Floats:

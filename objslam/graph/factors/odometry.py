@@ -40,19 +40,25 @@ def motions(
     odom_T_camera, every = odom_T_base @ keyframes.base_T_camera, np.arange(len(keyframes))
     before, after = (every[:-1], every[1:]) if pairs is None else pairs
     floor = motion_floor(keyframes.base_T_camera[after], settings, on_plane) * (after - before)[:, None, None]
-    floor += wander(keyframes, before, after)
+    gathered = drift[after] - drift[before]
+    if keyframes.wander is not None:
+        gathered += wander(keyframes, before, after)
     camera_T_odom = inverse(odom_T_camera)
-    covariance = motion_covariance(drift[after] - drift[before], adjoint(camera_T_odom[after]), floor)
+    covariance = motion_covariance(gathered, adjoint(camera_T_odom[after]), floor)
     return camera_T_odom[before] @ odom_T_camera[after], covariance
 
 
 def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) -> Floats:
     """Return the covariances (M, 6, 6) of motions by the interpolation between two poses of the odometry.
 
-    In the frame of the last camera. before, after: (M,), (M,) the keyframes. walk: whether the path inside a step is a
-    random walk that the poses of the odometry do not hold. Otherwise it is a bridge (`frontend.odometry_bridge`).
+    Like `Keyframes.drift`, they are in the frame of odom_T_base. Half of the noise of a motion inside a step is at each end.
+
+    Args:
+        before, after: (M,), (M,) the keyframes, with odometry.
+        walk: whether the path inside a step is a random walk that the poses of the odometry do not hold. Otherwise it is a
+            bridge (`frontend.odometry_bridge`).
     """
-    if keyframes.step is None or keyframes.wander is None:
+    if keyframes.step is None or keyframes.wander is None or keyframes.odom_T_base is None:
         return np.zeros((len(before), 6, 6))
     passed = np.floor(keyframes.step)
     share = (keyframes.step - passed)[:, None]
@@ -63,9 +69,14 @@ def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) 
         first, last, inside = (part * (1 - part) for part in (share[before], share[after], np.abs(apart)))
     same = (passed[before] == passed[after])[:, None]
     size = keyframes.wander
-    variance = np.where(same, size[after] * inside, size[before] * first + size[after] * last)
-    to_camera = adjoint(inverse(keyframes.base_T_camera[after]))
-    return np.asarray((to_camera * variance[:, None, :]) @ np.swapaxes(to_camera, -1, -2))
+    half, from_base = size[after] * inside / 2, adjoint(keyframes.odom_T_base)
+    found = np.zeros((len(before), 6, 6))
+    for at, variance in (
+        (before, np.where(same, half, size[before] * first)),
+        (after, np.where(same, half, size[after] * last)),
+    ):
+        found += (from_base[at] * variance[:, None, :]) @ np.swapaxes(from_base[at], -1, -2)
+    return found
 
 
 def _on_plane(keyframes: Keyframes, odom_T_base: Floats) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import adjoint, inverse
 from objslam.core.types import Keyframes
 from objslam.graph.factors.odometry import motions, wander
 
@@ -51,17 +52,23 @@ class OdometryMotions:
         motion, _ = motions(keyframes, settings, pairs=(before, after))
         below = below_ties(ties, len(keyframes))
         bridge = wander(keyframes, before, after)
-        steps = np.arange(max(len(keyframes) - 1, 0))
-        walk = wander(keyframes, steps, steps + 1, walk=True)
-        total = np.concatenate([np.zeros((1, 6, 6)), np.cumsum(walk, axis=0)])
         here = np.flatnonzero(below[chain])
-        bridge[here] = walk[chain[here]]
-        loose = total[ties[:, 1]] - total[ties[:, 0]]
+        walk = np.zeros((len(keyframes), 6, 6))
+        walk[chain[here] + 1] = bridge[here] = wander(keyframes, chain[here], chain[here] + 1, walk=True)
+        total = np.cumsum(walk, axis=0)
+        bridge = _in_camera(keyframes, after, bridge)
+        loose = _in_camera(keyframes, ties[:, 1], total[ties[:, 1]] - total[ties[:, 0]])
         found = cls(before, after, motion, bridge, bridge, loose)
         return found.with_noise(found.noise_of(keyframes, settings))
 
     def __len__(self) -> int:
         return len(self.before)
+
+    @property
+    def tied(self) -> float:
+        """The share of the motions between consecutive keyframes that are below ties."""
+        chain = len(self) - len(self.loose)
+        return float((self.after[chain:] - self.before[chain:]).sum()) / max(chain, 1)
 
     def noise_of(self, keyframes: Keyframes, settings: Settings) -> Floats:
         """Return the noise (M, 6, 6) of the same motions of other keyframes, or for other settings."""
@@ -79,6 +86,16 @@ class OdometryMotions:
         if len(self.loose):
             covariance[ties] = _remaining(covariance[ties], self.noise[ties] + self.loose)
         return covariance
+
+
+def _in_camera(keyframes: Keyframes, last: Ints, covariance: Floats) -> Floats:
+    """Return covariances (M, 6, 6), in the frame of odom_T_base, in the frames of the keyframes `last` (M,)."""
+    if not covariance.any():
+        return covariance
+    assert keyframes.odom_T_base is not None
+    to_camera = adjoint(inverse(keyframes.odom_T_base[last] @ keyframes.base_T_camera[last]))
+    moved = to_camera @ covariance @ np.swapaxes(to_camera, -1, -2)
+    return np.asarray((moved + np.swapaxes(moved, -1, -2)) / 2)
 
 
 def below_ties(ties: Ints, count: int) -> Bools:
