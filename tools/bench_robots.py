@@ -6,7 +6,8 @@ Each robot drives to random points of a room, with stops. wheels: encoders with 
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
 wheels, but only one or two odometry poses in a second. The camera has a wrong clock, yaw, tilt and roll. Boxes are rounded
 to pixels, sit beside the object by a share of its size that depends on the side, and 1 % have a wrong name. Robots with an
-even number measure depths too. All settings are the defaults of joint mode. A line for each robot, then for each kind.
+even number measure depths too. All settings are the defaults of joint mode. A line for each robot, then for each kind. Then,
+for each parameter of the calibration, the robots whose true value is within 1.96 and within 3 of its standard deviations.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 
 from objslam.config import load_settings
 from objslam.core.arrays import Floats
+from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2, make_pose
@@ -43,8 +45,9 @@ def main() -> None:
     settings = load_settings(None, ("mode=joint", "output.recording=false"))
     for kind in options.kinds:
         rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
+        errors: dict[str, list[float]] = {}
         for seed in range(options.first, options.first + options.robots):
-            log, ranged, begin = robot(seed, kind), seed % 2 == 0, time.process_time()
+            (log, true), ranged, begin = robot(seed, kind), seed % 2 == 0, time.process_time()
             try:
                 result = pipeline.run(log, settings, Ledger())
             except ObjslamError as error:
@@ -63,6 +66,10 @@ def main() -> None:
                 f"squared Mahalanobis median {squared:.2f}, {seconds:.1f} s of CPU",
                 flush=True,
             )
+            off = deviations(result.calibration, true)
+            for name, error in off.items():
+                errors.setdefault(name, []).append(error)
+            print("    " + ", ".join(f"{name} {error:+.1f} sigma" for name, error in off.items()), flush=True)
         for ranged, of in rows.items():
             if of:
                 matched, objects, false, inside, rmse, squared, seconds = np.array(of).T
@@ -73,19 +80,37 @@ def main() -> None:
                     f"RMSE median {np.median(rmse):.3f} m, largest {rmse.max():.3f} m, {np.median(seconds):.1f} s of CPU",
                     flush=True,
                 )
+        for name, of_name in errors.items():
+            size = np.abs(of_name)
+            print(
+                f"== {kind}, {name}: of {len(size)} robots, {(size <= 1.96).sum()} within 1.96 sigma, "
+                f"{(size <= 3).sum()} within 3, root mean square {np.sqrt((size**2).mean()):.2f}, largest {size.max():.1f}",
+                flush=True,
+            )
 
 
-def robot(seed: int, kind: str) -> Log:
-    """Draw a robot of a kind, a room and a drive. The same seed and kind give the same log."""
+def deviations(found: Calibration | None, true: dict[str, float]) -> dict[str, float]:
+    """Return the errors of the estimated parameters with a known true value, in their standard deviations."""
+    if found is None:
+        return {}
+    at = {name: (value, sigma) for name, value, sigma in zip(found.names, found.values, found.sigma, strict=True)}
+    return {name: float((at[name][0] - value) / at[name][1]) for name, value in true.items() if name in at}
+
+
+def robot(seed: int, kind: str) -> tuple[Log, dict[str, float]]:
+    """Draw a robot of a kind, a room and a drive. The same seed and kind give the same log.
+
+    Also returns the true values of its calibration, by the names of the parameters.
+    """
     rng = np.random.default_rng([seed, 1 + KINDS.index(kind)])
     room, speed, seconds = rng.uniform(5, 15, 2), rng.uniform(0.2, 1.0), rng.uniform(120, 500)
     stamps, path, forward, turning = drive(rng, room, speed, seconds)
     if kind == "vio":
-        odometry = vio(rng, stamps, path, float(rng.choice([10, 20, 30])))
+        odometry, true = vio(rng, stamps, path, float(rng.choice([10, 20, 30])))
     else:
         rate = float(rng.choice([1, 2]) if kind == "slow" else rng.choice([10, 20, 50]))
-        odometry = wheels(rng, stamps, forward, turning, kind == "gyro", rate)
-    camera, base_T_camera = mounted(rng)
+        odometry, true = wheels(rng, stamps, forward, turning, kind == "gyro", rate)
+    camera, base_T_camera, turns = mounted(rng)
     clock = rng.normal(0, 0.08)
     rate = float(rng.choice([2, 5, 10, 15]))
     fired = np.arange(1.0, seconds - 1.0, 1 / rate)
@@ -99,7 +124,8 @@ def robot(seed: int, kind: str) -> Log:
         objects=tuple(TruthObject(i, name, place) for i, (name, place) in enumerate(zip(names, places, strict=True))),
         trajectory=Trajectory(fired - clock, map_T_base),
     )
-    return Log(f"{kind}{seed}", (CameraLog(camera, detections),), odometry=odometry, truth=truth)
+    true |= {f"{camera.name}.clock": clock} | {f"{camera.name}.{axis}": turn for axis, turn in turns.items()}
+    return Log(f"{kind}{seed}", (CameraLog(camera, detections),), odometry=odometry, truth=truth), true
 
 
 def drive(rng: np.random.Generator, room: Floats, speed: float, seconds: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -127,46 +153,57 @@ def drive(rng: np.random.Generator, room: Floats, speed: float, seconds: float) 
 
 def wheels(
     rng: np.random.Generator, stamps: Floats, forward: Floats, turning: Floats, gyro: bool, rate: float
-) -> Trajectory:
-    """The odometry of two wheels, with the heading of a gyroscope if there is one. rate: poses in a second."""
+) -> tuple[Trajectory, dict[str, float]]:
+    """The odometry of two wheels, with the heading of a gyroscope if there is one, and its errors. rate: poses in a second.
+
+    Unequal wheels turn the odometry as they roll, which is no constant bias, so wheels alone have none.
+    """
     track, slip, tick = rng.uniform(0.2, 0.6), rng.uniform(0.003, 0.02), rng.uniform(0.0005, 0.003)
     both, wide = rng.normal(0, 0.015), 1 + rng.normal(0, 0.03)
-    moved = []
+    moved, longer = [], []
     for side in (-1, 1):
         way = (forward + side * turning * track / 2) * STEP
-        way = way * (1 + both + rng.normal(0, 0.003)) + slip * np.sqrt(np.abs(way)) * rng.normal(size=len(way))
+        longer.append(1 + both + rng.normal(0, 0.003))
+        way = way * longer[-1] + slip * np.sqrt(np.abs(way)) * rng.normal(size=len(way))
         moved.append(np.diff(np.floor(np.cumsum(way) / tick) * tick, prepend=0.0))
     ahead, turn, aside = (moved[0] + moved[1]) / 2, (moved[1] - moved[0]) / (track * wide), np.zeros(len(stamps))
     slipped = np.flatnonzero((rng.random(len(stamps)) < STEP / SLIPS) & (forward > 0.05))
     turn[slipped] += rng.normal(0, np.radians(2), len(slipped))
     aside[slipped] += rng.normal(0, 0.02, len(slipped))
+    faster, bias = float(np.mean(longer)) / wide, 0.0
     if gyro:
         noise = rng.uniform(0.0005, 0.003) * np.sqrt(STEP) * rng.normal(size=len(turn))
-        turn = (turning * (1 + rng.normal(0, 0.01)) + rng.normal(0, 0.002)) * STEP + noise
+        faster, bias = 1 + rng.normal(0, 0.01), rng.normal(0, 0.002)
+        turn = (turning * faster + bias) * STEP + noise
     yaw = np.cumsum(turn)
     c, s = np.cos(yaw - turn / 2), np.sin(yaw - turn / 2)
     pose = np.column_stack([np.cumsum(ahead * c - aside * s), np.cumsum(ahead * s + aside * c), yaw])
+    pose = np.vstack([np.zeros((1, 3)), pose[:-1]])  # A stamp is at the beginning of a simulated step.
     every = max(round(1 / (rate * STEP)), 1)
-    return Trajectory(stamps[::every], lift_se2(pose[::every]))
+    true = {"odometry.scale": 1 / float(np.mean(longer)) - 1, "odometry.turn_scale": 1 / faster - 1}
+    true |= {"odometry.turn_bias": -bias / faster} if gyro else {}
+    return Trajectory(stamps[::every], lift_se2(pose[::every])), true
 
 
-def vio(rng: np.random.Generator, stamps: Floats, path: Floats, rate: float) -> Trajectory:
-    """A path with a wrong scale, and with drift in all six directions."""
+def vio(rng: np.random.Generator, stamps: Floats, path: Floats, rate: float) -> tuple[Trajectory, dict[str, float]]:
+    """A path with a wrong scale, and with drift in all six directions, and its errors."""
     every = max(round(1 / (rate * STEP)), 1)
     poses = lift_se2(path[::every])
     steps = inverse(poses[:-1]) @ poses[1:]
     root = np.sqrt(np.linalg.norm(steps[:, :3, 3], axis=1) + 1e-6)[:, None]
     turn = rng.uniform(0.001, 0.003) * root * rng.normal(size=(len(steps), 3)) * [0.3, 0.3, 1]
     way = rng.uniform(0.002, 0.01) * root * rng.normal(size=(len(steps), 3)) * [1, 1, 0.5]
-    steps[:, :3, 3] *= 1 + rng.normal(0, 0.01)
+    longer = 1 + rng.normal(0, 0.01)
+    steps[:, :3, 3] *= longer
     found = [poses[0]]
     for step in steps @ make_pose(rotation_from_vector(turn), way):
         found.append(found[-1] @ step)
-    return Trajectory(stamps[::every], np.array(found))
+    true = {"odometry.scale": 1 / longer - 1, "odometry.turn_scale": 0.0, "odometry.turn_bias": 0.0}
+    return Trajectory(stamps[::every], np.array(found)), true
 
 
-def mounted(rng: np.random.Generator) -> tuple[Camera, Floats]:
-    """A camera that looks ahead, as its calibration says, and where it really is (4, 4) on the robot."""
+def mounted(rng: np.random.Generator) -> tuple[Camera, Floats, dict[str, float]]:
+    """A camera that looks ahead, as its calibration says, where it really is (4, 4) on the robot, and its turns, rad."""
     focal, height = rng.uniform(350, 700), rng.uniform(0.2, 1.2)
     roll, tilt, yaw = rng.normal(0, [0.01, 0.015, 0.02])
     ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -174,7 +211,8 @@ def mounted(rng: np.random.Generator) -> tuple[Camera, Floats]:
     place = np.array([0.15, 0.0, height])
     matrix = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
     camera = Camera("front", 640, 480, matrix, base_T_camera=make_pose(ahead, place))
-    return camera, make_pose(turns[0] @ turns[1] @ turns[2] @ ahead, place)
+    true = {"roll": float(roll), "tilt": float(tilt), "yaw": float(yaw)}
+    return camera, make_pose(turns[0] @ turns[1] @ turns[2] @ ahead, place), true
 
 
 def boxes_of(

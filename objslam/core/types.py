@@ -191,9 +191,9 @@ class Keyframes:
     map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation. localized_every: how many
     keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. odom_T_base:
     (K, 4, 4) in the coordinate frame of the first odometry pose, None without odometry. drift: (K, 6, 6) covariance,
-    rotation first, of the odometry's error since its start, in the frame of odom_T_base. stretch: (K,) the number of the
-    odometry stretch of each keyframe, where gaps split the odometry into stretches. None means one stretch for all. -1 marks
-    a keyframe without odometry, whose odom_T_base and drift have no meaning.
+    rotation first, of the odometry's error since its start, in the frame of odom_T_base. stretch: (K,) the stretch of the
+    odometry between two gaps, None means one for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have
+    no meaning. step, wander: (K,), (K, 6) by `frontend.odometry_bridge`, None if the odometry is exact between its poses.
     """
 
     stamps: Floats
@@ -205,6 +205,8 @@ class Keyframes:
     odom_T_base: Floats | None = None
     drift: Floats | None = None
     stretch: Ints | None = None
+    step: Floats | None = None
+    wander: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import make_pose
 from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import CameraLog, Images, Log, Trajectory
+from objslam.frontend.odometry_bridge import OdometryBridge
 
 ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
 """The errors of odometry."""
@@ -53,6 +55,11 @@ class CorrectablePath:
         self._turned = np.append(0.0, np.cumsum(turn))
         self._seconds = odometry.stamps - odometry.stamps[0]
         self._ways = np.ascontiguousarray(np.diff(places, axis=0).T)
+
+    @cached_property
+    def bridge(self) -> OdometryBridge:
+        """How far the path may be from the interpolated one. The errors hardly change this."""
+        return OdometryBridge.of(self.odometry)
 
     def path(self, error: Mapping[str, float]) -> Trajectory:
         """Return the corrected path, as `corrected_odometry` does."""

@@ -8,6 +8,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError
+from objslam.frontend.odometry_bridge import OdometryBridge
 from objslam.frontend.odometry_drift import gathered_drift
 
 
@@ -41,13 +42,14 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
     what = "localisation" if localized else "odometry"
     map_T_base, on_path = _on_path(path, stamps, valid, boxes, max_gap, ledger, what)
     valid &= on_path
-    odom_T_base, drift, stretch = None, None, None
+    odom_T_base, drift, stretch, step, wander = None, None, None, None, None
     if odometry is not None:
         odom_T_base, drift = map_T_base, gathered_drift(odometry, stamps, settings.odometry)
         if localized:
             odom_T_base, on_odometry = _on_path(odometry, stamps, valid, boxes, max_gap, ledger, "odometry")
             valid &= on_odometry
         odom_T_base = inverse(odometry.poses[0]) @ odom_T_base
+        step, wander = OdometryBridge.of(odometry).at(stamps)
         gap_ends = odometry.stamps[1:][np.diff(odometry.stamps) > max_gap]
         stretch = np.searchsorted(gap_ends, stamps, side="right")
     base_T_camera = np.empty((len(stamps), 4, 4))
@@ -88,6 +90,8 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
         odom_T_base=odom_T_base,
         drift=drift,
         stretch=stretch,
+        step=step,
+        wander=wander,
     ).take(valid)
 
 

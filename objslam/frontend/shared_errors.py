@@ -128,7 +128,8 @@ class SharedErrors:
 
         The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. Keyframes stay
         on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
-        pose. drift: whether the drift is computed for the corrected odometry. If not, it stays as measured.
+        pose. drift: whether the drift is computed for the corrected odometry. If not, it stays as measured, and so does what
+        the interpolated path may be off.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
@@ -138,10 +139,11 @@ class SharedErrors:
             mine = keyframes.camera == index
             base_T_camera[mine] = corrected_mount(base_T_camera[mine], error, one.camera.name)
             direction = refocused(direction, mine[rays.keyframe], error.get(f"{one.camera.name}.focal", 0.0))
-        gathered = keyframes.drift
+        gathered, step, wander = keyframes.drift, keyframes.step, keyframes.wander
         if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
             gathered = self._drift(error).gathered(np.maximum.accumulate(poses.known), settings.odometry)
+            step, wander = self._correctable().bridge.at(poses.known)
         moved = replace(
             keyframes,
             stamps=poses.stamps,
@@ -149,6 +151,8 @@ class SharedErrors:
             map_T_base=poses.map_T_base,
             odom_T_base=poses.odom_T_base,
             drift=gathered,
+            step=step,
+            wander=wander,
         )
         longer = (1 + error.get("range_scale", 0.0)) * (1 + self.noise.shrinkage)
         ranged = replace(rays, direction=direction, range=rays.range * longer, range_sigma=rays.range_sigma * longer)

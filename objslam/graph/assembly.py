@@ -15,6 +15,7 @@ from objslam.graph.factors.bearing import point_to_line_fixed
 from objslam.graph.factors.localization import localizations
 from objslam.graph.factors.noise import robust
 from objslam.graph.factors.odometry import betweens, motions
+from objslam.graph.factors.odometry_motions import OdometryMotions, find_ties
 from objslam.graph.factors.priors import anchor, landmark_priors
 from objslam.graph.factors.range import along_ray
 from objslam.graph.factors.rays import ray_factors
@@ -51,7 +52,8 @@ class Measurements:
 
     images: all K keyframes. keyframes: the first keyframe of each multiframe. Only these have a pose in the graph. rays: in
     the camera frames of `keyframes`. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions by odometry, None
-    without odometry. tags: the fiducials whose corners are landmarks, None if there are none.
+    without odometry. motions: those in the graph, None without odometry. tags: the fiducials whose corners are landmarks,
+    None if there are none.
     """
 
     multiframes: Multiframes
@@ -61,6 +63,7 @@ class Measurements:
     settings: Settings
     motion: Floats | None
     covariance: Floats | None
+    motions: OdometryMotions | None = None
     tags: TagCorners | None = None
 
     @classmethod
@@ -71,13 +74,20 @@ class Measurements:
         settings: Settings,
         multiframes: Multiframes | None = None,
         tags: TagCorners | None = None,
+        ties: Ints | None = None,
     ) -> Self:
-        """Compute the measurements from keyframes and rays. Without multiframes, each keyframe has its own pose."""
+        """Compute the measurements from keyframes and rays. Without multiframes, each keyframe has its own pose.
+
+        ties: (T, 2) the ties between multiframes, from `find_ties`. If it is None, they are found anew.
+        """
         joined = Multiframes.single(len(images)) if multiframes is None else multiframes
         keyframes, rays = joined.keyframes(images), joined.rays(images, rays)
-        motion, covariance = (None, None) if keyframes.odom_T_base is None else motions(keyframes, settings)
+        motion, covariance, used = None, None, None
+        if keyframes.odom_T_base is not None:
+            motion, covariance = motions(keyframes, settings)
+            used = OdometryMotions.of(keyframes, settings, find_ties(keyframes, settings) if ties is None else ties)
         sized = None if tags is None else tags.sized(rays.label_names, settings)
-        return cls(joined, images, keyframes, rays, settings, motion, covariance, sized)
+        return cls(joined, images, keyframes, rays, settings, motion, covariance, used, sized)
 
     def map_T_base(self, map_T_camera: Floats) -> Floats:
         """Return the base poses (K, 4, 4) at all images, from the poses (P, 4, 4) of the graph."""
@@ -85,10 +95,16 @@ class Measurements:
 
     @cached_property
     def seen_twice(self) -> Bools:
-        """(P-1,) whether both poses of a motion see the same fiducial, so that its corners measure the motion too."""
+        """(M,) whether both poses of a motion see the same fiducial, so that its corners measure the motion too.
+
+        A tie counts if one of the motions below it does.
+        """
+        if self.motions is None:
+            return np.zeros(0, dtype=bool)
         if self.tags is None:
-            return np.zeros(max(len(self.keyframes) - 1, 0), dtype=bool)
-        return self.tags.measured_motions(self.rays, len(self.keyframes))
+            return np.zeros(len(self.motions), dtype=bool)
+        number = np.append(0, np.cumsum(self.tags.measured_motions(self.rays, len(self.keyframes))))
+        return np.asarray(number[self.motions.after] > number[self.motions.before])
 
     def whole(
         self, owner: Ints, used: Bools, map_T_camera: Floats, positions: Floats, loss: Loss = "huber"
@@ -147,10 +163,10 @@ class Measurements:
         end = len(keyframes) if end is None else end
         made = [f for _, group in ray_factors(self.rays.take(which), owner[which], loss, settings) for f in group]
         made += landmark_priors(landmarks, positions, settings)
-        if self.motion is not None and self.covariance is not None:
-            steps = slice(max(begin - 1, 0), end - 1)
-            robust = None if self.tags is None else self.seen_twice[steps]
-            made += betweens(self.motion[steps], self.covariance[steps], steps.start, keyframes.measured[steps], robust)
+        if self.motions is not None:
+            of = self.motions
+            new = np.flatnonzero((of.after >= begin) & (of.after < end))
+            made += betweens(of.before[new], of.after[new], of.motion[new], of.covariance[new], self.seen_twice[new])
         if keyframes.localized_every:
             on_plane = is_planar(keyframes.map_T_base)
             made += localizations(keyframes.take(np.arange(begin, end)), settings, begin, on_plane)

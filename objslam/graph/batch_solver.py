@@ -17,6 +17,7 @@ from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
+from objslam.graph.factors.odometry_motions import find_ties
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.marginals import (
@@ -133,15 +134,14 @@ def solve_joint(
         rays, association = tags.rays(rays), tags.association
 
     multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
+    theta = errors.mean if theta is None and errors is not None else theta
+    given = (keyframes, rays, settings) if errors is None or theta is None else errors.at(theta)
+    ties = find_ties(multiframes.keyframes(given[0]), given[2])
 
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
-        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes, tags)
+        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes, tags, ties)
 
-    if errors is None:
-        measured = measure(keyframes, rays, settings)
-    else:
-        theta = errors.mean if theta is None else theta
-        measured = measure(*errors.at(theta))
+    measured = measure(*given)
     keyframes, rays = measured.keyframes, measured.rays
     positions = np.full((association.count, 3), np.nan)
     map_T_camera = keyframes.map_T_camera

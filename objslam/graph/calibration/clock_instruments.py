@@ -19,16 +19,16 @@ class ClockInstruments:
     The derivative of a motion by a clock is the difference of the velocities at its ends. Measured velocities have noise,
     and so have the residuals. The velocities of the solved path do not correlate with the residuals.
 
-    moved: for each clock, by the index of its parameter, the poses (K,) whose images have this clock. steps: (s,) the
-    motions in the graph. motions: None without odometry. back: (s, 6, 6) from twists before a motion to twists after it.
-    absolute: (a, 6, 6) from velocities to the rows of absolute poses, which begin at the row `first`. before, after: (K,)
-    the poses between which the velocity at a pose is measured. along: (K, 6, 6) from twists of `before` to twists of
-    `after`. seconds: (K,) between them, 0 without a measured motion. to_base: (K, 6, 6) from camera to base twists.
-    velocity: (K, 6) twists of base per s, with the rotation first.
+    moved: for each clock, by the index of its parameter, the poses (K,) whose images have this clock. moves: (s,), (s,) the
+    poses before and after the motions in the graph. motions: None without odometry. back: (s, 6, 6) from twists before a
+    motion to twists after it. absolute: (a, 6, 6) from velocities to the rows of absolute poses, which begin at the row
+    `first`. before, after: (K,) the poses between which the velocity at a pose is measured. along: (K, 6, 6) from twists of
+    `before` to twists of `after`. seconds: (K,) between them, 0 without a measured motion. to_base: (K, 6, 6) from camera to
+    base twists. velocity: (K, 6) twists of base per s, with the rotation first.
     """
 
     moved: Mapping[int, Bools]
-    steps: Ints
+    moves: tuple[Ints, Ints]
     motions: Motions | None
     back: Floats
     absolute: Floats
@@ -55,11 +55,11 @@ class ClockInstruments:
         rate = np.where(seconds > 0, 1 / np.maximum(seconds, 1e-9), 0.0)
         return cls(
             moved,
-            graph.steps,
+            graph.moves,
             motions,
-            adjoint(inverse(path[1:]) @ path[:-1])[graph.steps],
+            adjoint(inverse(path[graph.moves[1]]) @ path[graph.moves[0]]),
             roots @ adjoint(inverse(keyframes.base_T_camera)) if local else np.zeros((0, 6, 6)),
-            graph.first_motion + 6 * len(graph.steps),
+            graph.first_motion + 6 * len(graph.motion_roots),
             before,
             after,
             adjoint(inverse(moves)),
@@ -72,7 +72,8 @@ class ClockInstruments:
         """Write the instruments of a clock for velocities (K, 6, n) into columns (M, n)."""
         own = np.where(self.moved[clock][:, None, None], velocity, 0.0)
         if self.motions is not None:
-            change = own[1:][self.steps] - self.back @ own[:-1][self.steps]
+            first, last = self.moves
+            change = own[last] - self.back @ own[first]
             instruments[self.motions.rows] = -self.motions.whitened(change)
         if len(self.absolute):
             rows = (self.absolute @ own).reshape(-1, own.shape[2])

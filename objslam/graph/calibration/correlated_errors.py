@@ -38,7 +38,7 @@ def _seconds(of: Linearised, system: LinearSystem) -> Floats:
     seconds = np.zeros(len(system.residual))
     seconds[: 2 * len(seen)] = np.repeat(seen, 2)
     seconds[system.first_range : system.first_range + int(ranged.sum())] = seen[ranged]
-    if of.measured.motion is not None:
-        moved = np.repeat(stamps[1:][keyframes.measured], 6)
+    if of.measured.motions is not None:
+        moved = np.repeat(stamps[of.measured.motions.after], 6)
         seconds[system.first_motion : system.first_motion + len(moved)] = moved
     return seconds

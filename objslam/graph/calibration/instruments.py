@@ -23,28 +23,36 @@ class Motions:
     """The measured motions in the graph: s twists of base, with the rotation first.
 
     to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. weight: (s,) robust. covariance: (s, 6, 6) of the
-    twists, which neighbours predict. seconds: (s,) durations. rows: of the motions in the linear system.
+    twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their standard deviations. The rest is
+    of the interpolated path. seconds: (s,) durations. rows: of the motions in the linear system. tied: the share of the
+    motions between keyframes that are below ties.
     """
 
     to_twist: Floats
     weight: Floats
     covariance: Floats
+    by_odometry: Floats
     seconds: Floats
     rows: slice
+    tied: float
 
     @classmethod
     def of(cls, of: Linearised) -> Self:
         """Return the motions of a graph with odometry."""
-        keyframes, steps = of.measured.keyframes, of.graph.steps
+        keyframes, (before, after), odometry = of.measured.keyframes, of.graph.moves, of.measured.motions
+        assert odometry is not None
         robust, _ = of.graph.motion_weights(of.map_T_camera)
-        to_base = adjoint(keyframes.base_T_camera[1:][steps])
-        seconds = np.maximum(np.diff(keyframes.stamps)[steps], 0.0)
-        covariance = to_base @ of.measured.odometry()[1][steps] @ np.swapaxes(to_base, 1, 2)
+        to_base = adjoint(keyframes.base_T_camera[after])
+        seconds = np.maximum(keyframes.stamps[after] - keyframes.stamps[before], 0.0)
+        covariance = to_base @ odometry.covariance @ np.swapaxes(to_base, 1, 2)
         near = from_neighbours(covariance.reshape(-1, 36), seconds).reshape(-1, 6, 6)
         near = np.where((np.einsum("kii->k", near) > 0)[:, None, None], near, covariance)
         to_twist = to_base @ np.linalg.inv(robust[:, None, None] * of.graph.motion_roots)
+        noise = np.einsum("kij,kjl,kil->ki", to_base, odometry.noise, to_base)
+        by_odometry = np.sqrt(noise / np.einsum("kii->ki", covariance))
         first = of.graph.first_motion
-        return cls(to_twist, robust, _alike(near, covariance), seconds, slice(first, first + 6 * len(steps)))
+        rows = slice(first, first + 6 * len(after))
+        return cls(to_twist, robust, _alike(near, covariance), by_odometry, seconds, rows, odometry.tied)
 
     def twists(self, columns: Floats) -> Floats:
         """Return the twists (s, 6, n) of columns (M, n) of the linear system."""

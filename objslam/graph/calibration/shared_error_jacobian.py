@@ -131,7 +131,7 @@ def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats, noi
     graph, rows = of.graph, of.rows
     sides, moved = _parameter_columns(of, errors, theta)
     asked = bool(moved) or any(name.startswith("odometry.") for name in errors.names)
-    motions = Motions.of(of) if asked and len(graph.steps) else None
+    motions = Motions.of(of) if asked and len(graph.motion_roots) else None
     clocks = ClockInstruments.of(of, moved, motions) if moved else None
     by_path = sides[:, list(moved)]
     for i, k in enumerate(moved):
@@ -203,14 +203,14 @@ class _Part:
 def _parts(of: Linearised) -> tuple[_Part, ...]:
     """Return the kinds of measurements that shared errors may change."""
     graph, map_T_camera = of.graph, of.map_T_camera
-    steps, ranged = graph.steps, graph.ranged
+    (before, after), ranged = graph.moves, graph.ranged
     seen = graph.seen(map_T_camera, of.positions[of.landmarks])
     to_landmark = from_origins(graph.rays, seen)
     axes = graph.bearing_axes(to_landmark)
     bearing_root, _ = graph.bearing_roots(graph.bearing_residuals(graph.rays.direction, to_landmark, axes))
     range_ = graph.rays.range[ranged]
     range_root, _ = graph.range_roots(np.linalg.norm(to_landmark[ranged], axis=1))
-    moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[steps]
+    moved = inverse(map_T_camera[before]) @ map_T_camera[after]
     motion_weight, _ = graph.motion_weights(map_T_camera)
     floor = of.measured.settings.odometry.floor_xy
     _, absolute_root, _ = graph.absolute_roots(map_T_camera)
@@ -223,10 +223,10 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
         return np.asarray(range_root * (np.linalg.norm(to_landmark, axis=1) - measured) / (measured / range_))
 
     def said(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
-        if not len(steps) or keyframes.odom_T_base is None:
+        if not len(before) or keyframes.odom_T_base is None:
             return ()
         odom_T_camera = keyframes.odom_T_base @ keyframes.base_T_camera
-        return (inverse(odom_T_camera[:-1]) @ odom_T_camera[1:])[steps], np.array(settings.odometry.floor_xy / floor)
+        return inverse(odom_T_camera[before]) @ odom_T_camera[after], np.array(settings.odometry.floor_xy / floor)
 
     def motions(motion: Floats, way: Floats) -> Floats:
         off = log_se3(inverse(motion) @ moved) / np.repeat([1.0, float(way)], 3)
@@ -250,7 +250,7 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
         ),
         _Part(graph.first_motion, said, motions),
         _Part(
-            graph.first_motion + 6 * len(steps),
+            graph.first_motion + 6 * len(before),
             lambda keyframes, rays, settings: (keyframes.map_T_camera[: len(absolute)],),
             poses,
         ),

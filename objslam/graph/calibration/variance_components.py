@@ -19,7 +19,7 @@ from objslam.graph.calibration.instruments import from_neighbours
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.factors.bearing import tangent_basis
-from objslam.graph.factors.odometry import motions
+from objslam.graph.factors.odometry_motions import OdometryMotions
 from objslam.graph.least_squares.joint_rows import whitening
 from objslam.graph.least_squares.normal_equations import NormalEquations
 
@@ -56,10 +56,10 @@ class _Rows:
     """A description of the rows of a linear system: n bearings, q ranges and s motions, with their nominal noise.
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
-    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m, the standard deviation of the bias. parts: (3,
-    s, 6, 6) covariances of the motions by the noise along, across and in turning. rest: (s, 6, 6) covariances without this
-    noise. motion_axes: (3, s, 6) twists along, across and in turning, in the camera frame after the motion. motion_window:
-    (s,), ray_window: (n,) the window of each motion and ray. The errors in a window may be correlated.
+    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m, the standard deviation of the bias. motions:
+    those in the graph. parts: (3, s, 6, 6) their covariances by the noise along, across and in turning. rest: (s, 6, 6) by
+    the noise of `planar`. motion_axes: (3, s, 6) twists along, across and in turning, in the camera frame after the motion.
+    motion_window: (s,), ray_window: (n,) the window of each motion and ray. The errors in a window may be correlated.
     """
 
     bearing_axes: Floats
@@ -67,6 +67,7 @@ class _Rows:
     owner: Ints
     range_sigma: Floats
     bias: Floats
+    motions: OdometryMotions | None
     parts: Floats
     rest: Floats
     motion_axes: Floats
@@ -125,11 +126,11 @@ def _from_logarithms(logarithms: Floats, other: NoiseFactors) -> NoiseFactors:
 def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Rows:
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     ranged = np.isfinite(rays.range)
-    steps = np.flatnonzero(keyframes.measured)
+    motions, (_, after) = of.measured.motions, of.graph.moves
     parts = [np.zeros((0, 6, 6))] * 4
-    if len(steps):
+    if motions is not None and len(motions):
         kinds = errors.drift_components(theta)
-        parts = [motions(of.measured.multiframes.keyframes(one), settings)[1][steps] for one, settings in kinds]
+        parts = [motions.noise_of(of.measured.multiframes.keyframes(one), settings) for one, settings in kinds]
     origins, directions = rays.in_map(of.map_T_camera)
     to_landmark = of.positions[of.association.object[of.which]] - origins
     off = np.linalg.norm(np.cross(directions, to_landmark), axis=1) / np.linalg.norm(to_landmark, axis=1)
@@ -139,17 +140,18 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     if of.measured.tags is not None:  # The corners of a fiducial may err together.
         owner = of.measured.tags.object_of_landmark()[owner]
     pair = np.column_stack([owner, second[rays.keyframe]])
-    to_camera = adjoint(inverse(keyframes.base_T_camera[1:][steps]))
+    to_camera = adjoint(inverse(keyframes.base_T_camera[after]))
     return _Rows(
         bearing_axes=_azimuth_elevation(rays.direction, keyframes.base_T_camera[rays.keyframe]),
         bearing_weight=np.minimum(1.0, HUBER_K * rays.sigma / np.maximum(off, 1e-12)),
         owner=of.association.object[of.which][ranged],
         range_sigma=errors.rays.range_sigma[of.which][ranged],
         bias=errors.rays.range_bias[of.which][ranged],
+        motions=motions,
         parts=np.array(parts[:3]),
         rest=parts[3],
         motion_axes=np.moveaxis(to_camera[:, :, [3, 4, 2]], 2, 0),
-        motion_window=np.unique(second[1:][steps], return_inverse=True)[1],
+        motion_window=np.unique(second[after], return_inverse=True)[1],
         ray_window=np.unique(pair, axis=0, return_inverse=True)[1].ravel(),
     )
 
@@ -286,16 +288,17 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
     localisation, there is no force. The curvature is the information of all measured lengths about the size.
     """
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
-    steps = np.flatnonzero(keyframes.measured)
-    if not len(steps) or keyframes.localized_every or keyframes.odom_T_base is None:
+    before, after = of.graph.moves
+    odometry = of.measured.motions
+    if odometry is None or not len(odometry) or keyframes.localized_every or keyframes.odom_T_base is None:
         return 0.0, 1.0
     camera_T_base = inverse(keyframes.base_T_camera)
     solved, said = (
-        (inverse(path[:-1]) @ path[1:])[steps, :3, 3] for path in (of.map_T_camera @ camera_T_base, keyframes.odom_T_base)
+        (inverse(path[before]) @ path[after])[:, :3, 3] for path in (of.map_T_camera @ camera_T_base, keyframes.odom_T_base)
     )
-    turn = keyframes.base_T_camera[1:][steps, :3, :3]
-    variance = turn @ of.measured.odometry()[1][steps, 3:, 3:] @ np.swapaxes(turn, 1, 2)
-    told = from_neighbours(said, np.maximum(np.diff(keyframes.stamps)[steps], 0.0))
+    turn = keyframes.base_T_camera[after, :3, :3]
+    variance = turn @ odometry.covariance[:, 3:, 3:] @ np.swapaxes(turn, 1, 2)
+    told = from_neighbours(said, np.maximum(keyframes.stamps[after] - keyframes.stamps[before], 0.0))
 
     def product(one: Floats, two: Floats) -> float:
         return float((one * np.linalg.solve(variance, two[..., None])[..., 0]).sum())
@@ -332,7 +335,8 @@ def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
 def _motion_covariance(rows: _Rows, noise: NoiseFactors) -> Floats:
     """Return the covariances (s, 6, 6) of the motions."""
     variances = np.array([noise.along, noise.across, noise.turning]) ** 2
-    return np.asarray(rows.rest + np.tensordot(variances, rows.parts, 1))
+    total = np.asarray(rows.rest + np.tensordot(variances, rows.parts, 1))
+    return total if rows.motions is None else rows.motions.with_noise(total).covariance
 
 
 def _azimuth_elevation(directions: Floats, base_T_camera: Floats) -> Floats:

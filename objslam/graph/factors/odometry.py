@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse, is_planar
 from objslam.core.types import Keyframes
 from objslam.graph.variables import X0
@@ -19,22 +19,64 @@ corrects itself: 0.27 m at 0.9 m/s was seen. 99.9 % of all Gaussian errors are b
 freedom). With a larger value, a jump bends the map more. A smaller value uses less of the odometry."""
 
 
-def motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> tuple[Floats, Floats]:
-    """Return the camera motions (K-1, 4, 4) between consecutive keyframes, and their covariances (K-1, 6, 6).
+def motions(
+    keyframes: Keyframes, settings: Settings, on_plane: bool | None = None, pairs: tuple[Ints, Ints] | None = None
+) -> tuple[Floats, Floats]:
+    """Return the camera motions (M, 4, 4) between pairs of keyframes, and their covariances (M, 6, 6).
 
     A motion is E_prev^-1 * odo * E_next. E is base_T_camera, and odo is the motion of base. The covariance is Ad(E_next^-1)
-    S Ad(E_next^-1)^T plus a floor, with the rotation first. S is the covariance that the odometry accumulated between the
-    two keyframes, in the base frame at the second one. Rows where `Keyframes.measured` is false have no meaning. on_plane:
-    whether the path is planar. If it is None, the poses decide. ValueError if the keyframes have no odometry.
+    S Ad(E_next^-1)^T plus a floor for each keyframe, with the rotation first. S is the covariance that the odometry
+    accumulated between the two keyframes, in the base frame at the second one, plus that of their interpolated poses. Rows
+    where `Keyframes.measured` is false have no meaning. ValueError if the keyframes have no odometry.
+
+    Args:
+        on_plane: whether the path is planar. If it is None, the poses decide.
+        pairs: (M,), (M,) the keyframes before and after each motion. If it is None, all K-1 consecutive pairs.
     """
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     if odom_T_base is None or drift is None:
         raise ValueError("the keyframes have no odometry, which motions need")
     on_plane = _on_plane(keyframes, odom_T_base) if on_plane is None else on_plane
-    odom_T_camera = odom_T_base @ keyframes.base_T_camera
-    floor = motion_floor(keyframes.base_T_camera[1:], settings, on_plane)
-    covariance = motion_covariance(drift[1:] - drift[:-1], adjoint(inverse(odom_T_camera[1:])), floor)
-    return inverse(odom_T_camera[:-1]) @ odom_T_camera[1:], covariance
+    odom_T_camera, every = odom_T_base @ keyframes.base_T_camera, np.arange(len(keyframes))
+    before, after = (every[:-1], every[1:]) if pairs is None else pairs
+    floor = motion_floor(keyframes.base_T_camera[after], settings, on_plane) * (after - before)[:, None, None]
+    gathered = drift[after] - drift[before]
+    if keyframes.wander is not None:
+        gathered += wander(keyframes, before, after)
+    camera_T_odom = inverse(odom_T_camera)
+    covariance = motion_covariance(gathered, adjoint(camera_T_odom[after]), floor)
+    return camera_T_odom[before] @ odom_T_camera[after], covariance
+
+
+def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) -> Floats:
+    """Return the covariances (M, 6, 6) of motions by the interpolation between two poses of the odometry.
+
+    Like `Keyframes.drift`, they are in the frame of odom_T_base. Half of the noise of a motion inside a step is at each end.
+
+    Args:
+        before, after: (M,), (M,) the keyframes, with odometry.
+        walk: whether the path inside a step is a random walk that the poses of the odometry do not hold. Otherwise it is a
+            bridge (`frontend.odometry_bridge`).
+    """
+    if keyframes.step is None or keyframes.wander is None or keyframes.odom_T_base is None:
+        return np.zeros((len(before), 6, 6))
+    passed = np.floor(keyframes.step)
+    share = (keyframes.step - passed)[:, None]
+    apart = share[after] - share[before]
+    if walk:
+        first, last, inside = 1 - share[before], share[after], np.abs(apart)
+    else:
+        first, last, inside = (part * (1 - part) for part in (share[before], share[after], np.abs(apart)))
+    same = (passed[before] == passed[after])[:, None]
+    size = keyframes.wander
+    half, from_base = size[after] * inside / 2, adjoint(keyframes.odom_T_base)
+    found = np.zeros((len(before), 6, 6))
+    for at, variance in (
+        (before, np.where(same, half, size[before] * first)),
+        (after, np.where(same, half, size[after] * last)),
+    ):
+        found += (from_base[at] * variance[:, None, :]) @ np.swapaxes(from_base[at], -1, -2)
+    return found
 
 
 def _on_plane(keyframes: Keyframes, odom_T_base: Floats) -> bool:
@@ -75,16 +117,15 @@ def motion_covariance(gathered: Floats, camera_from_drift: Floats, floor: Floats
 
 
 def betweens(
-    motion: Floats, covariance: Floats, first: int, measured: Bools | None = None, robust: Bools | None = None
+    before: Ints, after: Ints, motion: Floats, covariance: Floats, robust: Bools | None = None
 ) -> list[gtsam.NonlinearFactor]:
-    """Return between-factors for the camera motions (M, 4, 4) from X(first) to X(first + 1) and so on.
+    """Return between-factors for the camera motions (M, 4, 4) from X(before) (M,) to X(after) (M,).
 
-    measured: (M,) whether a motion gets a factor. None means all motions. robust: (M,) whether it has Cauchy's loss with
-    `JUMP`. None means that no motion has it.
+    robust: (M,) whether a motion has Cauchy's loss with `JUMP`. None means that no motion has it.
     """
-    steps = np.arange(len(motion)) if measured is None else np.flatnonzero(measured)
     loss = np.zeros(len(motion), dtype=bool) if robust is None else robust
-    return [between(first + i, first + i + 1, motion[i], covariance[i], bool(loss[i])) for i in steps.tolist()]
+    columns = (before.tolist(), after.tolist(), motion, covariance, loss.tolist())
+    return [between(*row) for row in zip(*columns, strict=True)]
 
 
 def between(before: int, after: int, motion: Floats, covariance: Floats, robust: bool = False) -> gtsam.NonlinearFactor:

@@ -79,9 +79,9 @@ class JointGraph:
         return _ranged(self.rays)
 
     @cached_property
-    def steps(self) -> Ints:
-        """(s,) the motions that the odometry measured. Motion i is from pose i to pose i + 1."""
-        return _steps(self.measured)
+    def moves(self) -> tuple[Ints, Ints]:
+        """(s,), (s,) the poses before and after each of the motions that the odometry measured."""
+        return _moves(self.measured)
 
     @property
     def first_range(self) -> int:
@@ -102,7 +102,8 @@ class JointGraph:
     @cached_property
     def motion_roots(self) -> Floats:
         """(s, 6, 6) upper triangular matrices that whiten the motions."""
-        return whitening(self.measured.odometry()[1][self.steps]) if len(self.steps) else np.zeros((0, 6, 6))
+        of = self.measured.motions
+        return whitening(of.covariance) if of is not None and len(of) else np.zeros((0, 6, 6))
 
     @cached_property
     def _absolute_roots(self) -> Floats:
@@ -200,21 +201,28 @@ class JointGraph:
 
         A motion that fiducials measure too has Cauchy's loss. Other motions have none.
         """
-        if not len(self.steps):
+        if not len(self.motion_roots):
             return np.zeros(0), np.zeros(0)
-        moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[self.steps]
-        off = log_se3(inverse(self.measured.odometry()[0][self.steps]) @ moved)
+        off = log_se3(self.motion_errors(map_T_camera)[1])
         square = ((self.motion_roots @ off[..., None])[..., 0] ** 2).sum(axis=1)
-        robust, ratio = self.measured.seen_twice[self.steps], square / JUMP**2
+        robust, ratio = self.measured.seen_twice, square / JUMP**2
         return np.where(robust, 1 / np.sqrt(1 + ratio), 1.0), np.where(robust, JUMP**2 * np.log1p(ratio), square) / 2
+
+    def motion_errors(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
+        """Return the motions (s, 4, 4) of poses (P, 4, 4), and the same in the frame after the measured motion."""
+        before, after = self.moves
+        moved = inverse(map_T_camera[before]) @ map_T_camera[after]
+        of = self.measured.motions
+        assert of is not None
+        return moved, inverse(of.motion) @ moved
 
     def _motion_rows(self, map_T_camera: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the residuals (6 s,) of the motions, their derivatives (s, 6, 12) by the poses before and after, and their
         costs (s,)."""
-        if not len(self.steps):
+        if not len(self.motion_roots):
             return np.zeros(0), np.zeros((0, 6, 12)), np.zeros(0)
-        moved = (inverse(map_T_camera[:-1]) @ map_T_camera[1:])[self.steps]
-        off = log_se3(inverse(self.measured.odometry()[0][self.steps]) @ moved)
+        moved, error = self.motion_errors(map_T_camera)
+        off = log_se3(error)
         weight, cost = self.motion_weights(map_T_camera)
         roots = weight[:, None, None] * self.motion_roots
         after = roots @ _by_end(off)
@@ -226,10 +234,9 @@ def _ranged(rays: Rays) -> Ints:
     return np.flatnonzero(np.isfinite(rays.range))
 
 
-def _steps(measured: Measurements) -> Ints:
-    if measured.motion is None:
-        return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(measured.keyframes.measured)
+def _moves(measured: Measurements) -> tuple[Ints, Ints]:
+    of = measured.motions
+    return (np.zeros(0, dtype=np.int64),) * 2 if of is None else (of.before, of.after)
 
 
 def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: Ints) -> tuple[Ints, Ints]:
@@ -237,7 +244,7 @@ def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: Ints
     first_pose = 3 * len(landmarks)
     on_landmark = 3 * landmark[:, None] + np.arange(3)
     seen = np.hstack([on_landmark, first_pose + 6 * rays.keyframe[:, None] + np.arange(6)])
-    moved = first_pose + 6 * _steps(measured)[:, None] + np.arange(12)
+    moved = first_pose + np.hstack([6 * pose[:, None] + np.arange(6) for pose in _moves(measured)])
     localized = len(measured.keyframes) if measured.keyframes.localized_every else 1
     absolute = first_pose + 6 * np.arange(localized)[:, None] + np.arange(6)
     parts = (

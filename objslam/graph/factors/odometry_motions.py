@@ -1,0 +1,143 @@
+"""The motions by odometry that a graph gets: from keyframe to keyframe, and across the steps of a slow odometry.
+
+Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent: a robot that turned
+late in one motion turned more in the next, because the poses of the odometry hold the whole step. So the motions inside a
+step are loose, as those of a random walk, and a tie across the step says how far they go together. For a linear system this
+is exact: let motions with the shares d of a step have the noise D d of the odometry and the bridge W (diag(d) - d d'). Then
+their information is that of independent motions with the noise (D + W) d, and that of a tie: 1 / D - 1 / (D + W).
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import adjoint, inverse
+from objslam.core.types import Keyframes
+from objslam.graph.factors.odometry import motions, wander
+
+_LEAST_TOLD = 0.1
+"""A tie is used if it gives at least this share of the information about a motion in some direction. With a larger share,
+fewer ties are used, and the motions below them count as independent. With a smaller one, faster odometry has ties too, which
+hardly change the solution but take time."""
+_NOTHING = 1e-6
+"""The least share of the information about a motion that a tie gives. A tie says nothing about directions in which the
+motions inside a step are not loose, and a matrix without information has no inverse. A larger share says more there."""
+
+
+@dataclass(frozen=True)
+class OdometryMotions:
+    """M camera motions: first those between consecutive keyframes, then the ties.
+
+    before, after: (M,) the keyframes. motion: (M, 4, 4). noise: (M, 6, 6) of the odometry. wander: (M, 6, 6) of the
+    interpolated path, which adds to the noise. loose: (T, 6, 6) for each of the T ties, the same of the independent motions
+    below it.
+    """
+
+    before: Ints
+    after: Ints
+    motion: Floats
+    noise: Floats
+    wander: Floats
+    loose: Floats
+
+    @classmethod
+    def of(cls, keyframes: Keyframes, settings: Settings, ties: Ints) -> Self:
+        """Return the motions of keyframes with odometry. ties: (T, 2) from `find_ties`."""
+        chain = np.flatnonzero(keyframes.measured)
+        before, after = np.concatenate([chain, ties[:, 0]]), np.concatenate([chain + 1, ties[:, 1]])
+        motion, _ = motions(keyframes, settings, pairs=(before, after))
+        below = below_ties(ties, len(keyframes))
+        bridge = wander(keyframes, before, after)
+        here = np.flatnonzero(below[chain])
+        walk = np.zeros((len(keyframes), 6, 6))
+        walk[chain[here] + 1] = bridge[here] = wander(keyframes, chain[here], chain[here] + 1, walk=True)
+        total = np.cumsum(walk, axis=0)
+        bridge = _in_camera(keyframes, after, bridge)
+        loose = _in_camera(keyframes, ties[:, 1], total[ties[:, 1]] - total[ties[:, 0]])
+        found = cls(before, after, motion, bridge, bridge, loose)
+        return found.with_noise(found.noise_of(keyframes, settings))
+
+    def __len__(self) -> int:
+        return len(self.before)
+
+    @property
+    def tied(self) -> float:
+        """The share of the motions between consecutive keyframes that are below ties."""
+        chain = len(self) - len(self.loose)
+        return float((self.after[chain:] - self.before[chain:]).sum()) / max(chain, 1)
+
+    def noise_of(self, keyframes: Keyframes, settings: Settings) -> Floats:
+        """Return the noise (M, 6, 6) of the same motions of other keyframes, or for other settings."""
+        return motions(replace(keyframes, wander=None), settings, pairs=(self.before, self.after))[1]
+
+    def with_noise(self, noise: Floats) -> Self:
+        """Return the motions with another noise (M, 6, 6) of the odometry."""
+        return replace(self, noise=noise)
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """(M, 6, 6), of a tie what it adds to the motions below it."""
+        covariance = self.noise + self.wander
+        ties = slice(len(self) - len(self.loose), len(self))
+        if len(self.loose):
+            covariance[ties] = _remaining(covariance[ties], self.noise[ties] + self.loose)
+        return covariance
+
+
+def _in_camera(keyframes: Keyframes, last: Ints, covariance: Floats) -> Floats:
+    """Return covariances (M, 6, 6), in the frame of odom_T_base, in the frames of the keyframes `last` (M,)."""
+    if not covariance.any():
+        return covariance
+    assert keyframes.odom_T_base is not None
+    to_camera = adjoint(inverse(keyframes.odom_T_base[last] @ keyframes.base_T_camera[last]))
+    moved = to_camera @ covariance @ np.swapaxes(to_camera, -1, -2)
+    return np.asarray((moved + np.swapaxes(moved, -1, -2)) / 2)
+
+
+def below_ties(ties: Ints, count: int) -> Bools:
+    """Return which motions (count - 1,) between consecutive keyframes are below one of the ties (T, 2)."""
+    ends = np.zeros(count, dtype=np.int64)
+    np.add.at(ends, ties[:, 0], 1)
+    np.add.at(ends, ties[:, 1], -1)
+    return np.cumsum(ends)[:-1] > 0
+
+
+def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
+    """Return the pairs (T, 2) of keyframes that need a tie, one after the other along the path.
+
+    A tie connects the keyframes that are nearest to two poses of the odometry, if there are others between them. If the
+    interpolation errs by less than the odometry, the tie is left out.
+    """
+    nothing = np.zeros((0, 2), dtype=np.int64)
+    if keyframes.step is None or keyframes.wander is None or len(keyframes) < 3:
+        return nothing
+    pose = np.rint(keyframes.step).astype(np.int64)
+    nearest = np.lexsort((np.abs(keyframes.step - pose), pose))
+    nearest = np.sort(nearest[np.unique(pose[nearest], return_index=True)[1]])
+    pairs = np.column_stack([nearest[:-1], nearest[1:]])
+    unmeasured = np.append(0, np.cumsum(~keyframes.measured))
+    pairs = pairs[(np.diff(pairs, axis=1)[:, 0] > 1) & (unmeasured[pairs[:, 0]] == unmeasured[pairs[:, 1]])]
+    if not len(pairs):
+        return nothing
+    found = OdometryMotions.of(keyframes, settings, pairs)
+    noise = found.noise[-len(pairs) :]
+    told = _told(noise + found.wander[-len(pairs) :], noise + found.loose)[0]
+    return np.asarray(pairs[told.max(axis=1) >= _LEAST_TOLD])
+
+
+def _told(whole: Floats, loose: Floats) -> tuple[Floats, Floats]:
+    """Return the shares (T, 6) of the information 1 / `whole` that is not in 1 / `loose`, (T, 6, 6) both, and the axes."""
+    root = np.linalg.cholesky(whole)
+    back = np.linalg.inv(root)
+    size, axes = np.linalg.eigh(back @ loose @ np.swapaxes(back, 1, 2))
+    return 1 - 1 / np.maximum(size, 1.0), root @ axes
+
+
+def _remaining(whole: Floats, loose: Floats) -> Floats:
+    """Return the covariance (T, 6, 6) that `loose` needs beside it to give the information of `whole`."""
+    told, axes = _told(whole, loose)
+    return (axes / np.maximum(told, _NOTHING)[:, None]) @ np.swapaxes(axes, 1, 2)
