@@ -97,7 +97,7 @@ class JointGraph:
     def first_further(self) -> int:
         """The first row of the kinds in `further`."""
         absolute = len(self.measured.keyframes) if self.measured.keyframes.localized_every else 1
-        return self.first_motion + 6 * (len(self.steps) + absolute)
+        return self.first_motion + 6 * (len(self.moves[0]) + absolute)
 
     @cached_property
     def motion_roots(self) -> Floats:
