@@ -37,7 +37,7 @@ from objslam.graph.tags.fixed import tags_at_poses
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
-_TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
+_TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-3
 """A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a solve without
 shared errors. The second is for a solve with them, whose estimation moves everything again. Larger values end it sooner."""
 _ROUNDS_BEFORE = 2

@@ -100,8 +100,9 @@ def calibrate(
         noise = estimate_noise(state, at.system, fit.errors, theta, fit.prior_residuals)
         before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
         fit = replace(fit, errors=fit.errors.with_noise(noise))
-        state = fit.remeasured(state, theta).settled()
-        if nearly or not same:
+        state = fit.remeasured(state, theta)
+        if nearly or not same:  # Otherwise, the last solve below settles what little the new noise moves.
+            state = state.fresh().solved().settled()
             at = fit.shared_errors(state, theta, _CONVERGED, at.noise if noise.like(before, _SAME_SHARES) else None)
             state, theta, steps, nearly = at.state, at.theta, steps + at.steps, False
         if same:
@@ -239,8 +240,8 @@ class _Fit:
         return _Found(now.theta, now.state, now.linear, shares, steps)
 
     def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
-        """Return the optimum for the measurements with the present noise."""
-        return state.measuring(self.measure(*self.errors.at(theta))).solved()
+        """Return the same poses and landmarks with the measurements at the present noise."""
+        return state.measuring(self.measure(*self.errors.at(theta)))
 
 
 def _likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:
