@@ -70,6 +70,17 @@ class Measurements:
             return np.zeros(max(len(self.keyframes) - 1, 0), dtype=bool)
         return self.tags.measured_motions(self.rays, len(self.keyframes))
 
+    @cached_property
+    def motion_factors(self) -> list[gtsam.NonlinearFactor | None]:
+        """The factors of the P-1 motions, None for one without a measurement. Graphs share them, as they never change."""
+        steps = np.flatnonzero(self.keyframes.measured)
+        made: list[gtsam.NonlinearFactor | None] = [None] * max(len(self.keyframes) - 1, 0)
+        robust = None if self.tags is None else self.seen_twice
+        motion, covariance = self.odometry()
+        for i, factor in zip(steps.tolist(), betweens(motion, covariance, 0, self.keyframes.measured, robust), strict=True):
+            made[i] = factor
+        return made
+
     def whole(
         self, owner: Ints, used: Bools, map_T_camera: Floats, positions: Floats, loss: Loss = "huber"
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -116,9 +127,7 @@ class Measurements:
         made = [f for _, group in ray_factors(self.rays.take(which), owner[which], loss, settings) for f in group]
         made += landmark_priors(landmarks, positions, settings)
         if self.motion is not None and self.covariance is not None:
-            steps = slice(max(begin - 1, 0), end - 1)
-            robust = None if self.tags is None else self.seen_twice[steps]
-            made += betweens(self.motion[steps], self.covariance[steps], steps.start, keyframes.measured[steps], robust)
+            made += [f for f in self.motion_factors[max(begin - 1, 0) : end - 1] if f is not None]
         if keyframes.localized_every:
             on_plane = is_planar(keyframes.map_T_base)
             made += localizations(keyframes.take(np.arange(begin, end)), settings, begin, on_plane)

@@ -111,6 +111,7 @@ def solve_joint(
     errors: CalibratedMeasurements | None = None,
     theta: Floats | None = None,
     hold: bool = False,
+    places: Floats | None = None,
 ) -> Estimate:
     """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
@@ -119,7 +120,8 @@ def solve_joint(
     If most rays of a stretch of the drive were rejected, and there is only odometry, the poses of the stretch may be wrong.
     In this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose.
     SolveError if the linear system is indeterminate, or if the cost is not finite.
-    start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors.
+    start: (K, 4, 4) camera poses to start from instead. places: (N, 3) m, positions to start from, NaN where unknown, if
+    start and places are the solution of nearly the same measurements. Its rejected stretches are not tried again. errors: the same keyframes and rays as a function of shared errors.
     The shared errors are estimated, starting from theta (P,) or from their mean. Their covariance is added to the covariance
     of objects. hold: whether the shared errors stay at theta, and the noise as it is. In this case, no covariance is added.
     progress(done, total) counts the keyframes in the growing graph.
@@ -149,13 +151,15 @@ def solve_joint(
         trace.base_T_camera = keyframes.base_T_camera
     if start is not None:
         map_T_camera = start[multiframes.first]
+        if places is not None and tags is None:  # The corners of fiducials have no known positions.
+            positions = places
     elif not keyframes.localized_every:
         map_T_camera, positions = initialize_known(measured, association, progress, trace)
     nothing = np.zeros(len(rays), dtype=bool)
     tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
     rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
     found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace, tolerance, rounds)
-    loose = keyframes.odom_T_base is not None and not keyframes.localized_every
+    loose = keyframes.odom_T_base is not None and not keyframes.localized_every and places is None
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None

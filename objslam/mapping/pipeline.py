@@ -12,6 +12,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
+from objslam.core.import_later import import_later
 from objslam.core.result import RunResult
 from objslam.core.trajectory import correct_path
 from objslam.core.types import Keyframes, Log, Trajectory
@@ -61,6 +62,7 @@ def run(
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
     with _stage("load", seconds, progress):
+        import_later("numpy.f2py")  # scipy copies all names of numpy, which loads this compiler of Fortran: 0.06 s.
         for library in _LIBRARIES:
             import_module(library)
     diagnosis = Diagnosis()

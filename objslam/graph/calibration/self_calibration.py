@@ -14,6 +14,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import CalibratedMeasurements, Calibration
+from objslam.core.noise import NOMINAL
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
@@ -93,7 +94,7 @@ def calibrate(
     """
     fit = _Fit(errors, measure, trace)
     state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used).ordered()
-    nearly = bool(errors.unknown_noise) and len(theta) > 0
+    nearly = bool(errors.unknown_noise) and len(theta) > 0 and errors.noise == NOMINAL  # Else, it is known from before.
     at = fit.shared_errors(state, theta, _NEARLY if nearly else _CONVERGED)
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
