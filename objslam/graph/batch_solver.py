@@ -121,9 +121,10 @@ def solve_joint(
     In this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose.
     SolveError if the linear system is indeterminate, or if the cost is not finite.
     start: (K, 4, 4) camera poses to start from instead. places: (N, 3) m, positions to start from, NaN where unknown, if
-    start and places are the solution of nearly the same measurements. Its rejected stretches are not tried again. errors: the same keyframes and rays as a function of shared errors.
-    The shared errors are estimated, starting from theta (P,) or from their mean. Their covariance is added to the covariance
-    of objects. hold: whether the shared errors stay at theta, and the noise as it is. In this case, no covariance is added.
+    start and places solve nearly the same measurements. Stretches that this solution rejects are not tried again. errors:
+    the same keyframes and rays as a function of shared errors. The shared errors are estimated, starting from theta (P,) or
+    from their mean. Their covariance is added to the covariance of objects. hold: whether the shared errors stay at theta,
+    and the noise as it is. In this case, no covariance is added.
     progress(done, total) counts the keyframes in the growing graph.
     The corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
     """
@@ -163,12 +164,16 @@ def solve_joint(
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
-        other = reject_outliers(
-            measured, association, found.map_T_camera, found.positions, found.used, back, attempt, tolerance, rounds
-        )
-        before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
-        if after < before:
-            found = replace(other, cost_before=found.cost_before, iterations=found.iterations + other.iterations)
+        before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
+        for limit in (1, rounds - 1):  # Rays that belong to their objects lower the misfit in the first round already.
+            tried = reject_outliers(
+                measured, association, other.map_T_camera, other.positions, other.used, again, attempt, tolerance, limit
+            )
+            other, again = replace(tried, iterations=other.iterations + tried.iterations), nothing
+            if misfit(other.map_T_camera, other.positions, measured, association) >= before:
+                break
+        else:
+            found = replace(other, cost_before=found.cost_before)
             if trace is not None and attempt is not None:
                 trace.take(attempt)
     calibrated, calibration = None, None

@@ -26,11 +26,16 @@ _TOLERANCE = 1e-4
 class InnerSolve(Linearised):
     """A graph for given parameters, with its variables near their optimum.
 
-    stale: the factorised normal equations of a state nearby, None if there is none. Steps with them cost a fifth of steps
-    with fresh ones, because no matrix is built and factorised.
+    stale: the factorised normal equations of a state nearby, for the steps. None means those of this state. Steps with stale
+    ones cost a fifth, because no matrix is built and factorised.
     """
 
     stale: NormalEquations | None = None
+
+    @property
+    def factored(self) -> NormalEquations:
+        """The normal equations of the next step."""
+        return self.normal if self.stale is None else self.stale
 
     @property
     def cost(self) -> float:
@@ -39,9 +44,8 @@ class InnerSolve(Linearised):
 
     @cached_property
     def step(self) -> Floats:
-        """(D,) the next step of an inner solve, by Gauss-Newton, or by a chord step with the `stale` normal equations."""
-        normal = self.normal if self.stale is None else self.stale
-        return -normal.solve(self.rows.jacobian.T @ self.rows.residual)
+        """(D,) the next step of an inner solve, by Gauss-Newton or, with `stale` normal equations, by the chord method."""
+        return -self.factored.solve(self.rows.jacobian.T @ self.rows.residual)
 
     @property
     def decrease(self) -> float:
@@ -76,22 +80,25 @@ class InnerSolve(Linearised):
     def solved(self) -> Self:
         """Return the state after at most `_INNER` steps, or `_damped` if a step does not lower the cost.
 
-        All steps have the `stale` normal equations, or else those of the first step (chord method). Between them, only the
-        robust weights and the directions change, and both little. The gradient is fresh, so the steps lead to the same
-        optimum as those of Gauss-Newton.
+        A step takes the normal equations of the step before (chord method). Between steps, only the robust weights and the
+        directions change, and both little. The gradient is fresh, so the steps lead to the same optimum as those of
+        Gauss-Newton. If a chord step does not lower the cost, the step is taken with fresh normal equations instead.
         """
-        state = self if self.stale is not None else replace(self, stale=self.normal)
+        state = self
         for _ in range(_INNER):
             if state.decrease <= _TOLERANCE * state.rows.cost:
-                return state
-            after = state.moved(state.step)
-            if not after.rows.cost <= state.rows.cost:
-                return self._damped() if self.stale is None else self.fresh().solved()
-            state = after
+                break
+            after = replace(state.moved(state.step), stale=state.factored)
+            if after.rows.cost <= state.rows.cost:
+                state = after
+            elif state.stale is None:
+                return state._damped()
+            else:
+                state = state.fresh()
         return state
 
     def fresh(self) -> Self:
-        """Return the state whose steps have its own normal equations."""
+        """Return the state whose next step has its own normal equations."""
         return replace(self, stale=None)
 
     def _damped(self) -> Self:
