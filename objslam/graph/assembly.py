@@ -106,6 +106,12 @@ class Measurements:
         number = np.append(0, np.cumsum(self.tags.measured_motions(self.rays, len(self.keyframes))))
         return np.asarray(number[self.motions.after] > number[self.motions.before])
 
+    @cached_property
+    def motion_factors(self) -> list[gtsam.NonlinearFactor]:
+        """The factors of `motions`. Graphs share them, as they never change."""
+        of = self.motions
+        return [] if of is None else betweens(of.before, of.after, of.motion, of.covariance, self.seen_twice)
+
     def whole(
         self, owner: Ints, used: Bools, map_T_camera: Floats, positions: Floats, loss: Loss = "huber"
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -164,9 +170,8 @@ class Measurements:
         made = [f for _, group in ray_factors(self.rays.take(which), owner[which], loss, settings) for f in group]
         made += landmark_priors(landmarks, positions, settings)
         if self.motions is not None:
-            of = self.motions
-            new = np.flatnonzero((of.after >= begin) & (of.after < end))
-            made += betweens(of.before[new], of.after[new], of.motion[new], of.covariance[new], self.seen_twice[new])
+            after = self.motions.after
+            made += [self.motion_factors[i] for i in np.flatnonzero((after >= begin) & (after < end)).tolist()]
         if keyframes.localized_every:
             on_plane = is_planar(keyframes.map_T_base)
             made += localizations(keyframes.take(np.arange(begin, end)), settings, begin, on_plane)

@@ -38,7 +38,7 @@ from objslam.graph.tags.fixed import tags_at_poses
 from objslam.graph.variables import make_values, with_points
 from objslam.triangulation.triangulate import Triangulation
 
-_TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-4
+_TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-3
 """A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a solve without
 shared errors. The second is for a solve with them, whose estimation moves everything again. Larger values end it sooner."""
 _ROUNDS_BEFORE = 2
@@ -112,6 +112,7 @@ def solve_joint(
     errors: CalibratedMeasurements | None = None,
     theta: Floats | None = None,
     hold: bool = False,
+    places: Floats | None = None,
 ) -> Estimate:
     """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
@@ -120,9 +121,11 @@ def solve_joint(
     If most rays of a stretch of the drive were rejected, and there is only odometry, the poses of the stretch may be wrong.
     In this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose.
     SolveError if the linear system is indeterminate, or if the cost is not finite.
-    start: (K, 4, 4) camera poses to start from instead. errors: the same keyframes and rays as a function of shared errors.
-    The shared errors are estimated, starting from theta (P,) or from their mean. Their covariance is added to the covariance
-    of objects. hold: whether the shared errors stay at theta, and the noise as it is. In this case, no covariance is added.
+    start: (K, 4, 4) camera poses to start from instead. places: (N, 3) m, positions to start from, NaN where unknown, if
+    start and places solve nearly the same measurements. Stretches that this solution rejects are not tried again. errors:
+    the same keyframes and rays as a function of shared errors. The shared errors are estimated, starting from theta (P,) or
+    from their mean. Their covariance is added to the covariance of objects. hold: whether the shared errors stay at theta,
+    and the noise as it is. In this case, no covariance is added.
     progress(done, total) counts the keyframes in the growing graph.
     The corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
     """
@@ -149,22 +152,28 @@ def solve_joint(
         trace.base_T_camera = keyframes.base_T_camera
     if start is not None:
         map_T_camera = start[multiframes.first]
+        if places is not None and tags is None:  # The corners of fiducials have no known positions.
+            positions = places
     elif not keyframes.localized_every:
         map_T_camera, positions = initialize_known(measured, association, progress, trace)
     nothing = np.zeros(len(rays), dtype=bool)
     tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
     rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
     found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace, tolerance, rounds)
-    loose = keyframes.odom_T_base is not None and not keyframes.localized_every
+    loose = keyframes.odom_T_base is not None and not keyframes.localized_every and places is None
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
-        other = reject_outliers(
-            measured, association, found.map_T_camera, found.positions, found.used, back, attempt, tolerance, rounds
-        )
-        before, after = (misfit(one.map_T_camera, one.positions, measured, association) for one in (found, other))
-        if after < before:
-            found = replace(other, cost_before=found.cost_before, iterations=found.iterations + other.iterations)
+        before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
+        for limit in (1, rounds - 1):  # Rays that belong to their objects lower the misfit in the first round already.
+            tried = reject_outliers(
+                measured, association, other.map_T_camera, other.positions, other.used, again, attempt, tolerance, limit
+            )
+            other, again = replace(tried, iterations=other.iterations + tried.iterations), nothing
+            if misfit(other.map_T_camera, other.positions, measured, association) >= before:
+                break
+        else:
+            found = replace(other, cost_before=found.cost_before)
             if trace is not None and attempt is not None:
                 trace.take(attempt)
     calibrated, calibration = None, None

@@ -34,6 +34,9 @@ _ITERATIONS = 3
 """The number of steps of this search. More steps find the directions more exactly, and take longer."""
 _COLUMNS = 48
 """The number of columns of the inverse that are computed at once. A larger number takes more memory."""
+_DENSE, _EACH = 2000, 8
+"""A dense block of the inverse has at most this many columns, and at most the second number for each column that is asked
+for. Beyond these, single columns take less time. Larger numbers take dense blocks more often."""
 
 
 @dataclass(frozen=True)
@@ -225,9 +228,15 @@ class _Inverse:
         """Return the block (d, d) of the inverse for each group of variables, in the order of their keys."""
         found: list[Floats] = []
         waiting: list[Ints] = []
-        for i, group in enumerate(groups):
-            waiting.append(self.columns(group))
-            if sum(map(len, waiting)) < _COLUMNS and i + 1 < len(groups):
+        asked = [self.columns(group) for group in groups]
+        every = np.unique(np.concatenate(asked)) if asked else np.zeros(0, dtype=np.int64)
+        dense = self.normal.last_block(every, min(_DENSE, _EACH * len(every))) if len(every) else None
+        if dense is not None:
+            block = (dense + dense.T) / 2 / self.scale[every] / self.scale[every, None]
+            return [block[np.ix_(at, at)] for at in (np.searchsorted(every, one) for one in asked)]
+        for i in range(len(asked)):
+            waiting.append(asked[i])
+            if sum(map(len, waiting)) < _COLUMNS and i + 1 < len(asked):
                 continue
             at = np.concatenate(waiting)
             whole = np.zeros((len(self.scale), len(at)))

@@ -13,6 +13,11 @@ from objslam.core.trace import Trace
 from objslam.errors import SolveError
 from objslam.graph.variables import read_poses, with_points
 
+STILL = 5e-3
+"""A joint solve ends if an iteration decreases the cost by less than this. The cost is half the sum of squared residuals in
+standard deviations. So a step that decreases it by d moves no variable by more than sqrt(2 d) of the variable's own standard
+deviation (Cauchy-Schwarz with the information matrix), here 0.1. A larger value ends a solve sooner."""
+
 OnIteration = Callable[[float, gtsam.Values], None]
 """A function that is called after each iteration with the new cost and the new values."""
 
@@ -55,14 +60,15 @@ def optimize(
     known_inliers: Sequence[int],
     tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
+    still: float = 0.0,
 ) -> Optimum:
     """Minimise from `start`, by `graduated` for the loss `gnc` and by `levenberg_marquardt` for all other losses.
 
-    known_inliers is for `gnc` only. tolerance and on_iteration are for all other losses only.
+    known_inliers is for `gnc` only. tolerance, on_iteration and still are for all other losses only.
     """
     if loss == "gnc":
         return graduated(graph, start, settings.joint.max_iterations, known_inliers)
-    return levenberg_marquardt(graph, start, settings.joint.max_iterations, tolerance, on_iteration)
+    return levenberg_marquardt(graph, start, settings.joint.max_iterations, tolerance, on_iteration, still)
 
 
 def levenberg_marquardt(
@@ -71,15 +77,17 @@ def levenberg_marquardt(
     max_iterations: int,
     relative_tolerance: float = 1e-6,
     on_iteration: OnIteration | None = None,
+    still: float = 0.0,
 ) -> Optimum:
     """Minimise by Levenberg-Marquardt. SolveError if the linear system is indeterminate, or if the cost is not finite.
 
-    relative_tolerance: the solve ends if an iteration decreases the cost by less than this share.
+    relative_tolerance: the solve ends if an iteration decreases the cost by less than this share. still: it also ends if an
+    iteration decreases the cost by less than this, for example `STILL`.
     """
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(max_iterations)
     parameters.setRelativeErrorTol(relative_tolerance)
-    parameters.setAbsoluteErrorTol(1e-12)
+    parameters.setAbsoluteErrorTol(max(still, 1e-12))
     last = 0
 
     def hook(number: Any, _: Any, after: Any) -> None:

@@ -12,7 +12,7 @@ from objslam.core.trace import Trace
 from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_at
-from objslam.graph.optimizers import Optimum, optimize, trace_solve
+from objslam.graph.optimizers import STILL, Optimum, optimize, trace_solve
 from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import read_poses, with_points
 
@@ -60,10 +60,12 @@ def reject_outliers(
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the relative
-    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger.
+    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger. With inliers of
+    an earlier solve, which seldom change, the first solve goes to the end already.
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
+    limit = tolerance if used.any() else max(tolerance, _COARSE)
     if measured.tags is not None:
         positions = measured.tags.placed(measured.rays, map_T_camera, positions)
     for _ in range(rounds):
@@ -76,14 +78,14 @@ def reject_outliers(
         graph, values = measured.whole(association.object, used, map_T_camera, positions, loss)
         landmarks, others = np.flatnonzero(np.isfinite(positions[:, 0])), range(int(used.sum()), graph.size())
         traced = trace_solve(trace, positions, landmarks)
-        optimum = optimize(graph, values, loss, measured.settings, others, max(tolerance, _COARSE), traced)
+        optimum = optimize(graph, values, loss, measured.settings, others, limit, traced, STILL)
         cost_before = optimum.cost_before if np.isnan(cost_before) else cost_before
         iterations += optimum.iterations
         map_T_camera = read_poses(optimum.values)
         positions = with_points(positions, landmarks, optimum.values)
     assert optimum is not None
-    if tolerance < _COARSE and loss != "gnc":
-        optimum = optimize(graph, optimum.values, loss, measured.settings, others, tolerance, traced)
+    if tolerance < limit and loss != "gnc":
+        optimum = optimize(graph, optimum.values, loss, measured.settings, others, tolerance, traced, STILL)
         iterations += optimum.iterations
         map_T_camera = read_poses(optimum.values)
         positions = with_points(positions, landmarks, optimum.values)

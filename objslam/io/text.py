@@ -76,14 +76,14 @@ def split_lines(data: bytes, place: str, ledger: Ledger) -> list[tuple[int, str]
     except UnicodeDecodeError:
         damaged = True
         text = data.decode("utf-8-sig", errors="replace")
-    lines = []
-    for number, line in enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), start=1):
-        content = line.strip()
-        if damaged and "\ufffd" in content:
-            ledger.drop("line that is not UTF-8 text", where=f"{place}:{number}")
-        elif content and not content.startswith("#"):
-            lines.append((number, content))
-    return lines
+    numbered = enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), start=1)
+    lines = [(number, content) for number, line in numbered if (content := line.strip())]
+    if damaged:
+        for number, content in lines:
+            if "\ufffd" in content:
+                ledger.drop("line that is not UTF-8 text", where=f"{place}:{number}")
+        lines = [line for line in lines if "\ufffd" not in line[1]]
+    return [line for line in lines if line[1][0] != "#"]
 
 
 def read_table(path: Path, columns: int, ledger: Ledger, what: str) -> Table:
@@ -121,7 +121,8 @@ def to_table(
 def _clean_table(numbered: Sequence[tuple[int, str]], columns: int) -> Table | None:
     """Return the table if all lines have `columns` numbers, else None. It is three times as fast as line by line."""
     lines = [text for _, text in numbered]
-    if not lines or any("_" in text or not text.isascii() for text in lines):
+    whole = "".join(lines)
+    if not lines or "_" in whole or not whole.isascii():
         return None
     try:
         values = np.loadtxt(lines, comments=None, ndmin=2)

@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
+from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
@@ -37,9 +37,6 @@ from objslam.mapping.refuted import without_refuted
 from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
-
-_LIBRARIES = ("gtsam", "scipy.linalg", "scipy.sparse")
-"""The libraries of every solve. They load in a stage of their own, because this takes longer than a small solve."""
 
 
 def run(
@@ -61,8 +58,7 @@ def run(
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
     with _stage("load", seconds, progress):
-        for library in _LIBRARIES:
-            import_module(library)
+        load_libraries()  # In a stage of its own, because this takes longer than a small solve.
     diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
         if settings.checks.use:

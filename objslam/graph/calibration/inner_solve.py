@@ -11,12 +11,12 @@ from objslam.core.geometry import exp_se3
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
-from objslam.graph.least_squares.normal_equations import elimination_order
+from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 from objslam.graph.optimizers import levenberg_marquardt
 from objslam.graph.outlier_rejection import supported
 from objslam.graph.variables import read_poses, with_points
 
-_INNER = 3
+_INNER = 4
 """The most steps of an inner solve. Few are enough, because it begins at a linear prediction of its optimum."""
 _TOLERANCE = 1e-4
 """An inner solve ends if the next step would decrease the cost by less than this share. A larger share ends it sooner."""
@@ -24,7 +24,18 @@ _TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class InnerSolve(Linearised):
-    """A graph for given parameters, with its variables near their optimum."""
+    """A graph for given parameters, with its variables near their optimum.
+
+    stale: the factorised normal equations of a state nearby, for the steps. None means those of this state. Steps with stale
+    ones cost a fifth, because no matrix is built and factorised.
+    """
+
+    stale: NormalEquations | None = None
+
+    @property
+    def factored(self) -> NormalEquations:
+        """The normal equations of the next step."""
+        return self.normal if self.stale is None else self.stale
 
     @property
     def cost(self) -> float:
@@ -33,8 +44,8 @@ class InnerSolve(Linearised):
 
     @cached_property
     def step(self) -> Floats:
-        """(D,) the next step of an inner solve, by Gauss-Newton."""
-        return -self.normal.solve(self.rows.jacobian.T @ self.rows.residual)
+        """(D,) the next step of an inner solve, by Gauss-Newton or, with `stale` normal equations, by the chord method."""
+        return -self.factored.solve(self.rows.jacobian.T @ self.rows.residual)
 
     @property
     def decrease(self) -> float:
@@ -59,23 +70,36 @@ class InnerSolve(Linearised):
 
     def predicted(self, system: ReducedSystem, step: Floats, measured: Measurements) -> Self:
         """Return the linear prediction of the optimum for other measurements, after a step (P,) of the parameters."""
-        return self.moved(system.sensitivity @ step + system.newton).measuring(measured)
+        moved = self.moved(system.sensitivity @ step + system.newton)
+        return replace(moved, stale=self.normal).measuring(measured)
 
     def measuring(self, measured: Measurements) -> Self:
         """Return the state with other measured values of the same rays and motions."""
         return replace(self, measured=measured, known=self.graph.measuring(measured))
 
     def solved(self) -> Self:
-        """Return the state after at most `_INNER` Gauss-Newton steps, or `_damped` if a step does not lower the cost."""
+        """Return the state after at most `_INNER` steps, or `_damped` if a step does not lower the cost.
+
+        A step takes the normal equations of the step before (chord method). Between steps, only the robust weights and the
+        directions change, and both little. The gradient is fresh, so the steps lead to the same optimum as those of
+        Gauss-Newton. If a chord step does not lower the cost, the step is taken with fresh normal equations instead.
+        """
         state = self
         for _ in range(_INNER):
             if state.decrease <= _TOLERANCE * state.rows.cost:
-                return state
-            after = state.moved(state.step)
-            if not after.rows.cost <= state.rows.cost:
-                return self._damped()
-            state = after
+                break
+            after = replace(state.moved(state.step), stale=state.factored)
+            if after.rows.cost <= state.rows.cost:
+                state = after
+            elif state.stale is None:
+                return state._damped()
+            else:
+                state = state.fresh()
         return state
+
+    def fresh(self) -> Self:
+        """Return the state whose next step has its own normal equations."""
+        return replace(self, stale=None)
 
     def _damped(self) -> Self:
         """Return the state after at most `_INNER` iterations of Levenberg-Marquardt."""

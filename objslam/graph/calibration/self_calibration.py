@@ -14,6 +14,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import CalibratedMeasurements, Calibration
+from objslam.core.noise import NOMINAL
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
@@ -93,15 +94,16 @@ def calibrate(
     """
     fit = _Fit(errors, measure, trace)
     state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used).ordered()
-    nearly = bool(errors.unknown_noise) and len(theta) > 0
+    nearly = bool(errors.unknown_noise) and len(theta) > 0 and errors.noise == NOMINAL  # Else, it is known from before.
     at = fit.shared_errors(state, theta, _NEARLY if nearly else _CONVERGED)
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
         noise = estimate_noise(state, at.system, fit.errors, theta, fit.prior_residuals)
         before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
         fit = replace(fit, errors=fit.errors.with_noise(noise))
-        state = fit.remeasured(state, theta).settled()
-        if nearly or not same:
+        state = fit.remeasured(state, theta)
+        if nearly or not same:  # Otherwise, the last solve below settles what little the new noise moves.
+            state = state.fresh().solved().settled()
             at = fit.shared_errors(state, theta, _CONVERGED, at.noise if noise.like(before, _SAME_SHARES) else None)
             state, theta, steps, nearly = at.state, at.theta, steps + at.steps, False
         if same:
@@ -239,8 +241,8 @@ class _Fit:
         return _Found(now.theta, now.state, now.linear, shares, steps)
 
     def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
-        """Return the optimum for the measurements with the present noise."""
-        return state.measuring(self.measure(*self.errors.at(theta))).solved()
+        """Return the same poses and landmarks with the measurements at the present noise."""
+        return state.measuring(self.measure(*self.errors.at(theta)))
 
 
 def _likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:

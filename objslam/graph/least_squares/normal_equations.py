@@ -34,6 +34,25 @@ class NormalEquations:
         found[self.order] = self.factored.solve(right[self.order])
         return found
 
+    def last_block(self, columns: Ints, most: int) -> Floats | None:
+        """Return the block (n, n) of the inverse at some columns (n,), if they are eliminated among the `most` last ones.
+
+        With J^T J = L U, the last block of the inverse is that of the last block of L times that of U. Landmarks are
+        eliminated late, because many poses see them. So their covariances come from a small dense matrix, where `solve`
+        would go through all poses for each column. None if a column is eliminated earlier.
+        """
+        rank = np.empty_like(self.order)
+        rank[self.order] = np.arange(len(self.order))
+        first = int(rank[columns].min())
+        straight = np.arange(len(rank))
+        if len(rank) - first > most or not all(
+            np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)
+        ):
+            return None
+        last = (self.factored.L[first:, first:] @ self.factored.U[first:, first:]).toarray()
+        at = rank[columns] - first
+        return np.asarray(np.linalg.inv(last)[np.ix_(at, at)])
+
 
 def elimination_order(jacobian: sparse.csr_matrix, blocks: Ints) -> Ints:
     """Return the columns (D,) of a Jacobian (M, D) in an order in which their elimination fills in little (minimum degree).

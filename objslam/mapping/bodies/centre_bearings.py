@@ -68,7 +68,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
 def _solve(
     state: JointState, keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, shift: Floats
 ) -> Estimate:
-    """Solve poses and objects once more, with `shift` (R, 3) added to the measured directions.
+    """Solve poses and objects once more, from the estimate, with `shift` (R, 3) added to the measured directions.
 
     keyframes, rays: those of the state without the shared errors of the estimate.
     """
@@ -89,6 +89,7 @@ def _solve(
         state.trace,
         errors,
         None if estimate.calibration is None else estimate.calibration.values,
+        places=estimate.positions,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
-from objslam.core.geometry import inverse, make_pose
+from objslam.core.geometry import inverse, lift_se2, make_pose
 from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion, rotation_from_vector
 from objslam.core.types import CameraLog, Log, Trajectory
 
@@ -182,8 +182,7 @@ def yaws(poses: Floats) -> Floats:
 
 def _yaw_times(poses: Floats, factor: float) -> Floats:
     """Return poses with their headings multiplied by a factor."""
-    yaw = factor * yaws(poses)
-    return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])
+    return make_pose(_about_z(factor * yaws(poses)), poses[:, :3, 3])
 
 
 def _from_degrees(poses: Floats) -> Floats:
@@ -196,8 +195,12 @@ def _from_degrees(poses: Floats) -> Floats:
     steps = np.unwrap(np.append(0.0, np.diff(said)))  # Each step is near the step before.
     yaw = np.radians(np.cumsum(steps))
     way = np.diff(poses[:, :2, 3], axis=0) @ [1, 1j] * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
-    yaw += np.angle(way.sum())
-    return make_pose(rotation_from_vector(np.outer(yaw, [0.0, 0.0, 1.0])), poses[:, :3, 3])
+    return make_pose(_about_z(yaw + np.angle(way.sum())), poses[:, :3, 3])
+
+
+def _about_z(yaw: Floats) -> Floats:
+    """Return the rotations (N, 3, 3) with headings (N,), rad."""
+    return lift_se2(np.column_stack([np.zeros((len(yaw), 2)), yaw]))[:, :3, :3]
 
 
 def _swapped(poses: Floats) -> Floats:

@@ -35,37 +35,41 @@ def draw_segments(image: Image, ends: Floats, colour: Colour, opacity: float) ->
     """Draw segments (n, 2, 2), px, 1 px wide (Wu 1991). Where k overlap, (1 - opacity)^k of the image shows through."""
     height, width = image.shape[:2]
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
-    cover = np.zeros(height * width)
-    for x, y, weight in _pixels_of(ends, width, height):
-        cover += np.bincount(y * width + x, weight, minlength=len(cover))
-    touched = np.flatnonzero(cover)
-    left = (1 - opacity) ** cover[touched, None]
+    # The canvas has a rim that takes what lies beside the image: one pixel before it, two behind it.
+    cover = np.zeros((height + 3) * (width + 3))
+    for pixel, weight in _pixels_of(ends, width, height):
+        cover += np.bincount(pixel, weight, minlength=len(cover))
+    inside = cover.reshape(height + 3, width + 3)[1 : height + 1, 1 : width + 1].ravel()
+    touched = np.flatnonzero(inside)
+    left = (1 - opacity) ** inside[touched, None]
     flat = image.reshape(-1, 3)
     flat[touched] = np.round(flat[touched] * left + _bgr(colour) * (1 - left)).astype(np.uint8)
 
 
-def _pixels_of(ends: Floats, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], Floats]]:
-    """Yield, in batches, the pixels x, y that segments (n, 2, 2), px, touch, and the covered share of each pixel. These are
-    two neighbouring pixels for each px along a segment."""
+def _pixels_of(ends: Floats, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], Floats]]:
+    """Yield, in batches, the pixels that segments (n, 2, 2), px, touch, and the covered share of each pixel. These are two
+    neighbouring pixels for each px along a segment. A pixel is its number in the canvas of `draw_segments`."""
     along = ends[:, 1] - ends[:, 0]
     steep = np.abs(along[:, 1]) > np.abs(along[:, 0])
     ends = np.where(steep[:, None, None], ends[..., ::-1], ends)  # The longer coordinate comes first.
     ends = np.where((ends[:, 0, 0] > ends[:, 1, 0])[:, None, None], ends[:, ::-1], ends)
-    first = np.clip(np.ceil(ends[:, 0, 0]), 0, np.where(steep, height, width)).astype(np.int64)
-    last = np.clip(np.floor(ends[:, 1, 0]), -1, np.where(steep, height, width) - 1).astype(np.int64)
+    longer, other = np.where(steep, [[height], [width]], [[width], [height]])
+    first = np.clip(np.ceil(ends[:, 0, 0]), 0, longer).astype(np.int64)
+    last = np.clip(np.floor(ends[:, 1, 0]), -1, longer - 1).astype(np.int64)
     count = np.maximum(last - first + 1, 0)
     slope = (ends[:, 1, 1] - ends[:, 0, 1]) / np.maximum(ends[:, 1, 0] - ends[:, 0, 0], 1e-9)
+    to_next, to_side = np.where(steep, [[width + 3], [1]], [[1], [width + 3]])
     for part in np.array_split(np.arange(len(ends)), int(count.sum()) // _BATCH + 1):
         number = count[part]
         which = np.repeat(part, number)
-        fast = first[which] + np.arange(len(which)) - np.repeat(np.cumsum(number) - number, number)
-        slow = ends[which, 0, 1] + slope[which] * (fast - ends[which, 0, 0])
-        below = np.floor(np.clip(slow, -_FAR, _FAR)).astype(np.int64)
-        share = slow - below
-        for pixel, weight in ((below, 1 - share), (below + 1, share)):
-            x, y = np.where(steep[which], pixel, fast), np.where(steep[which], fast, pixel)
-            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-            yield x[inside], y[inside], weight[inside]
+        fast = np.arange(len(which)) + np.repeat(first[part] - np.cumsum(number) + number, number)
+        slow = (ends[:, 0, 1] - slope * ends[:, 0, 0])[which] + slope[which] * fast
+        slow = np.clip(slow, -1.0, other[which])
+        below = np.floor(slow).astype(np.int64)
+        share, side = slow - below, to_side[which]
+        pixel = (fast + 1) * to_next[which] + (below + 1) * side
+        yield pixel, 1 - share
+        yield pixel + side, share
 
 
 def draw_line(image: Image, points: Floats, colour: Colour, width: float, dash: tuple[float, float] | None = None) -> None:

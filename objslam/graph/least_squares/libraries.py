@@ -1,0 +1,33 @@
+"""Load the libraries of every solve, and nothing that they load without need."""
+
+import sys
+from importlib import import_module
+from importlib.util import LazyLoader, find_spec, module_from_spec
+
+_NEEDED = ("gtsam", "scipy.linalg", "scipy.sparse")
+"""The libraries of every solve. Together, they take longer to load than a small solve takes."""
+
+
+def load_libraries() -> None:
+    """Load GTSAM and the parts of scipy that a solve needs."""
+    import_module("numpy")
+    _import_later("numpy.f2py")  # scipy copies all names of numpy, which loads this compiler of Fortran: 0.06 s.
+    for library in _NEEDED:
+        import_module(library)
+
+
+def _import_later(name: str) -> None:
+    """Let a module load at its first use. Its parent must be imported already.
+
+    A module that only copies the names of the parent then does not load it. Nothing happens if the module is imported
+    already, or does not exist.
+    """
+    spec = None if name in sys.modules else find_spec(name)
+    if spec is None or spec.loader is None:
+        return
+    spec.loader = LazyLoader(spec.loader)
+    module = module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    parent, _, child = name.rpartition(".")
+    setattr(sys.modules[parent], child, module)
