@@ -32,10 +32,6 @@ larger residuals."""
 _STILL = 0.01
 """The share of rays that may get another object along the most likely path, without another round. A larger share ends the
 rounds sooner. A few rays change in each round, because the path has the steps of a grid."""
-_VIEW = 1.0
-"""The solid angle (sr) in which a stray ray may lie, about that of a camera. With a larger value, the number of agreeing
-rays counts more, and their noise less."""
-
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
 
@@ -219,15 +215,9 @@ class JointState:
 
     @property
     def explained(self) -> float:
-        """The sum over agreeing rays of the log odds that a ray belongs to its object and is not false.
-
-        Each object costs as much as `association.min_rays` average rays give. The density is 1 / (2 pi e sigma^2) per sr for
-        an agreeing ray, on average, and 1 / `_VIEW` for a false one. If more rays agree only because their noise was
-        estimated larger, each of them counts less. A ray with more noise than a view counts 0.
-        """
-        assert self.association is not None
-        gain = np.maximum(np.log(_VIEW / (2 * np.pi * np.e * self.rays.sigma**2)), 0.0)
-        return float(gain[self.agree].sum() - self.settings.association.min_rays * self.association.count * gain.mean())
+        """The log evidence for the association: how well it explains both the rays and the odometry."""
+        assert self.estimate is not None
+        return self.estimate.log_evidence
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
         from objslam.association.global_association import associate_globally

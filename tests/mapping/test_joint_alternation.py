@@ -45,26 +45,6 @@ def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry
     assert plain.agree.mean() < 0.95
 
 
-def test_more_rays_that_are_noisier_are_no_better_map():
-    rays = SimpleNamespace(sigma=np.full(100, 0.005))
-    settings = load_settings(None)
-
-    def state(agreeing, noise):
-        association = Association(np.where(np.arange(100) < agreeing, 0, -1), np.zeros(1, dtype=np.int64))
-        solved = SimpleNamespace(weight=np.ones(100))
-        noisy = SimpleNamespace(sigma=rays.sigma * noise)
-        return JointState(
-            None, None, None, noisy, (), settings, Ledger(), None, None, None, association=association, estimate=solved
-        )
-
-    quiet = state(80, 0.5)
-    assert quiet.better(state(95, 4.0)) is quiet
-    more = state(95, 0.5)
-    assert quiet.better(more).agree.sum() == 95
-    assert more.better(quiet) is more
-    assert state(80, 100.0).explained == 0  # 0.5 rad, more than a view
-
-
 def taking_turns(monkeypatch, turns, errors=None):
     """A state whose rounds find these associations, and the list of whether each of its solves held the shared errors."""
     rays = SimpleNamespace(sigma=np.full(30, 0.01))
@@ -75,8 +55,8 @@ def taking_turns(monkeypatch, turns, errors=None):
 
     def solve(state, why, association, start):
         held.append(state.hold)
-        weight = (association.object >= 0).astype(float)
-        estimate = SimpleNamespace(weight=weight, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
+        held_rays = int((association.object >= 0).sum())
+        estimate = SimpleNamespace(log_evidence=held_rays, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
         return replace(state, association=association, estimate=estimate)
 
     monkeypatch.setattr(JointState, "_associate", lambda state, *_, rough: turns[len(state.rounds)])
