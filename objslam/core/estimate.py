@@ -23,7 +23,8 @@ class Estimate:
     box_offset: the standard deviation of the error that all box centres of an object share, divided by the object's size.
     None if boxes have no size. correlated: (N, 3, m) m, the part of the errors that is correlated between objects, as a
     factor of their joint covariance. It is 0 for an object that was not solved, and None if all objects are independent.
-    tags: the rotation and the size of each fiducial that has them, by the index of its object.
+    tags: the rotation and the size of each fiducial that has them, by the index of its object. log_evidence: of the
+    association, up to a constant. It compares associations of the same rays. -inf if it is not known.
     """
 
     map_T_base: Floats
@@ -40,3 +41,4 @@ class Estimate:
     box_offset: float | None = None
     correlated: Floats | None = None
     tags: Mapping[int, TagPose] = field(default_factory=dict)
+    log_evidence: float = float("-inf")

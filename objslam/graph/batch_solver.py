@@ -20,7 +20,11 @@ from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.factors.odometry_motions import find_ties
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.init_known_correspondences import initialize_known
-from objslam.graph.marginals import (
+from objslam.graph.multiframes import Multiframes
+from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
+from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
+from objslam.graph.posterior.evidence import log_evidence
+from objslam.graph.posterior.marginals import (
     SolvedGraph,
     correlated_factor,
     joint_covariances,
@@ -28,9 +32,6 @@ from objslam.graph.marginals import (
     marginal_covariances,
     seen_covariances,
 )
-from objslam.graph.multiframes import Multiframes
-from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
-from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.robust_cost import ray_information
 from objslam.graph.tags.corner_rays import TagCorners
 from objslam.graph.tags.estimate import with_objects
@@ -195,7 +196,8 @@ def solve_joint(
 
     landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
     origins, directions = (a[used] for a in rays.in_map(map_T_camera))
-    residual = angles_off(origins, directions, positions[association.object[used]]) / rays.sigma[used]
+    seen = positions[association.object[used]]
+    residual = angles_off(origins, directions, seen) / rays.sigma[used]
     weight = np.zeros(len(rays))
     weight[used] = _weights(settings.joint.loss, residual, optimum)
     covariance = np.full((association.count, 3, 3), np.nan)
@@ -234,6 +236,9 @@ def solve_joint(
         calibration=calibration if calibration is not None and calibration.names else None,
         noise=None if errors is None else errors.noise,
         correlated=correlated if tags is None else tags.of_objects(correlated),
+        log_evidence=log_evidence(
+            measured, association, used, np.linalg.norm(seen - origins, axis=1), solved, optimum.cost_after
+        ),
     )
     if tags is None:
         return estimate

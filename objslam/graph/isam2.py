@@ -18,8 +18,8 @@ from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.graph.factors.priors import point_prior, pose_prior
 from objslam.graph.growing_graph import GrowingGraph
 from objslam.graph.isam2_rebuild import IncrementalRebuild, new_isam
-from objslam.graph.marginals import HELD, in_camera, in_order
 from objslam.graph.optimizers import build_graph, indeterminate, levenberg_marquardt
+from objslam.graph.posterior.marginals import HELD, in_camera, in_order
 from objslam.graph.variables import L0, X0, Variables
 
 _AT_ONCE = 400

@@ -186,7 +186,7 @@ def _explains_far_more(at: FixedPoses, wide: Association) -> Association | None:
 
 def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
     """Return an estimate with the covariance of the shared errors added to its objects."""
-    from objslam.graph.marginals import largest_sigma
+    from objslam.graph.posterior.marginals import largest_sigma
 
     told = found.calibration
     covariance = estimate.covariance + found.sensitivity @ told.covariance @ np.swapaxes(found.sensitivity, 1, 2)

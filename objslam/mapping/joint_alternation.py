@@ -32,9 +32,9 @@ larger residuals."""
 _STILL = 0.01
 """The share of rays that may get another object along the most likely path, without another round. A larger share ends the
 rounds sooner. A few rays change in each round, because the path has the steps of a grid."""
-_VIEW = 1.0
-"""The solid angle (sr) in which a stray ray may lie, about that of a camera. With a larger value, the number of agreeing
-rays counts more, and their noise less."""
+_WORSE = 2
+"""The number of rounds along the most likely path, one after the other, that explain no more than the best one before the
+rounds end. A larger number takes longer, and crosses more rounds in which close objects merged."""
 
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
@@ -168,11 +168,13 @@ class JointState:
         """Return the state after rounds along the most likely path through its map, if its rays are better `explained`.
 
         Rounds in turns keep a path that is bent onto wrong landmarks, because all its rays agree. So each round here begins
-        with the path that is most likely if any ray may belong to any landmark.
+        with the path that is most likely if any ray may belong to any landmark. Every second round holds the shared errors
+        and the noise, as they change little in one round.
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return self
-        state = best = self.attempt()
+        state, worse = self.attempt(), 0
+        best = state
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"most likely path, round {number + 1}", 0, 0)
             assert state.association is not None
@@ -186,10 +188,16 @@ class JointState:
             if rays_moved(before.object, association.object) <= _STILL * len(state.rays):
                 break
             start = path @ state.keyframes.base_T_camera
+            state = replace(state, hold=self.hold or (self.errors is not None and number % 2 == 1))
             state = state.counted(association).solve("association", association, start).merged()
-            best = max(best, state, key=lambda one: one.explained)  # Close objects may merge in one round, and part again.
+            # Close objects may merge in one round, and part again.
+            best, worse = (state, 0) if state.explained > best.explained else (best, worse + 1)
+            if worse == _WORSE:
+                break
         if best.association is self.association:
             return self
+        if best.hold != self.hold:
+            best = best.released(self.hold)
         assert best.association is not None
         assert best.estimate is not None
         turns = best.alternated(best.estimate.map_T_base, (best.association, best.estimate.positions))
@@ -202,13 +210,27 @@ class JointState:
         return replace(self, ledger=Ledger(), trace=None if self.trace is None else self.trace.aside())
 
     def better(self, attempt: Self) -> Self:
-        """Return the result of an attempt if its rays are better `explained` than those of this state, else this state."""
-        if attempt.explained <= self.explained:
+        """Return the result of an attempt if its association explains more than that of this state, else this state.
+
+        The two are compared at the shared errors and the noise of each. An estimate of the noise that is off by chance would
+        otherwise decide.
+        """
+        gain = attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
+        if not gain > 0:
             return self
         self.ledger.add(attempt.ledger)
         if self.trace is not None and attempt.trace is not None:
             self.trace.rounds.extend(attempt.trace.rounds)
         return replace(attempt, ledger=self.ledger, trace=self.trace)
+
+    def _explained_like(self, other: Self) -> float:
+        """Return what the association explains at the shared errors and the noise of another state."""
+        if self.errors is None or other.errors is None or other.theta is None:
+            return self.explained
+        assert self.association is not None
+        keyframes, rays, _ = other.errors.at(other.theta)
+        there = replace(self.attempt(), keyframes=keyframes, rays=rays, theta=other.theta, hold=True)
+        return there.solve_once(self.association, other.errors, self.solved_poses).log_evidence
 
     @property
     def agree(self) -> Bools:
@@ -219,15 +241,9 @@ class JointState:
 
     @property
     def explained(self) -> float:
-        """The sum over agreeing rays of the log odds that a ray belongs to its object and is not false.
-
-        Each object costs as much as `association.min_rays` average rays give. The density is 1 / (2 pi e sigma^2) per sr for
-        an agreeing ray, on average, and 1 / `_VIEW` for a false one. If more rays agree only because their noise was
-        estimated larger, each of them counts less. A ray with more noise than a view counts 0.
-        """
-        assert self.association is not None
-        gain = np.maximum(np.log(_VIEW / (2 * np.pi * np.e * self.rays.sigma**2)), 0.0)
-        return float(gain[self.agree].sum() - self.settings.association.min_rays * self.association.count * gain.mean())
+        """The log evidence for the association: how well it explains both the rays and the odometry."""
+        assert self.estimate is not None
+        return self.estimate.log_evidence
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
         from objslam.association.global_association import associate_globally

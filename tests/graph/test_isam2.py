@@ -16,8 +16,8 @@ from objslam.errors import SolveError
 from objslam.graph.factors.odometry import motions
 from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
-from objslam.graph.marginals import SolvedGraph, largest_sigma, marginal_covariances, seen_covariances
 from objslam.graph.optimizers import levenberg_marquardt
+from objslam.graph.posterior.marginals import SolvedGraph, largest_sigma, marginal_covariances, seen_covariances
 from objslam.graph.variables import X0, make_values, read_points, read_poses
 from objslam.simulation import preset, simulate
 

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.graph.factors.bearing import bearings
-from objslam.graph.marginals import (
+from objslam.graph.optimizers import build_graph
+from objslam.graph.posterior.marginals import (
     SolvedGraph,
     correlated_factor,
     in_order,
@@ -18,7 +19,6 @@ from objslam.graph.marginals import (
     marginal_covariances,
     seen_covariances,
 )
-from objslam.graph.optimizers import build_graph
 from objslam.graph.variables import L0, X0, make_values
 
 POINTS = np.array([[4.0, 1, 0], [0, 5, 1], [-3, 2, 0.5]])

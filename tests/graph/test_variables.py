@@ -9,8 +9,8 @@ from test_isam2 import grown
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3
 from objslam.graph.assembly import Measurements
-from objslam.graph.marginals import SolvedGraph, marginal_covariances, seen_covariances
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
+from objslam.graph.posterior.marginals import SolvedGraph, marginal_covariances, seen_covariances
 from objslam.graph.variables import L0, make_values, read_points, read_poses, with_points
 
 OTHER_POSE, OTHER_POINT = gtsam.symbol("c", 3), gtsam.symbol("t", 0)

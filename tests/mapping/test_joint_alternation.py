@@ -13,6 +13,7 @@ from objslam.core.types import Association, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
+from objslam.mapping import joint_alternation
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import seen_something
@@ -45,26 +46,6 @@ def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry
     assert plain.agree.mean() < 0.95
 
 
-def test_more_rays_that_are_noisier_are_no_better_map():
-    rays = SimpleNamespace(sigma=np.full(100, 0.005))
-    settings = load_settings(None)
-
-    def state(agreeing, noise):
-        association = Association(np.where(np.arange(100) < agreeing, 0, -1), np.zeros(1, dtype=np.int64))
-        solved = SimpleNamespace(weight=np.ones(100))
-        noisy = SimpleNamespace(sigma=rays.sigma * noise)
-        return JointState(
-            None, None, None, noisy, (), settings, Ledger(), None, None, None, association=association, estimate=solved
-        )
-
-    quiet = state(80, 0.5)
-    assert quiet.better(state(95, 4.0)) is quiet
-    more = state(95, 0.5)
-    assert quiet.better(more).agree.sum() == 95
-    assert more.better(quiet) is more
-    assert state(80, 100.0).explained == 0  # 0.5 rad, more than a view
-
-
 def taking_turns(monkeypatch, turns, errors=None):
     """A state whose rounds find these associations, and the list of whether each of its solves held the shared errors."""
     rays = SimpleNamespace(sigma=np.full(30, 0.01))
@@ -75,8 +56,8 @@ def taking_turns(monkeypatch, turns, errors=None):
 
     def solve(state, why, association, start):
         held.append(state.hold)
-        weight = (association.object >= 0).astype(float)
-        estimate = SimpleNamespace(weight=weight, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
+        held_rays = int((association.object >= 0).sum())
+        estimate = SimpleNamespace(log_evidence=held_rays, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
         return replace(state, association=association, estimate=estimate)
 
     monkeypatch.setattr(JointState, "_associate", lambda state, *_, rough: turns[len(state.rounds)])
@@ -119,6 +100,62 @@ def test_the_last_solve_estimates_the_shared_errors(monkeypatch, two, turns, exp
     assert chosen.settled
     assert not chosen.hold
     assert held == expected
+
+
+@pytest.fixture
+def along_paths(monkeypatch):
+    """A function that makes a state whose rounds along the most likely path find associations with these log evidences."""
+
+    def make(evidences):
+        names = [Association(np.full(30, i), np.zeros(i + 1, dtype=np.int64)) for i in range(len(evidences))]
+        begin, held = taking_turns(monkeypatch, [], errors=SimpleNamespace())
+        solve, value = JointState.solve, {one.count: evidence for one, evidence in zip(names, evidences, strict=True)}
+        monkeypatch.setattr(JointState, "explained", property(lambda state: value[state.association.count]))
+        monkeypatch.setattr(JointState, "_explained_like", lambda state, other: state.explained)
+        monkeypatch.setattr(JointState, "_associate", lambda state, *_, rough: names[state.association.count])
+        monkeypatch.setattr(JointState, "alternated", lambda state, *_: state)
+        monkeypatch.setattr(joint_alternation, "relocalize", lambda *_: (np.eye(4)[None], None))
+        monkeypatch.setattr(joint_alternation, "rays_moved", lambda *_: 30)
+        keyframes = SimpleNamespace(base_T_camera=np.eye(4)[None], odom_T_base=np.eye(4)[None], localized_every=0.0)
+        return solve(replace(begin, keyframes=keyframes, rays=range(30)), "association", names[0], None), held
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("evidences", "expected", "solves"),
+    [
+        ([5, 6, 7, 1, 2, 9], 7, [False, True, False, True, False]),
+        ([5, 1, 7, 8, 2, 3, 9], 8, [False, True, False, True, False]),
+        ([5, 4, 3, 9], 5, [False, True]),
+    ],
+    ids=["held", "through a worse round", "none"],
+)
+def test_rounds_along_the_path_end_after_two_worse_ones_and_the_best_counts(along_paths, evidences, expected, solves):
+    """Every second round holds the shared errors. They are estimated once more if the best round held them."""
+    begin, held = along_paths(evidences)
+    held.clear()
+    found = begin.relocalized()
+    assert found.explained == expected
+    assert not found.hold
+    assert held == solves
+
+
+@pytest.mark.parametrize(("other", "wins"), [(-1.0, False), (2.0, True)])
+def test_maps_are_compared_at_the_same_noise(monkeypatch, other, wins):
+    """The estimated noise favours one of two maps. At the noise of either, the other may be better."""
+    one = Association(np.zeros(30, dtype=np.int64), np.zeros(1, dtype=np.int64))
+    errors = [SimpleNamespace(at=lambda theta, name=name: (None, name, None), name=name) for name in ("quiet", "noisy")]
+    settings = load_settings(None)
+    states = []
+    for own, evidence in zip(errors, (100.0, 110.0), strict=True):
+        state = JointState(None, None, None, None, (), settings, Ledger(), None, None, own, np.zeros(1))
+        states.append(replace(state, association=one, estimate=SimpleNamespace(log_evidence=evidence)))
+    mine, attempt = states
+    told = {"quiet": SimpleNamespace(log_evidence=100.0 + other), "noisy": SimpleNamespace(log_evidence=110.0 - other)}
+    monkeypatch.setattr(JointState, "solved_poses", None)
+    monkeypatch.setattr(JointState, "solve_once", lambda state, association, errors, start: told[state.rays])
+    assert (mine.better(attempt) is not mine) == wins
 
 
 def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():

@@ -28,6 +28,11 @@ class NormalEquations:
         """The least pivot. The larger the entries of J^T J are beside it, the more digits the elimination has lost."""
         return float(self.factored.U.diagonal().min())
 
+    @property
+    def log_determinant(self) -> float:
+        """The log of the determinant of J^T J."""
+        return float(np.log(self.factored.U.diagonal()).sum())
+
     def solve(self, right: Floats) -> Floats:
         """Return the solution (D,) or (D, n) for a right-hand side (D,) or (D, n)."""
         found = np.empty_like(right)

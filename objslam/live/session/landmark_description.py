@@ -9,7 +9,7 @@ from objslam.core.geometry import widest_angle
 from objslam.core.object_map import MapObject
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association
-from objslam.graph.marginals import largest_sigma
+from objslam.graph.posterior.marginals import largest_sigma
 from objslam.live.calibration.collected import offline_rays
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track

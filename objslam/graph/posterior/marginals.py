@@ -220,6 +220,11 @@ class _Inverse:
         first, last = begin.tolist(), end.tolist()
         return cls(normal, scale, dict(zip(keys, first, strict=True)), dict(zip(keys, last, strict=True)))
 
+    @property
+    def log_determinant(self) -> float:
+        """The log of the determinant of the normal equations."""
+        return self.normal.log_determinant + 2 * float(np.log(self.scale).sum())
+
     def columns(self, keys: Sequence[int]) -> Ints:
         """Return the columns of variables, in the order of the keys."""
         return np.concatenate([np.arange(self.begin[key], self.end[key]) for key in keys])
