@@ -178,7 +178,6 @@ def wheels(
     yaw = np.cumsum(turn)
     c, s = np.cos(yaw - turn / 2), np.sin(yaw - turn / 2)
     pose = np.column_stack([np.cumsum(ahead * c - aside * s), np.cumsum(ahead * s + aside * c), yaw])
-    pose = np.vstack([np.zeros((1, 3)), pose[:-1]])  # A stamp is at the beginning of a simulated step.
     every = max(round(1 / (rate * STEP)), 1)
     true = {"odometry.scale": 1 / float(np.mean(longer)) - 1, "odometry.turn_scale": 1 / faster - 1}
     true |= {"odometry.turn_bias": -bias / faster} if gyro else {}

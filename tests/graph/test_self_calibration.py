@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
+from objslam.core.types import Trajectory
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
@@ -210,3 +211,21 @@ def test_only_measured_motions_have_noise_in_their_derivatives():
         shares.append(noise_shares(state, linearise(state, errors, theta), errors)[errors.names.index("front.clock")])
     assert shares[0] > 0.5
     assert shares[1] < 0.01
+
+
+def test_below_ties_the_path_is_the_instrument_of_the_clock():
+    """Images come every 0.2 s, and poses of the odometry every 1.4 s, or as often as the images."""
+    found = {}
+    for every in (1, 7):
+        log = simulate(preset("demo", frames=200, objects=12, classes=12, localization=None, odometry=Odometry()), 3)
+        log = replace(log, odometry=Trajectory(log.odometry.stamps[::every], log.odometry.poses[::every]))
+        made = drive_of(log, load_settings(None, ("mode=joint", "poses.max_gap=2")))
+        errors, every_ray = shared_errors(log, made.keyframes, made.rays, made.settings), np.ones(len(made.rays), dtype=bool)
+        theta, poses = np.zeros(len(errors.names)), made.map_T_base @ made.keyframes.base_T_camera
+        measured = Measurements.of(*errors.at(theta))
+        state = Linearised(measured, made.association, poses, made.points, every_ray)
+        system = linearise(state, errors, theta)
+        k = errors.names.index("front.clock")
+        found[every] = noise_shares(state, system, errors)[k], measured.motions.tied
+    assert found[1][1] == 0
+    assert 0.2 < found[7][1] <= found[7][0] <= 1
