@@ -12,13 +12,17 @@ from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import ConfigError
-from objslam.frontend.corrected_log import AXES, ODOMETRY, take_out
+from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
 from objslam.io.calibration_yaml import load_calibration
 
+_PRIORS = {"translation": 0.05, "focal": 0.02, "centre": 0.02}
+"""The prior standard deviations (m, share, share of the focal length) that `auto` means in fixed mode: of a place that
+somebody measured with a ruler, of a field of view from a data sheet, and of an image centre taken as the middle of the
+image. A calibrated camera errs less. With larger values, a log must show more before an error counts as known."""
 COARSE = 0.3
 """The noise of given poses, m, from which on they reveal no error of a camera. A robot at 1 to 2 m/s drives less than this
 during its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
-_CAMERA = ("clock", *AXES, "focal", "x", "y", "z")
+_CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
 
 
 def error_names(log: Log) -> tuple[str, ...]:
@@ -36,7 +40,11 @@ def prior_sigma(name: str, settings: Settings) -> float:
     what = kind(name)
     if settings.mode == "fixed" and (name in ODOMETRY or what in ("range_scale", "tag_scale")):
         return 0.0
-    return float(getattr(settings.calibration, "translation" if what in ("x", "y", "z") else what))
+    setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
+    sigma = getattr(settings.calibration, setting)
+    if sigma == "auto":
+        return _PRIORS[setting] if settings.mode == "fixed" else 0.0
+    return float(sigma)
 
 
 def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:

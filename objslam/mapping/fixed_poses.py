@@ -128,11 +128,11 @@ def calibrate_fixed(
     were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors, turned_by_errors
-    from objslam.graph.fixed_pose_triangulation import pose_noise
+    from objslam.graph.fixed_pose_triangulation import noise_of_poses
 
     calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     every = errors.take(at.frames, at.rays)
-    noise = pose_noise(errors.rays, errors.keyframes, at.settings)
+    noise = noise_of_poses(errors.keyframes, at.settings)
     told = noise_of_errors(every, calibration)
     rounds: tuple[dict[str, int], ...] = ()
     for number in range(_ROUNDS):
@@ -150,10 +150,11 @@ def calibrate_fixed(
         except SolveError as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
             return now, association, replace(estimate, calibration=calibration), rounds
-        allowed = np.hypot(noise[0], told)
+        own = np.hypot(errors.rays.sigma, noise[0])
+        allowed = np.hypot(own, told)
         turned = turned_by_errors(every, calibration.values, found.calibration.values)
         calibration, told = found.calibration, noise_of_errors(every, found.calibration)
-        changes = turned / allowed, np.hypot(noise[0], told) / allowed - 1
+        changes = turned / allowed, np.hypot(own, told) / allowed - 1
         if all(np.sqrt((change**2).mean()) < _SAME for change in changes):
             break
     else:

@@ -67,7 +67,6 @@ def run(
     with _stage("rays", seconds, progress):
         if settings.checks.use:
             diagnosis = diagnose(expected, settings, ledger)
-            settings = diagnosis.settings_of(settings)
             if not diagnosis.refutable:
                 say(diagnosis, ledger)
         if diagnosis.certain and settings.mode == "joint":
