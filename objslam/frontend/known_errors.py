@@ -68,11 +68,12 @@ def possible(log: Log, settings: Settings) -> list[str]:
     """Return the names of the errors of a log that the settings do not fix.
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
-    position have no errors, unless settings.calibration.use is true.
+    position have no errors, unless settings.calibration.use is true. Neither has its lens in fixed mode, because such poses
+    come from images of this lens, or were calibrated with it.
     """
     asked = settings.calibration.use is True
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
-    mounted = (*AXES, "x", "y", "z")
+    mounted = (*AXES, "x", "y", "z", *(LENS if settings.mode == "fixed" else ()))
     names = [n for n in error_names(log) if prior_sigma(n, settings) > 0]
     return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
 

@@ -158,7 +158,7 @@ def test_a_camera_that_is_the_base_is_not_turned():
     own = replace(log.localization, poses=poses)
     camera = replace(one.camera, base_T_camera=np.eye(4))
     log = replace(log, localization=own, cameras=(replace(one, camera=camera),))
-    assert run(log).calibration.names == ("front.clock", "front.focal", "front.cx", "front.cy")
+    assert run(log).calibration.names == ("front.clock",)
     assert len(run(log, "calibration.use=true").calibration.names) == 10
 
 
