@@ -113,18 +113,27 @@ def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floa
 
 
 def linearise_points(
-    errors: CalibratedMeasurements, theta: Floats, points: Floats, owner: Ints, held: Bools, noise: Noise
+    errors: CalibratedMeasurements,
+    theta: Floats,
+    points: Floats,
+    owner: Ints,
+    held: Bools,
+    noise: Noise,
+    *,
+    trusted: bool = True,
 ) -> PointSystem:
     """Return the normal equations at errors (P,) and points (N, 3).
 
-    held: (R,) the rays that count. owner: (n,) the point of each ray that counts. noise: of the poses.
+    held: (R,) the rays that count. owner: (n,) the point of each ray that counts. noise: of the poses. trusted: whether the
+    rays err as the noise says. If they err by far more, as at poses by odometry, their misses must not move points along
+    the rays.
     """
     target = points[owner]
 
     def residual(values: Floats) -> tuple[Floats, Floats]:
         keyframes, rays, _ = errors.at(values, drift=False)
         origins, directions = rays.in_map(keyframes.map_T_camera)
-        return _across(origins[held], directions[held], target, np.hypot(rays.sigma[held], noise[0]), noise[1])
+        return _across(origins[held], directions[held], target, np.hypot(rays.sigma[held], noise[0]), noise[1], trusted)
 
     e, by_point = residual(theta)
     weight = 1 / (1 + (np.linalg.norm(e, axis=1) / _CAUCHY) ** 2)
@@ -169,12 +178,14 @@ def _slope(residual: Callable[[Floats], tuple[Floats, Floats]], theta: Floats, i
     return np.asarray((residual(theta + move)[0] - residual(theta - move)[0]) / (2 * step))
 
 
-def _across(origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float) -> tuple[Floats, Floats]:
+def _across(
+    origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float, trusted: bool
+) -> tuple[Floats, Floats]:
     """Return the angles (n, 2) between rays and points, in standard deviations, and their derivatives by the points.
 
-    angle: (n,) rad, the noise of directions. place: m, the noise of origins. The derivatives contain those of the standard
-    deviation, which depends on the distance. Otherwise the noise would shift the errors of the camera and the points in one
-    direction, and more rays would not reduce this bias.
+    angle: (n,) rad, the noise of directions. place: m, the noise of origins. If the noise is trusted, the derivatives contain
+    those of the standard deviation, which depends on the distance. Otherwise the noise would shift the errors of the camera
+    and the points in one direction, and more rays would not reduce this bias.
     """
     to = target - origins
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
@@ -183,5 +194,5 @@ def _across(origins: Floats, directions: Floats, target: Floats, angle: Floats, 
     level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
     basis = np.stack([level, np.cross(directions, level)], axis=1)
     miss, sigma = np.einsum("nki,ni->nk", basis, to), np.hypot(angle, place / distance)
-    along = miss * (angle / sigma)[:, None] ** 2
+    along = miss * (angle / sigma)[:, None] ** 2 * trusted
     return miss / sigma[:, None], (basis - along[:, :, None] * to[:, None, :]) / (distance * sigma)[:, None, None]

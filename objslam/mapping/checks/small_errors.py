@@ -128,7 +128,7 @@ def find_small_errors(
     theta = np.zeros(len(errors.names))
     chosen: list[int] = []
     for _ in range(2 * len(_KINDS)):
-        system = linearise_points(errors, theta, points, owner, held, noise)
+        system = linearise_points(errors, theta, points, owner, held, noise, trusted=False)
         gains = np.zeros(len(theta))
         for i in wanted.tolist():
             if i not in chosen:
@@ -138,7 +138,7 @@ def find_small_errors(
             break
         chosen.append(best)
         for _ in range(_ROUNDS):
-            system = linearise_points(errors, theta, points, owner, held, noise)
+            system = linearise_points(errors, theta, points, owner, held, noise, trusted=False)
             step, moved = _step(system, chosen)
             theta[chosen] = np.clip(theta[chosen] + step, -errors.bounds[chosen], errors.bounds[chosen])
             points = points + moved
@@ -146,7 +146,7 @@ def find_small_errors(
             break
     if not chosen:
         return None
-    system = linearise_points(errors, theta, points, owner, held, noise)
+    system = linearise_points(errors, theta, points, owner, held, noise, trusted=False)
     sigma = np.sqrt(np.diagonal(np.linalg.inv(system.matrix[np.ix_(chosen, chosen)])) * system.variance)
     return SmallErrors(errors, tuple(errors.names[i] for i in chosen), theta[chosen], sigma)
 
