@@ -184,8 +184,8 @@ def _across(
     """Return the angles (n, 2) between rays and points, in standard deviations, and their derivatives by the points.
 
     angle: (n,) rad, the noise of directions. place: m, the noise of origins. If the noise is trusted, the derivatives
-    contain those of the standard deviation, which depends on the distance. Otherwise the noise would shift the errors of the camera
-    and the points in one direction, and more rays would not reduce this bias.
+    contain those of the standard deviation, which depends on the distance. Otherwise the noise would shift the errors of the
+    camera and the points in one direction, and more rays would not reduce this bias.
     """
     to = target - origins
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
