@@ -30,7 +30,7 @@ from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.lasting_errors import with_lasting_errors
+from objslam.mapping.fixed.lasting_errors import with_lasting_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct

@@ -12,7 +12,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.core.types import Log
 from objslam.mapping import pipeline
-from objslam.mapping.lasting_errors import Cells, lasting_variances
+from objslam.mapping.fixed.lasting_errors import Cells, lasting_variances
 from objslam.simulation import PoseNoise, preset, simulate
 
 
