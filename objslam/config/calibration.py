@@ -33,13 +33,15 @@ class CalibrationSettings(Section):
     """rad; the rotation of each camera on the base about the sideways axis."""
     roll: NotNegative = 0.02
     """rad; the rotation of each camera on the base about the forward axis."""
-    translation: NotNegative = 0.0
-    """m; the offset of each camera's place on the base, along each axis."""
+    translation: Literal["auto"] | NotNegative = "auto"
+    """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode, 0 in joint mode."""
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
     tag_scale: NotNegative = 0.01
     """share by which all fiducials of a given size are smaller or larger than the settings say. A printer, a ruler, the lens
     and the detector of the corners each add to it. It is estimated in joint mode only."""
-    focal: NotNegative = 0.0
-    """share by which the focal length of each camera is too long or too short. If it is not set, and the checks of a fixed
-    run find a wrong focal length, the run estimates it with 0.05."""
+    focal: Literal["auto"] | NotNegative = "auto"
+    """share by which the focal length of each camera is too long or too short. auto: 0.02 in fixed mode, 0 in joint mode."""
+    centre: Literal["auto"] | NotNegative = "auto"
+    """share of the focal length by which the image centre of each camera is off, along each axis. auto: 0.02 in fixed mode,
+    0 in joint mode."""

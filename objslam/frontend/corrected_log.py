@@ -17,6 +17,9 @@ ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
 """The errors of odometry."""
 AXES = ("roll", "tilt", "yaw")
 """The rotations of a camera on the robot, about the axes x, y and z of base."""
+LENS = ("focal", "cx", "cy")
+"""The errors of a camera matrix. The focal length is too short by the share `focal`. The image centre is too far left by cx
+and too far up by cy, both as shares of the focal length."""
 _SQUEEZED = 1e-3
 """A clock offset may move frames beyond an end of the path. They are placed within this time (s) of that end. A larger value
 moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2
@@ -144,14 +147,28 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
     return make_pose(turn @ base_T_camera[..., :3, :3], base_T_camera[..., :3, 3] + move)
 
 
-def refocused(directions: Floats, mine: Bools, focal: float) -> Floats:
-    """Return unit directions (R, 3) after a change of the focal length.
+def lens_errors(error: Mapping[str, float], name: str) -> tuple[float, float, float]:
+    """Return the errors `LENS` of the camera with this name."""
+    focal, cx, cy = (error.get(f"{name}.{one}", 0.0) for one in LENS)
+    return focal, cx, cy
 
-    The focal length is longer by the share `focal`. Only directions in the mask `mine` (R,) change.
+
+def inverse_lens(errors: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the errors `LENS` whose correction undoes the correction of the given ones."""
+    longer = 1 + errors[0]
+    return 1 / longer - 1, -errors[1] / longer, -errors[2] / longer
+
+
+def refocused(directions: Floats, mine: Bools, errors: tuple[float, float, float]) -> Floats:
+    """Return unit directions (R, 3), corrected by the errors `LENS` of a camera matrix.
+
+    Only directions in the mask `mine` (R,) change.
     """
-    if focal == 0:
+    if not any(errors):
         return directions
-    longer = np.where(mine[:, None], directions * [1.0, 1.0, 1 + focal], directions)
+    (focal, cx, cy), (x, y, z) = errors, directions.T
+    corrected = np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=1)
+    longer = np.where(mine[:, None], corrected, directions)
     return np.asarray(longer / np.linalg.norm(longer, axis=1, keepdims=True))
 
 
@@ -180,12 +197,13 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
     """Return a camera and its data, corrected by the errors. path: on this path its stamps stay (see `later`)."""
     camera, name = one.camera, one.camera.name
-    clock, focal = error.get(f"{name}.clock", 0.0), 1 + error.get(f"{name}.focal", 0.0)
+    clock, (focal, cx, cy) = error.get(f"{name}.clock", 0.0), lens_errors(error, name)
+    fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
     longer = 1 + error.get("range_scale", 0.0)
     corrected = replace(
         camera,
         base_T_camera=corrected_mount(camera.base_T_camera, error, name),
-        matrix=camera.matrix * np.array([[focal, 1, 1], [1, focal, 1], [1, 1, 1]]),
+        matrix=camera.matrix + np.array([[focal * fx, 0, cx * fx], [0, focal * fy, cy * fy], [0, 0, 0]]),
         depth_scale=camera.depth_scale / longer,
     )
 

@@ -12,13 +12,17 @@ from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import ConfigError
-from objslam.frontend.corrected_log import AXES, ODOMETRY, take_out
+from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
 from objslam.io.calibration_yaml import load_calibration
 
+_PRIORS = {"translation": 0.05, "focal": 0.02, "centre": 0.02}
+"""The prior standard deviations (m, share, share of the focal length) that `auto` means in fixed mode: of a place that
+somebody measured with a ruler, of a field of view from a data sheet, and of an image centre taken as the middle of the
+image. A calibrated camera errs less. With larger values, a log must show more before an error counts as known."""
 COARSE = 0.3
 """The noise of given poses, m, from which on they reveal no error of a camera. A robot at 1 to 2 m/s drives less than this
 during its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
-_CAMERA = ("clock", *AXES, "focal", "x", "y", "z")
+_CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
 
 
 def error_names(log: Log) -> tuple[str, ...]:
@@ -36,7 +40,11 @@ def prior_sigma(name: str, settings: Settings) -> float:
     what = kind(name)
     if settings.mode == "fixed" and (name in ODOMETRY or what in ("range_scale", "tag_scale")):
         return 0.0
-    return float(getattr(settings.calibration, "translation" if what in ("x", "y", "z") else what))
+    setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
+    sigma = getattr(settings.calibration, setting)
+    if sigma == "auto":
+        return _PRIORS[setting] if settings.mode == "fixed" else 0.0
+    return float(sigma)
 
 
 def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
@@ -60,11 +68,12 @@ def possible(log: Log, settings: Settings) -> list[str]:
     """Return the names of the errors of a log that the settings do not fix.
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
-    position have no errors, unless settings.calibration.use is true.
+    position have no errors, unless settings.calibration.use is true. Neither has its lens in fixed mode, because such poses
+    come from images of this lens, or were calibrated with it.
     """
     asked = settings.calibration.use is True
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
-    mounted = (*AXES, "x", "y", "z")
+    mounted = (*AXES, "x", "y", "z", *(LENS if settings.mode == "fixed" else ()))
     names = [n for n in error_names(log) if prior_sigma(n, settings) > 0]
     return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
 

@@ -13,7 +13,15 @@ from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
-from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, corrected_mount, later, refocused, take_out
+from objslam.frontend.corrected_log import (
+    ODOMETRY,
+    CorrectablePath,
+    corrected_mount,
+    later,
+    lens_errors,
+    refocused,
+    take_out,
+)
 from objslam.frontend.known_errors import estimates, known_errors, possible, prior_sigma
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
@@ -126,7 +134,8 @@ class SharedErrors:
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return keyframes, rays and settings corrected by the errors (P,).
 
-        The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. Keyframes stay
+        The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. The noise of
+        directions follows the focal length for the same reason: with a longer one, all angles are smaller. Keyframes stay
         on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
         pose. drift: whether the drift is computed for the corrected odometry. If not, it stays as measured, and so does what
         the interpolated path may be off.
@@ -134,11 +143,13 @@ class SharedErrors:
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
         settings, poses = self._scaled_noise(error), self._poses(error)
-        base_T_camera, direction = poses.base_T_camera.copy(), rays.direction
+        base_T_camera, direction, sigma = poses.base_T_camera.copy(), rays.direction, rays.sigma.copy()
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             base_T_camera[mine] = corrected_mount(base_T_camera[mine], error, one.camera.name)
-            direction = refocused(direction, mine[rays.keyframe], error.get(f"{one.camera.name}.focal", 0.0))
+            lens = lens_errors(error, one.camera.name)
+            direction = refocused(direction, mine[rays.keyframe], lens)
+            sigma[mine[rays.keyframe]] /= 1 + lens[0]
         gathered, step, wander = keyframes.drift, keyframes.step, keyframes.wander
         if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
@@ -155,7 +166,8 @@ class SharedErrors:
             wander=wander,
         )
         longer = (1 + error.get("range_scale", 0.0)) * (1 + self.noise.shrinkage)
-        ranged = replace(rays, direction=direction, range=rays.range * longer, range_sigma=rays.range_sigma * longer)
+        ranged = replace(rays, direction=direction, sigma=sigma)
+        ranged = replace(ranged, range=rays.range * longer, range_sigma=rays.range_sigma * longer)
         tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))
         return moved, ranged, settings.model_copy(update={"tags": tags})
 

@@ -34,12 +34,19 @@ def triangulate_landmarks(
 def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
     """Return the standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins.
 
-    Both contain the noise of the localisation. Keyframes that share one measured pose share its error, so its variance is
-    multiplied by their number. Without a localisation, only the noise of the rays remains.
+    Both contain the noise of the localisation (`noise_of_poses`). Without one, only the noise of the rays remains.
     """
-    share = keyframes.localized_every
-    of = settings.localization
-    return np.sqrt(rays.sigma**2 + of.yaw**2 * share), float(of.xy * np.sqrt(share))
+    yaw, place = noise_of_poses(keyframes, settings)
+    return np.hypot(rays.sigma, yaw), place
+
+
+def noise_of_poses(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
+    """Return the standard deviations of localised poses: of headings, rad, and of places, m. 0 without a localisation.
+
+    Keyframes that share one measured pose share its error, so its variance is multiplied by their number.
+    """
+    share = float(np.sqrt(keyframes.localized_every))
+    return settings.localization.yaw * share, settings.localization.xy * share
 
 
 def _triangulate(

@@ -13,7 +13,7 @@ from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.bodies.centre_bearings import solve_to_centres, to_centres
 from objslam.mapping.checks.unexplained import warn_of_unexplained
-from objslam.mapping.fixed_poses import FixedPoses, calibrate_fixed
+from objslam.mapping.fixed.fixed_poses import FixedPoses, calibrate_fixed
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.joint_solve import solve_joint
 from objslam.mapping.progress import Progress

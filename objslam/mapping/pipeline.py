@@ -30,6 +30,7 @@ from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.fixed.lasting_errors import with_lasting_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
 from objslam.mapping.reconstruction import reconstruct
@@ -63,7 +64,6 @@ def run(
     with _stage("rays", seconds, progress):
         if settings.checks.use:
             diagnosis = diagnose(expected, settings, ledger)
-            settings = diagnosis.settings_of(settings)
             if not diagnosis.refutable:
                 say(diagnosis, ledger)
         if diagnosis.certain and settings.mode == "joint":
@@ -100,6 +100,8 @@ def run(
         if settings.checks.use:
             diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
+    if settings.mode == "fixed":
+        solution = with_lasting_errors(solution, settings)
     solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate

@@ -14,15 +14,21 @@ def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
     """Return the log as it would be with shared errors of these values, named as in `core.calibration.Calibration`.
 
     Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, range_scale, and for each CAMERA the names
-    CAMERA.clock, CAMERA.roll, CAMERA.tilt and CAMERA.yaw. The odometry must be planar.
+    CAMERA.clock, CAMERA.roll, CAMERA.tilt, CAMERA.yaw, CAMERA.focal, CAMERA.cx, CAMERA.cy, CAMERA.x, CAMERA.y and CAMERA.z.
+    The odometry must be planar.
     """
     odometry = None if log.odometry is None else _wrong_odometry(log.odometry, errors)
     cameras = []
     for one in log.cameras:
         camera, found = one.camera, one.detections
-        turn = Rotation.from_rotvec([errors.get(f"{camera.name}.{axis}", 0.0) for axis in ("roll", "tilt", "yaw")])
-        rotation = turn.inv().as_matrix() @ camera.base_T_camera[:3, :3]
-        wrong = replace(camera, base_T_camera=make_pose(rotation, camera.base_T_camera[:3, 3]))
+        kinds = ("roll", "tilt", "yaw", "x", "y", "z", "cx", "cy", "focal")
+        *six, cx, cy, focal = (errors.get(f"{camera.name}.{kind}", 0.0) for kind in kinds)
+        rotation = Rotation.from_rotvec(six[:3]).inv().as_matrix() @ camera.base_T_camera[:3, :3]
+        base_T_camera = make_pose(rotation, camera.base_T_camera[:3, 3] - six[3:])
+        matrix = camera.matrix.copy()
+        matrix[[0, 1], [0, 1]] /= 1 + focal
+        matrix[:2, 2] -= matrix[[0, 1], [0, 1]] * [cx, cy]
+        wrong = replace(camera, base_T_camera=base_T_camera, matrix=matrix)
         if found is not None:
             found = replace(
                 found,

@@ -20,10 +20,11 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, linearise_points, noise_of_errors
-from objslam.graph.fixed_pose_triangulation import pose_noise, triangulate_at
+from objslam.graph.fixed_pose_triangulation import noise_of_poses, triangulate_at
 from objslam.simulation import PoseNoise, make_camera, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 
+HELD = ("calibration.translation=0", "calibration.focal=0", "calibration.centre=0")
 ERRORS = {"front.clock": 0.12, "front.roll": 0.015, "front.tilt": -0.02, "front.yaw": 0.03}
 
 
@@ -41,8 +42,8 @@ def parts(log: Log, *overrides: str) -> tuple[SharedErrors, Association, np.ndar
     return errors, association, np.where(placed.ok[:, None], placed.positions, np.nan)
 
 
-def noise(errors: SharedErrors) -> tuple[np.ndarray, float]:
-    return pose_noise(errors.rays, errors.keyframes, errors.settings)
+def noise(errors: SharedErrors) -> tuple[float, float]:
+    return noise_of_poses(errors.keyframes, errors.settings)
 
 
 def exact(**changes: object) -> Log:
@@ -52,10 +53,36 @@ def exact(**changes: object) -> Log:
 
 
 def test_without_noise_the_errors_are_exact():
-    errors, association, start = parts(add_shared_errors(exact(), ERRORS))
+    errors, association, start = parts(add_shared_errors(exact(), ERRORS), *HELD)
     found = calibrate_at_poses(errors, association, start, errors.mean, noise(errors)).calibration
     assert found.names == tuple(ERRORS)
     assert_allclose(found.values, list(ERRORS.values()), atol=5e-4)  # what is left is the pull of the prior towards 0
+
+
+def test_the_lens_and_the_place_of_a_camera_are_found_where_the_drive_shows_them():
+    """A common height of camera and objects shows nowhere. A tilt looks nearly like a centre that is too high."""
+    lens = {"front.focal": 0.03, "front.cx": -0.02, "front.x": -0.05, "front.y": 0.06}
+    errors, association, start = parts(add_shared_errors(exact(), {**ERRORS, **lens, "front.z": 0.04}))
+    found = calibrate_at_poses(errors, association, start, errors.mean, noise(errors)).calibration
+    for name, value, sigma, prior in zip(found.names, found.values, found.sigma, found.prior, strict=True):
+        assert abs(value - {**ERRORS, **lens}.get(name, 0.0)) < sigma, name
+        assert sigma < 0.6 * prior or name in ("front.z", "front.tilt", "front.cy"), name
+    height = found.names.index("front.z")
+    assert found.values[height] == pytest.approx(0.0, abs=1e-3)
+    assert found.sigma[height] == pytest.approx(0.05, rel=1e-2)
+
+
+def test_noise_shifts_no_error_of_the_lens_and_no_place():
+    """The mean over drives. Noise makes angles larger, and a longer lens or another place would hide it."""
+    found = []
+    for seed in range(8):
+        noisy = {"objects": 8, "classes": 8, "frames": 150, "false": 0.0, "pixel_sigma": 4.0}
+        errors, association, start = parts(simulate(preset("demo", odometry=None, **noisy), seed), "rays.pixel_sigma=4")
+        calibration = calibrate_at_poses(errors, association, start, errors.mean, noise(errors)).calibration
+        found.append(calibration.values / calibration.sigma)
+    mean = dict(zip(calibration.names, np.mean(found, axis=0).tolist(), strict=True))
+    assert all(abs(mean[f"front.{kind}"]) < 0.6 for kind in ("focal", "x", "y")), mean
+    assert abs(mean["front.z"]) < 0.02
 
 
 def test_the_points_follow_the_errors_as_a_whole_fit_does():
@@ -126,7 +153,7 @@ def test_what_a_drive_cannot_tell_stays_at_its_prior_and_widens_the_objects():
 
 
 def test_the_rays_vary_as_the_errors_do():
-    errors, _, _ = parts(exact())
+    errors, _, _ = parts(exact(), *HELD)
     covariance = np.diag([0.0, 0.0, 0.0, 0.02**2])
     names = errors.names
     assert names[-1] == "front.yaw"

@@ -63,7 +63,9 @@ def test_the_errors_that_were_put_in_are_found():
         found = estimated(seed, True).calibration
         true = np.array([drive(seed, True)[1].get(name, 0.0) for name in found.names])
         assert (np.abs(found.values - true) < 3 * found.sigma).all(), (seed, found.values - true, found.sigma)
-        assert (found.sigma < 0.2 * found.prior).all()
+        known = np.isin([name.rpartition(".")[2] for name in found.names], ("clock", "roll", "yaw"))
+        assert (found.sigma[known] < 0.3 * found.prior[known]).all()
+        assert ("front.tilt", "front.cy") in found.traded_off()
 
 
 def test_the_objects_are_as_good_as_with_known_errors():
@@ -135,7 +137,7 @@ def test_each_of_two_cameras_has_its_own_errors():
     found = run(add_shared_errors(log, errors)).calibration
     true = np.array([errors.get(name, 0.0) for name in found.names])
     assert (np.abs(found.values - true) < 3 * found.sigma).all()
-    assert len(found.names) == 8
+    assert len(found.names) == 20
 
 
 def test_where_no_object_is_placed_the_errors_stay_at_their_prior():
@@ -157,7 +159,7 @@ def test_a_camera_that_is_the_base_is_not_turned():
     camera = replace(one.camera, base_T_camera=np.eye(4))
     log = replace(log, localization=own, cameras=(replace(one, camera=camera),))
     assert run(log).calibration.names == ("front.clock",)
-    assert len(run(log, "calibration.use=true").calibration.names) == 4
+    assert len(run(log, "calibration.use=true").calibration.names) == 10
 
 
 def test_small_errors_do_not_hide_the_objects_of_a_short_drive():

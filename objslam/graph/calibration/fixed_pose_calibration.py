@@ -27,8 +27,8 @@ _FREE = 1e-6
 """The information (m^-2) added to each object, so that an object without rays is determined too. A larger value moves other
 objects."""
 
-Noise = tuple[Floats, float]
-"""The standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins."""
+Noise = tuple[float, float]
+"""The standard deviations of given poses: of headings, rad, and of places, m."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def calibrate_at_poses(
 ) -> FixedCalibration:
     """Estimate the shared errors, starting from theta (P,). An error that the rays do not determine stays at its prior.
 
-    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: of the rays, with
-    the noise of the poses. SolveError if the linear system has no single solution.
+    positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: of the poses.
+    SolveError if the linear system has no single solution.
     """
     held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # Index -1 (no object) takes the last entry.
     number, owner = np.unique(association.object[held], return_inverse=True)
@@ -113,27 +113,31 @@ def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floa
 
 
 def linearise_points(
-    errors: CalibratedMeasurements, theta: Floats, points: Floats, owner: Ints, held: Bools, noise: Noise
+    errors: CalibratedMeasurements,
+    theta: Floats,
+    points: Floats,
+    owner: Ints,
+    held: Bools,
+    noise: Noise,
+    *,
+    trusted: bool = True,
 ) -> PointSystem:
     """Return the normal equations at errors (P,) and points (N, 3).
 
-    held: (R,) the rays that count. owner: (n,) the point of each ray that counts. noise: of the rays, with the noise of the
-    poses.
+    held: (R,) the rays that count. owner: (n,) the point of each ray that counts. noise: of the poses. trusted: whether the
+    rays err as the noise says. If they err by far more, as at poses by odometry, their misses must not move points along
+    the rays.
     """
-    angle, place = noise
     target = points[owner]
 
-    def residual(values: Floats) -> tuple[Floats, Floats, Floats]:
+    def residual(values: Floats) -> tuple[Floats, Floats]:
         keyframes, rays, _ = errors.at(values, drift=False)
         origins, directions = rays.in_map(keyframes.map_T_camera)
-        return _across(origins[held], directions[held], target)
+        return _across(origins[held], directions[held], target, np.hypot(rays.sigma[held], noise[0]), noise[1], trusted)
 
-    e, basis, distance = residual(theta)
-    sigma = np.hypot(angle[held], place / distance)
-    robust = 1 / (1 + (np.linalg.norm(e, axis=1) / sigma / _CAUCHY) ** 2)
-    weight = robust / sigma**2
+    e, by_point = residual(theta)
+    weight = 1 / (1 + (np.linalg.norm(e, axis=1) / _CAUCHY) ** 2)
     by_error = np.stack([_slope(residual, theta, i, step) for i, step in enumerate(errors.steps)], axis=2)
-    by_point = basis / distance[:, None, None]  # (n, 2, 3)
     n, p = len(points), len(theta)
     h_pp, h_pt, g_p = np.zeros((n, 3, 3)), np.zeros((n, 3, p)), np.zeros((n, 3))
     weighted = weight[:, None, None] * by_point
@@ -149,7 +153,7 @@ def linearise_points(
     cost = float((weight[:, None] * left**2).sum())
     variance = max(1.0, cost / max(2 * len(e) - 3 * n, 1))
     # For the weight w, the curvature is 2 w^2 - w along a deviation and w across it. The mean is w^2.
-    curvature = float((robust * weight).sum() / max(weight.sum(), 1e-300))
+    curvature = float((weight**2).sum() / max(weight.sum(), 1e-300))
     return PointSystem(matrix, scores.sum(axis=0), cost, variance, curvature, scores, np.asarray(back), np.asarray(own))
 
 
@@ -169,16 +173,26 @@ def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
     return max(1.0, float(((sums**2).sum(axis=0)[told] / np.diagonal(system.matrix)[told]).max()))
 
 
-def _slope(residual: Callable[[Floats], tuple[Floats, Floats, Floats]], theta: Floats, i: int, step: float) -> Floats:
+def _slope(residual: Callable[[Floats], tuple[Floats, Floats]], theta: Floats, i: int, step: float) -> Floats:
     move = step * np.eye(len(theta))[i]
     return np.asarray((residual(theta + move)[0] - residual(theta - move)[0]) / (2 * step))
 
 
-def _across(origins: Floats, directions: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the angles (n, 2), rad, between rays and points, the axes (n, 2, 3) across the rays, and distances (n,), m."""
+def _across(
+    origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float, trusted: bool
+) -> tuple[Floats, Floats]:
+    """Return the angles (n, 2) between rays and points, in standard deviations, and their derivatives by the points.
+
+    angle: (n,) rad, the noise of directions. place: m, the noise of origins. If the noise is trusted, the derivatives
+    contain those of the standard deviation, which depends on the distance. Otherwise the noise would shift the errors of the
+    camera and the points in one direction, and more rays would not reduce this bias.
+    """
     to = target - origins
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
+    to = to / distance[:, None]
     level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)
     level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
     basis = np.stack([level, np.cross(directions, level)], axis=1)
-    return np.einsum("nki,ni->nk", basis, to / distance[:, None]), basis, distance
+    miss, sigma = np.einsum("nki,ni->nk", basis, to), np.hypot(angle, place / distance)
+    along = miss * (angle / sigma)[:, None] ** 2 * trusted
+    return miss / sigma[:, None], (basis - along[:, :, None] * to[:, None, :]) / (distance * sigma)[:, None, None]

@@ -8,7 +8,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.noise import range_noise
 from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
 from objslam.errors import ObjslamError
-from objslam.frontend.corrected_log import refocused
+from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.live.mapper.state import MapState
 from objslam.mapping.solution import seen_something
@@ -104,7 +104,7 @@ def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     direction = rays.direction
     for number, camera in enumerate(m.cameras):
         mine = m.camera_of_rays(rows) == number
-        direction = refocused(direction, mine, 1 / (1 + m.errors.get(f"{camera.name}.focal", 0.0)) - 1)
+        direction = refocused(direction, mine, inverse_lens(lens_errors(m.errors, camera.name)))
     return replace(rays, direction=direction, range=rays.range / longer, range_sigma=rays.range_sigma / longer)
 
 

@@ -7,7 +7,7 @@ from objslam.core.calibration import Calibration
 from objslam.core.geometry import inverse
 from objslam.core.types import Keyframes, Log
 from objslam.errors import SolveError
-from objslam.frontend.corrected_log import refocused
+from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.graph.factors.localization import localizations
@@ -83,17 +83,17 @@ def _errors(m: MapState, log: Log, keyframes: Keyframes, rows: Ints) -> tuple[Sh
 def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
     """Correct the rays by the new errors instead of the errors `before`. Return whether any ray may have changed."""
     rays, camera = m.rays, m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe)]
-    longer = _ratio(m, before, "range_scale")
-    focal = [_ratio(m, before, f"{one.name}.focal") for one in m.cameras]
+    longer = (1 + m.errors.get("range_scale", 0.0)) / (1 + before.get("range_scale", 0.0))
+    changed = longer != 1
     rays.range[:] *= longer
     rays.range_sigma[:] *= longer
-    for number, ratio in enumerate(focal):
-        rays.direction[:] = refocused(rays.direction, camera == number, ratio - 1)
-    return any(ratio != 1 for ratio in (longer, *focal))
-
-
-def _ratio(m: MapState, before: dict[str, float], name: str) -> float:
-    return (1 + m.errors.get(name, 0.0)) / (1 + before.get(name, 0.0))
+    for number, one in enumerate(m.cameras):
+        had, has = lens_errors(before, one.name), lens_errors(m.errors, one.name)
+        if had != has:
+            measured = refocused(rays.direction, camera == number, inverse_lens(had))
+            rays.direction[:] = refocused(measured, camera == number, has)
+            changed = True
+    return changed
 
 
 def _carried(m: MapState, drifted: Floats) -> Floats:

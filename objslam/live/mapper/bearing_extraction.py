@@ -9,7 +9,7 @@ from objslam.core.camera import Camera
 from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, surest
-from objslam.frontend.corrected_log import corrected_camera, corrected_mount, refocused
+from objslam.frontend.corrected_log import corrected_camera, corrected_mount, lens_errors, refocused
 from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
@@ -71,9 +71,9 @@ class BearingExtractor:
         few = surest(np.zeros(len(kept), dtype=np.int64), label[kept], frame.scores[kept], camera, self._ledger)
         kept, direction, sigma = kept[few], direction[few], sigma[few]
         reach = frame.depths[kept] / direction[:, 2] if settings.depth.use else np.full(len(kept), np.nan)
-        focal, longer = errors.get(f"{frame.camera}.focal", 0.0), 1 + errors.get("range_scale", 0.0)
+        lens, longer = lens_errors(errors, frame.camera), 1 + errors.get("range_scale", 0.0)
         rays = FrameRays(
-            direction=refocused(direction, np.ones(len(direction), dtype=bool), focal),
+            direction=refocused(direction, np.ones(len(direction), dtype=bool), lens),
             sigma=sigma,
             range=reach * longer,
             range_sigma=range_noise(reach, np.zeros(len(reach), dtype=np.int64), [camera], settings)[0] * longer,

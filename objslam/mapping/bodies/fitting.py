@@ -33,7 +33,8 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     """Return a solution with a body for each object whose boxes show one. The points and their covariances stay.
 
     The covariance of a centre contains the noise of the boxes and the errors that they share. It also contains what the
-    covariance of the point has beyond the noise of its rays, such as the noise of solved poses.
+    covariance of the point has beyond the noise of its rays, such as the noise of solved poses, or errors of given poses
+    that last.
     """
     if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution
@@ -121,7 +122,7 @@ def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
     """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2."""
     estimate, rays, keyframes = solution.estimate, solution.rays, solution.keyframes
-    if settings.mode != "joint" and estimate.calibration is None:
+    if settings.mode != "joint" and estimate.calibration is None and not keyframes.localized_every:
         return np.zeros((len(views.objects), 3, 3))
     use = views.ray[estimate.weight[views.ray] > 0]
     origin, direction = (part[use] for part in rays.in_map(estimate.map_T_base @ keyframes.base_T_camera))

@@ -1,7 +1,7 @@
 """Run all checks of the input of a log: the checks of the log itself, and the checks of how well its boxes agree."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -61,14 +61,12 @@ estimate. A larger value reports fewer errors."""
 class Diagnosis:
     """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
 
-    errors: small errors of the calibration that a run does not correct, None if there are none. priors: the standard
-    deviations, by settings of `calibration`, with which a run estimates small errors that the settings keep at 0.
+    errors: small errors of the calibration that a run does not correct, None if there are none.
     """
 
     findings: tuple[Finding, ...] = ()
     trials: tuple[Trial, ...] = ()
     errors: SmallErrors | None = None
-    priors: dict[str, float] = field(default_factory=dict)
 
     @property
     def spoilt(self) -> bool:
@@ -88,10 +86,6 @@ class Diagnosis:
     def refutable(self) -> bool:
         """Whether a solve that explains the boxes may refute one of the findings."""
         return any(finding.basis != "log" for finding in self.findings)
-
-    def settings_of(self, settings: Settings) -> Settings:
-        """Return the settings of a run that estimates the errors of `priors`."""
-        return settings.model_copy(update={"calibration": settings.calibration.model_copy(update=self.priors)})
 
     def with_findings(self, more: Sequence[Finding]) -> Self:
         """Return the diagnosis with more findings."""
@@ -133,7 +127,6 @@ def diagnose(
             if named is not None:
                 return Diagnosis((named, *findings), tuple(trials))
     errors: SmallErrors | None = None
-    priors: dict[str, float] = {}
     if impossible:  # Boxes at such poses agree with anything by chance.
         return Diagnosis(tuple(findings), tuple(trials))
     if found is not None and part.boxes >= _FEWEST:
@@ -142,14 +135,12 @@ def diagnose(
         if not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
             if errors is not None:
-                priors = errors.own_priors(settings)
                 cause = f"at the given poses the boxes fit best with {errors.in_words()}: {errors.causes()}"
-                how = "a run estimates it" if priors else f"{errors.remedy(settings)} estimates it"
                 # The objects get the covariance that such an error causes.
-                findings.append(Finding("calibration", f"{cause} ({how})", spoils=False))
+                findings.append(Finding("calibration", f"{cause} ({errors.remedy(settings)} estimates it)", spoils=False))
         ranges = check_ranges(found, part)
         findings += [ranges] if ranges else []
-    return Diagnosis(tuple(findings), tuple(trials), None if priors else errors, priors)
+    return Diagnosis(tuple(findings), tuple(trials), errors)
 
 
 def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:

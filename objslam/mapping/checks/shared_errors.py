@@ -24,6 +24,10 @@ _CAUSES = {
     "range_scale": "is the depth in metres (depth_scale)?",
     "tag_scale": "is tags.size the side between the corners that the detector reports?",
     "focal": "are the camera matrix and the boxes of the same image size?",
+    "cx": "are the camera matrix and the boxes of the same image size?",
+    "cy": "are the camera matrix and the boxes of the same image size?",
+    "x": "is the translation of base_T_camera right?",
+    "y": "is the translation of base_T_camera right?",
 }
 
 

@@ -24,9 +24,6 @@ _HARMFUL = {"clock": 0.12, "yaw": 0.035, "tilt": 0.035, "roll": 0.035, "focal": 
 _USUAL = {"focal": 0.05, "translation": 0.1}
 """The priors (share, m) that a warning recommends for errors that the settings keep at 0. A larger prior lets a run find a
 larger error."""
-_OWN = {"focal"}
-"""The errors that a run then estimates by itself. Bearings from known poses show a focal length to 1 %. They show a camera's
-place only to 0.1 m on some robots."""
 _KINDS = tuple(_HARMFUL)
 _LEAST_GAIN = 40.0
 """The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer."""
@@ -99,15 +96,6 @@ class SmallErrors:
         options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
         return " ".join(f"--set {option}" for option in options)
 
-    def own_priors(self, settings: Settings) -> dict[str, float]:
-        """Return the prior standard deviations with which a run estimates the harmful errors by itself, by their kinds.
-
-        Empty if it estimates them only when asked. What the user has set stays.
-        """
-        kinds = {kind(name) for name in self.harmful}
-        free = settings.calibration.use is not False and kinds <= _OWN - settings.calibration.model_fields_set
-        return {what: _USUAL[what] for what in kinds} if free else {}
-
     def causes(self) -> str:
         """Return the probable causes."""
         return "; ".join(dict.fromkeys(CAUSES[kind(name)] for name in self.harmful))
@@ -137,11 +125,10 @@ def find_small_errors(
     wanted = np.array([i for i, name in enumerate(errors.names) if kind(name) in kinds])
     number, owner = np.unique(found.point[held], return_inverse=True)
     points = found.points[number]
-    angle = np.hypot(errors.rays.sigma, noise[0])
     theta = np.zeros(len(errors.names))
     chosen: list[int] = []
     for _ in range(2 * len(_KINDS)):
-        system = linearise_points(errors, theta, points, owner, held, (angle, noise[1]))
+        system = linearise_points(errors, theta, points, owner, held, noise, trusted=False)
         gains = np.zeros(len(theta))
         for i in wanted.tolist():
             if i not in chosen:
@@ -151,7 +138,7 @@ def find_small_errors(
             break
         chosen.append(best)
         for _ in range(_ROUNDS):
-            system = linearise_points(errors, theta, points, owner, held, (angle, noise[1]))
+            system = linearise_points(errors, theta, points, owner, held, noise, trusted=False)
             step, moved = _step(system, chosen)
             theta[chosen] = np.clip(theta[chosen] + step, -errors.bounds[chosen], errors.bounds[chosen])
             points = points + moved
@@ -159,7 +146,7 @@ def find_small_errors(
             break
     if not chosen:
         return None
-    system = linearise_points(errors, theta, points, owner, held, (angle, noise[1]))
+    system = linearise_points(errors, theta, points, owner, held, noise, trusted=False)
     sigma = np.sqrt(np.diagonal(np.linalg.inv(system.matrix[np.ix_(chosen, chosen)])) * system.variance)
     return SmallErrors(errors, tuple(errors.names[i] for i in chosen), theta[chosen], sigma)
 

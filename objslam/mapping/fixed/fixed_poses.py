@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
     from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
-_ROUNDS = 8
-"""The most rounds of association and calibration. Two or three are usual. More rounds are slower."""
+_ROUNDS = 12
+"""The most rounds of association and calibration. Two or three are usual. A clock that is off by a second moves by 0.03 s in
+a round, so it needs ten to reach its bound. More rounds are slower where they do not settle."""
 _SAME = 0.05
-"""An association is repeated only if ray directions, or their noise, change by more than this share of the noise. Such a
-small change moves hardly any ray across a gate. A larger share ends sooner. A limit in standard deviations of the shared
-errors does not work: with precise errors, the association can swing between two states for ever."""
+"""An association is repeated only if ray directions, or their noise, differ from those of each earlier round by more than
+this share of the noise. Such a small change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A
+larger share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the
+association can swing between two states for ever."""
 _EXPLAINED = 0.5
 """An association that explains at most this share of the rays is compared with another one. The other one is taken if the
 first explains less than this share of what the other explains. A larger share takes the other one more often."""
@@ -128,13 +130,15 @@ def calibrate_fixed(
     were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors, turned_by_errors
-    from objslam.graph.fixed_pose_triangulation import pose_noise
+    from objslam.graph.fixed_pose_triangulation import noise_of_poses
 
     calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     every = errors.take(at.frames, at.rays)
-    noise = pose_noise(errors.rays, errors.keyframes, at.settings)
+    noise = noise_of_poses(errors.keyframes, at.settings)
     told = noise_of_errors(every, calibration)
     rounds: tuple[dict[str, int], ...] = ()
+    earlier: list[tuple[Floats, Floats]] = []
+    own = np.hypot(errors.rays.sigma, noise[0])
     for number in range(_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         now = at.without(errors, calibration.values)
@@ -150,11 +154,13 @@ def calibrate_fixed(
         except SolveError as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
             return now, association, replace(estimate, calibration=calibration), rounds
-        allowed = np.hypot(noise[0], told)
-        turned = turned_by_errors(every, calibration.values, found.calibration.values)
+        earlier.append((calibration.values, np.hypot(own, told)))
         calibration, told = found.calibration, noise_of_errors(every, found.calibration)
-        changes = turned / allowed, np.hypot(noise[0], told) / allowed - 1
-        if all(np.sqrt((change**2).mean()) < _SAME for change in changes):
+        allowed = np.hypot(own, told)
+        if any(
+            _rms(turned_by_errors(every, values, calibration.values) / before) < _SAME and _rms(allowed / before - 1) < _SAME
+            for values, before in earlier
+        ):
             break
     else:
         ledger.warn(f"the shared errors still change after {_ROUNDS} rounds of association")
@@ -168,6 +174,10 @@ def calibrate_fixed(
         sensitivity = calibrate_at_poses(errors, association, placed, calibration.values, noise).sensitivity
         found = replace(found, sensitivity=sensitivity)
     return now, association, _with_covariance(estimate, found), rounds
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def _explains_far_more(at: FixedPoses, wide: Association) -> Association | None:

@@ -1,0 +1,160 @@
+"""Errors of given poses that last for some seconds. All rays of this time miss their objects on the same side.
+
+Many rays from one visit do not average such an error out, so they count as few. The rays of several visits show its size.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.association.observations import MIN_DEPTH
+from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.graph.fixed_pose_triangulation import noise_of_poses
+from objslam.graph.robust_cost import ray_information
+from objslam.mapping.solution import Solution
+
+_CELL = 1.0
+"""The shortest time (s) whose rays count as one. A longer time is faster, and sees shorter errors as noise."""
+_MOST_CELLS = 48
+"""The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
+slower."""
+_TIMES = (1.0, 4.0, 16.0, 64.0)
+"""The times (s) after which the correlation of an error has fallen to 1/e, from a jump of a scan matcher to an error of the
+map around a place. More times are finer and slower."""
+_FACTORS = np.append(0.0, np.geomspace(0.1, 20.0, 40))
+"""The tried standard deviations of lasting errors, as multiples of the noise in `localization`. More factors are finer and
+slower."""
+_LOOSE = 1.0
+"""The prior standard deviation (m) of the error of a solved position. With a larger value, the rays decide more."""
+_POOLED = 20.0
+"""The number of rays at which the scatter inside cells weighs as much as the noise in the settings. A larger number trusts
+the settings more."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The rays of one object by time, in C cells.
+
+    times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left. white: (C,) rad, its
+    standard deviation from noise that does not last. shift: (C, 2) rad per m, its derivative by the object's x and y. size:
+    (C,) rad, the error of this angle by one standard deviation of the poses. pull: (C, 3) m, the shift of the object by such
+    an error in the cell.
+    """
+
+    times: Floats
+    mean: Floats
+    white: Floats
+    shift: Floats
+    size: Floats
+    pull: Floats
+
+    def alike(self, time: float) -> Floats:
+        """Return the correlations (C, C) of errors that last for `time`, s."""
+        return np.asarray(np.exp(-np.abs(self.times[:, None] - self.times) / time))
+
+
+def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
+    """Return the solution of a run at given poses with their lasting errors added to its covariances.
+
+    A pose has an error of its heading and of its place, which both turn a ray to a side as seen from the object. Its size is
+    `localization` times a factor, with a half-normal prior of 1, and its correlation falls exponentially over time. Both are
+    estimated by restricted maximum likelihood (Patterson and Thompson 1971), and averaged over their posterior.
+    """
+    if not solution.keyframes.localized_every:
+        return solution
+    seen = _cells_of(solution, settings)
+    if not seen:
+        return solution
+    variance = lasting_variances(list(seen.values()))
+    covariance = solution.estimate.covariance.copy()
+    for j, cells in seen.items():
+        kernel = sum(v * cells.alike(time) for v, time in zip(variance.tolist(), _TIMES, strict=True))
+        covariance[j] += cells.pull.T @ kernel @ cells.pull
+    return replace(solution, estimate=replace(solution.estimate, covariance=covariance))
+
+
+def lasting_variances(seen: list[Cells]) -> Floats:
+    """Return the expected squared factor of the errors of each of the times `_TIMES`. The sum is that of all lasting errors.
+
+    seen: the cells of each object.
+    """
+    likelihood = np.tile(-0.5 * _FACTORS**2, (len(_TIMES), 1))
+    for cells in seen:
+        shift, mean = cells.shift / cells.white[:, None], cells.mean / cells.white
+        own = np.outer(cells.size / cells.white, cells.size / cells.white)
+        for row, time in zip(likelihood, _TIMES, strict=True):
+            size, vectors = np.linalg.eigh(own * cells.alike(time))
+            y, x = vectors.T @ mean, vectors.T @ shift
+            variance = 1 + _FACTORS[:, None] ** 2 * np.maximum(size, 0.0)
+            matrix = np.einsum("ki,kj,sk->sij", x, x, 1 / variance) + np.eye(2) / _LOOSE**2
+            vector = np.einsum("ki,k,sk->si", x, y, 1 / variance)
+            explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
+            row -= 0.5 * ((y**2 / variance + np.log(variance)).sum(axis=1) + np.linalg.slogdet(matrix)[1] - explained)
+    weight = np.exp(likelihood - likelihood.max()) * np.gradient(_FACTORS)
+    return np.asarray((weight * _FACTORS**2).sum(axis=1) / weight.sum())
+
+
+def _cells_of(solution: Solution, settings: Settings) -> dict[int, Cells]:
+    """Return the cells of each object with a covariance, by its index. Rejected rays, and ranges, do not count."""
+    keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
+    placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
+    which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
+    which = which[placed[association.object[which]]]
+    if not len(which):
+        return {}
+    rays, owner, count = solution.rays.take(which), association.object[which], len(placed)
+    times = keyframes.stamps[rays.keyframe]
+    origin, direction = rays.in_map(keyframes.map_T_camera)
+    to = estimate.positions[owner] - origin
+    level = np.maximum(np.hypot(to[:, 0], to[:, 1]), MIN_DEPTH)
+    distance = np.maximum(np.linalg.norm(to, axis=1), MIN_DEPTH)
+    left = np.column_stack([-to[:, 1], to[:, 0]]) / level[:, None]
+    miss = (direction[:, :2] * left).sum(axis=1) / np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
+    yaw, place = noise_of_poses(keyframes, settings)
+    white, size = rays.sigma * distance / level, np.hypot(yaw, place / level)
+
+    across = np.hypot(np.hypot(rays.sigma, yaw) * distance, place)
+    strength = 1 / across if settings.fixed.loss == "l1" else across**-2
+    along = np.where(np.isfinite(rays.range), rays.range_sigma**-2, 0.0)
+    information = ray_information(direction, strength, along, owner, count)
+    held = np.linalg.eigvalsh(information)[:, 0] > 0
+    inverse = np.zeros_like(information)
+    inverse[held] = np.linalg.inv(information[held])
+
+    first, cell = _cells(times, owner, count)
+    weight = white**-2
+    total = np.bincount(cell, weight)
+
+    def mean(values: Floats) -> Floats:
+        return np.asarray(np.bincount(cell, weight * values) / total)
+
+    within = miss - mean(miss)[cell]
+    free = len(cell) - len(total)
+    scatter = ((within / white) ** 2).sum()
+    factor = np.sqrt((scatter + _POOLED) / (free + _POOLED))
+    pull = np.zeros((len(total), 3))
+    np.add.at(pull[:, :2], cell, (strength * size * level)[:, None] * left)
+    columns = mean(times), mean(miss), factor / np.sqrt(total), mean(size)
+    shift = np.column_stack([mean(left[:, 0] / level), mean(left[:, 1] / level)])
+    pull = np.einsum("cij,cj->ci", inverse[first], pull)
+    ends = np.flatnonzero(np.diff(first, append=count))
+    seen, begin = {}, 0
+    for end in (ends + 1).tolist():
+        mine = slice(begin, end)
+        when, missed, noise, sized = (column[mine] for column in columns)
+        seen[int(first[begin])] = Cells(when, missed, noise, shift[mine], sized, pull[mine])
+        begin = end
+    return seen
+
+
+def _cells(times: Floats, owner: Ints, count: int) -> tuple[Ints, Ints]:
+    """Return the object of each cell, in order, and the cell of each ray (R,)."""
+    width = np.full(count, _CELL)
+    while True:
+        number = np.floor((times - times.min()) / width[owner]).astype(np.int64)
+        pairs, cell = np.unique(np.column_stack([owner, number]), axis=0, return_inverse=True)
+        many = np.bincount(pairs[:, 0], minlength=count) > _MOST_CELLS
+        if not many.any():
+            return pairs[:, 0], cell.ravel()
+        width[many] *= 2

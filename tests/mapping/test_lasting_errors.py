@@ -1,0 +1,70 @@
+"""Errors of poses that last for some seconds: their size against what was drawn, and the sigmas of a map with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.core.types import Log
+from objslam.mapping import pipeline
+from objslam.mapping.fixed.lasting_errors import Cells, lasting_variances
+from objslam.simulation import PoseNoise, preset, simulate
+
+
+def with_lasting(log: Log, factor: float, time: float, seed: int) -> Log:
+    """The log with errors of its localisation that last for `time`: an autoregressive process at each pose."""
+    path, rng = log.localization, np.random.default_rng(seed)
+    kept = np.exp(-np.median(np.diff(path.stamps)) / time)
+    drawn = rng.standard_normal((len(path), 3)) * factor * [0.02, 0.02, 0.005]
+    for i in range(1, len(drawn)):
+        drawn[i] = kept * drawn[i - 1] + np.sqrt(1 - kept**2) * drawn[i]
+    turned = lift_se2(np.column_stack([np.zeros((len(path), 2)), drawn[:, 2]]))
+    poses = path.poses @ turned
+    poses[:, :2, 3] += drawn[:, :2]
+    return replace(log, localization=replace(path, poses=poses))
+
+
+def squares(log: Log) -> list[float]:
+    settings = load_settings(
+        None, ("mode=fixed", "calibration.use=false", "checks.use=false", "rays.box_sigma=0", "output.recording=false")
+    )
+    result = pipeline.run(log, settings, Ledger())
+    place = {item.label: item.position for item in log.truth.objects}
+    off = [(item.position - place[item.label], item.covariance) for item in result.map.resolved()]
+    return [float(miss @ np.linalg.solve(covariance, miss)) for miss, covariance in off]
+
+
+def test_errors_of_poses_that_last_are_in_the_covariances(monkeypatch):
+    logs = []
+    for seed in range(3):
+        noise = {"localization": PoseNoise(xy=0.005, yaw=0.001), "pixel_sigma": 1.0}
+        log = simulate(preset("demo", odometry=None, objects=12, classes=12, frames=300, false=0.0, **noise), seed)
+        logs.append(with_lasting(log, 2.5, 16.0, seed))
+    found = np.concatenate([squares(log) for log in logs])
+    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda solution, settings: solution)
+    without = np.concatenate([squares(log) for log in logs])
+    # An honest median is 2.4. A drive of one minute has few independent errors of 16 s, and its objects share them.
+    assert np.median(without) > 30
+    assert np.median(found) < 6
+
+
+@pytest.mark.parametrize(("factor", "time"), [(0.0, 1.0), (0.5, 4.0), (1.5, 16.0), (4.0, 64.0)])
+def test_the_size_of_lasting_errors_is_found(factor, time):
+    """Angles that are drawn from the model, at places that are off by some centimetres."""
+    rng, seen = np.random.default_rng(1), []
+    for _ in range(15):
+        times = np.sort(rng.uniform(0, 600, 40))
+        heading = rng.uniform(-np.pi, np.pi, 40)
+        size, white, level = np.full(40, 0.007), np.full(40, 0.003), rng.uniform(2, 5, 40)
+        shift = np.column_stack([np.cos(heading), np.sin(heading)]) / level[:, None]
+        cells = Cells(times, np.zeros(40), white, shift, size, np.zeros((40, 3)))
+        lasting = rng.multivariate_normal(np.zeros(40), factor**2 * np.outer(size, size) * cells.alike(time))
+        mean = lasting + white * rng.standard_normal(40) + shift @ rng.normal(0, 0.05, 2)
+        seen.append(replace(cells, mean=mean))
+    found = lasting_variances(seen)
+    assert np.sqrt(found.sum()) == pytest.approx(factor, rel=0.25, abs=0.1)
