@@ -15,9 +15,9 @@ from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import MOST_NOISE, NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
 from objslam.graph.calibration.anderson import MEMORY, accelerated
-from objslam.graph.calibration.instruments import from_neighbours
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
+from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry_motions import OdometryMotions
 from objslam.graph.least_squares.joint_rows import whitening
@@ -45,9 +45,6 @@ _WINDOWS = 30
 larger number shortens the windows of short logs."""
 _MOST_SHRINKAGE = 0.3
 """The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger limit hides."""
-_LEAST_TOLD = 0.3
-"""`shrinking_force` predicts motions by their neighbours if the prediction explains at least this share of the squared
-motions. A larger share uses it more rarely."""
 _PRIOR_OBJECTS = 4
 """The range bias in the settings counts like this number of objects at the most. With a larger number, the bias changes
 less."""
@@ -285,55 +282,6 @@ def _range_noise(
     squares = max(((middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2).sum(), 0.0)
     weight = min(prior, float(_PRIOR_OBJECTS))
     return ranges, float(np.sqrt((weight + squares) / (weight + has.sum())))
-
-
-def shrinking_force(of: Linearised) -> tuple[float, float]:
-    """Return the force that makes a joint solution too small, and the curvature against it, both per logarithm of the size.
-
-    Noise in the rays makes the path jitter. This makes its steps longer than the steps of the odometry. A smaller map makes
-    them shorter again, at the least cost (errors in variables; Neyman and Scott 1948). The motion
-    residuals pull on the size. Part of the pull is real, and part comes from the noise of the measured motions. Motions that
-    are predicted from their neighbours do not have this noise, and show the real part. The force is the total pull less the
-    real part, at least 0. If the prediction is poor (`_LEAST_TOLD`), the total pull counts. Without odometry, or with a
-    localisation, there is no force. The curvature is the information of all measured lengths about the size.
-    """
-    keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
-    before, after = of.graph.moves
-    odometry = of.measured.motions
-    if odometry is None or not len(odometry) or keyframes.localized_every or keyframes.odom_T_base is None:
-        return 0.0, 1.0
-    camera_T_base = inverse(keyframes.base_T_camera)
-    solved, said = (
-        (inverse(path[before]) @ path[after])[:, :3, 3] for path in (of.map_T_camera @ camera_T_base, keyframes.odom_T_base)
-    )
-    turn = keyframes.base_T_camera[after, :3, :3]
-    variance = turn @ odometry.covariance[:, 3:, 3:] @ np.swapaxes(turn, 1, 2)
-    told = from_neighbours(said, np.maximum(keyframes.stamps[after] - keyframes.stamps[before], 0.0))
-
-    def product(one: Floats, two: Floats) -> float:
-        return float((one * np.linalg.solve(variance, two[..., None])[..., 0]).sum())
-
-    ways, by_neighbours = product(said, said), product(told, said)
-    force = product(solved, solved - said)
-    if by_neighbours > _LEAST_TOLD * ways:
-        force -= product(told, solved - said) * ways / by_neighbours
-    ranged = np.isfinite(rays.range)
-    lengths = ways + float(((rays.range[ranged] / rays.range_sigma[ranged]) ** 2).sum()) + _of_tags(of)
-    return max(force, 0.0), max(lengths, 1.0)
-
-
-def _of_tags(of: Linearised) -> float:
-    """Return the information that the known sizes of fiducials give about the logarithm of the size of the map.
-
-    A view tells the distance to a fiducial by the directions of four corners, each half a diagonal from the centre.
-    """
-    tags = of.measured.tags
-    if tags is None:
-        return 0.0
-    seen = tags.seen(of.measured.rays, of.map_T_camera)
-    across = np.linalg.norm(seen.direction[:, 2] - seen.direction[:, 0], axis=1)
-    known = np.isfinite(tags.side)[seen.square]
-    return float(((across[known] / seen.sigma[known]) ** 2).sum())
 
 
 def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
