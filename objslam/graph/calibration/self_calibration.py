@@ -24,7 +24,8 @@ from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.inner_solve import InnerSolve
 from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
-from objslam.graph.calibration.variance_components import estimate_noise, shrinking_force
+from objslam.graph.calibration.shrinkage import shrinking_force
+from objslam.graph.calibration.variance_components import estimate_noise
 from objslam.graph.outlier_rejection import JointSolution, reject_outliers
 
 _ROUNDS = 8
