@@ -79,7 +79,7 @@ def test_the_map_has_the_size_of_the_odometry():
     assert abs(scales.mean() - 1) < 3 * scales.std() / np.sqrt(len(scales)) + 0.01
 
 
-@pytest.mark.parametrize(("duration", "told"), [(0.0, 3.0), (40.0, 3.0), (150.0, 5.0), (900.0, 10.0)])
+@pytest.mark.parametrize(("duration", "told"), [(0.0, 3.0), (40.0, 3.0), (150.0, 5.0), (900.0, 6.0)])
 def test_a_longer_log_finds_slower_errors(duration, told):
     stamps = 1.7e9 + np.array([0.0, duration / 3, duration])
     assert correlation_time(stamps) == pytest.approx(told)
