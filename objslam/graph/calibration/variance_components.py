@@ -37,9 +37,9 @@ so a larger share ends far from its value: with 0.02, one MRCLAM robot without r
 _LIMITS = (0.05, MOST_NOISE)
 """The smallest and largest factors on a nominal noise. Outside them, the settings do not describe the sensor at all."""
 _SHORTEST, _LONGEST = 3.0, 6.0
-"""The bounds of `correlation_time`, s. Wheels lag behind a command, and a detector's box is off, for one or two seconds. Slip
-lasts as long as the ground and the load: the speeds of five robots (MRCLAM, against motion capture) had errors with a
-correlation of 0.5 after 2 s, 1/e after 4 s and 0.3 after 6 s. Longer times find slower errors, from fewer independent sums."""
+"""The bounds of `correlation_time`, s. Wheels lag behind a command, and a detector's box is off, for one or two seconds.
+Slip lasts as long as the ground and the load: the speeds of five robots (MRCLAM, against motion capture) had errors with a
+correlation of 0.5 after 2 s, 1/e after 4 s and 0.3 after 6 s. Longer times find slower errors, from fewer sums."""
 _WINDOWS = 30
 """The number of windows that `correlation_time` leaves in a log. The variance of this number of sums is known to 26 %. A
 larger number shortens the windows of short logs."""
