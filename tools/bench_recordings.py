@@ -1,11 +1,12 @@
 """Map recorded drives with default settings, and compare each map with its truth and with its own sigmas.
 
-    python tools/bench_recordings.py [--parts named short cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
+    python tools/bench_recordings.py [--parts named short poses cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
 
 named: UTIAS MRCLAM 6 and 7 (15 landmarks, the odometry of wheels) and Lost in the Woods (17 posts, one observation a
 second), each landmark with a label of its own, from bearings and with ranges. short: parts of the MRCLAM drives of two to
-five minutes. unnamed: the same drives with ranges, and one label for all landmarks. cube: a cabinet of TUM fr3 at the poses
-of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses.
+five minutes. poses: the MRCLAM drives at the poses of the motion capture, from bearings. cube: a cabinet of TUM fr3 at the
+poses of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with
+ranges, and one label for all landmarks.
 
 Maps from odometry are compared after SE(2) alignment. The truth is inside a 95 % ellipsoid in 95 % of the cases, if the
 covariances are right. Times are of the processor, for the map alone.
@@ -141,6 +142,27 @@ def short(data: Path, only: str, overrides: list[str]) -> None:
             )
 
 
+def poses(data: Path, only: str, overrides: list[str]) -> None:
+    """Landmarks of the MRCLAM drives at the poses of the motion capture, without range and without an alignment."""
+    print("whole drives, fixed at the poses of the motion capture, bearings only")
+    print(
+        f"{'drive':<7}{'right':>7}{'false':>7}{'missed':>8}{'RMSE m':>8}{'inside 95 %':>13}{'median Mahalanobis^2':>22}"
+        f"{'s':>7}"
+    )
+    for name, log in drives(data, only, False):
+        if name == "woods":
+            continue
+        assert log.truth is not None
+        result, seconds = solve(replace(log, localization=log.truth.trajectory, odometry=None), ["mode=fixed", *overrides])
+        found = judged(log, result, align="none")
+        inside = f"{round(found['inside_95_3d'] * found['matched'])} of {found['matched']}"
+        print(
+            f"{name:<7}{found['matched']:7d}{found['false']:7d}{found['missed']:8d}{found['position_rmse']:8.3f}{inside:>13}"
+            f"{found['mahalanobis_median']:22.2f}{seconds:7.1f}",
+            flush=True,
+        )
+
+
 def cube(data: Path, overrides: list[str]) -> None:
     """The cabinet's horizontal error, poses fixed, with depths and without."""
     print("TUM fr3_cabinet (cube_slam), fixed")
@@ -171,7 +193,7 @@ def ycbv(data: Path, overrides: list[str]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("named", "short", "cube", "ycbv", "unnamed")
+    parts = ("named", "short", "poses", "cube", "ycbv", "unnamed")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--only", default="", help="only the drives whose name contains this, such as 6-1 or woods")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs")
@@ -183,6 +205,7 @@ def main() -> None:
     work = {
         "named": lambda: compare(data, only, overrides, names=True),
         "short": lambda: short(data, only, overrides),
+        "poses": lambda: poses(data, only, overrides),
         "cube": lambda: cube(data, overrides),
         "ycbv": lambda: ycbv(data, overrides),
         "unnamed": lambda: compare(data, only, overrides, names=False),
