@@ -17,6 +17,11 @@ settings.register_profile(
 settings.load_profile("objslam")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the tests that take longest. At the end, one process would run them while the others have nothing to do."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
+
+
 @pytest.fixture
 def objslam(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Call]:
     """The entry point of the console script, in this process. A process of its own pays a second for its imports."""

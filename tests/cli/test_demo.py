@@ -64,6 +64,7 @@ def test_a_demo_replaces_no_log_of_others(objslam: Objslam, tmp_path: Path) -> N
     assert (tmp_path / "log" / "camera.yaml").read_bytes() == before
 
 
+@pytest.mark.long
 def test_demo_from_images(objslam: Objslam, attempts: list[object], tmp_path: Path) -> None:
     """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises."""
     demo = objslam("demo", "-o", tmp_path / "demo")

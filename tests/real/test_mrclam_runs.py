@@ -38,6 +38,7 @@ def test_the_start_was_far_off(data_dir, robot):
     assert found["ate"] > 1.0
 
 
+@pytest.mark.long
 def test_landmarks_without_names(data_dir):
     """Fifteen posts, in clusters 17 cm apart, all called the same: loops are closed by how they stand to each other."""
     log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=1, anonymous=True))
