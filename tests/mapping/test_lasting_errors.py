@@ -53,6 +53,19 @@ def test_errors_of_poses_that_last_are_in_the_covariances(monkeypatch):
     assert np.median(found) < 6
 
 
+def test_the_status_of_an_object_knows_its_lasting_errors(monkeypatch):
+    """`seen_sigma` decides whether an object is resolved."""
+    made, wider = [], pipeline.with_lasting_errors
+    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda *given: made.append((given[0], wider(*given))) or made[0][1])
+    log = simulate(preset("demo", odometry=None, objects=6, classes=6, frames=150, false=0.0), 0)
+    squares(with_lasting(log, 2.5, 16.0, 0))
+    before, after = (solution.estimate for solution in made[0])
+    there = after.solved
+    assert (after.seen_sigma[there] > 1.05 * before.seen_sigma[there]).all()
+    largest = np.sqrt(np.linalg.eigvalsh(after.covariance[there])[:, -1])
+    np.testing.assert_allclose(after.seen_sigma[there], largest)
+
+
 @pytest.mark.parametrize(("factor", "time"), [(0.0, 1.0), (0.5, 4.0), (1.5, 16.0), (4.0, 64.0)])
 def test_the_size_of_lasting_errors_is_found(factor, time):
     """Angles that are drawn from the model, at places that are off by some centimetres."""

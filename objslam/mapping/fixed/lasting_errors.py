@@ -11,6 +11,7 @@ from objslam.association.observations import MIN_DEPTH
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.graph.fixed_pose_triangulation import noise_of_poses
+from objslam.graph.posterior.marginals import largest_sigma
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
 
@@ -71,7 +72,8 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
     for j, cells in seen.items():
         kernel = sum(v * cells.alike(time) for v, time in zip(variance.tolist(), _TIMES, strict=True))
         covariance[j] += cells.pull.T @ kernel @ cells.pull
-    return replace(solution, estimate=replace(solution.estimate, covariance=covariance))
+    wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
+    return replace(solution, estimate=wider)
 
 
 def lasting_variances(seen: list[Cells]) -> Floats:
