@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -101,38 +102,37 @@ def test_tags_of_unknown_size_say_how_a_size_helps(given, told):
     assert advice_on_tags(objects[:1], given) == ""
 
 
-def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before(monkeypatch):
+@contextmanager
+def terminal_in_place_of_stderr():
+    """A terminal of 100 columns; no fixture, because pytest sets stderr anew between a fixture and its test."""
     screen = Tty()
-    monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setenv("TERM", "xterm")
-    terminal.console.cache_clear()
-    try:
-        with terminal.progress_bar() as show:
-            show("detecting", 220, 220)
-            show("solving", 0, 0)
-            mark = len(screen.getvalue())
-    finally:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stderr", screen)
+        patch.setenv("COLUMNS", "100")
+        patch.setenv("TERM", "xterm")
         terminal.console.cache_clear()
-    after = screen.getvalue()[mark:]
+        try:
+            yield screen
+        finally:
+            terminal.console.cache_clear()
+
+
+def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before():
+    with terminal_in_place_of_stderr() as tty, terminal.progress_bar() as show:
+        show("detecting", 220, 220)
+        show("solving", 0, 0)
+        mark = len(tty.getvalue())
+    after = tty.getvalue()[mark:]
     assert "solving" in after
     assert "220" not in after
 
 
-def test_the_bar_of_a_stage_shows_its_count_from_the_start_and_its_rate(monkeypatch):
-    screen = Tty()
-    monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setenv("COLUMNS", "100")
-    monkeypatch.setenv("TERM", "xterm")
-    terminal.console.cache_clear()
-    try:
-        with terminal.progress_bar() as show:
-            mark = len(screen.getvalue())
-            for done in range(221):
-                show("detecting", done, 220)
-    finally:
-        terminal.console.cache_clear()
-    after = screen.getvalue()[mark:]
+def test_the_bar_of_a_stage_shows_its_count_from_the_start_and_its_rate():
+    with terminal_in_place_of_stderr() as tty, terminal.progress_bar() as show:
+        mark = len(tty.getvalue())
+        for done in range(221):
+            show("detecting", done, 220)
+    after = tty.getvalue()[mark:]
     assert "/?" not in after
     assert "220/220" in after
     assert "/s" in after
