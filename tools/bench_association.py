@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from log_parts import without_names
 from peers.drives import drives
 from peers.krylov import locate
 from peers.street import Street, simulate_street
@@ -324,16 +325,6 @@ def hidden(scene: Scene) -> Log:
     features = None if scene.rays.feature is None else detections.features
     detections = replace(detections, track_ids=np.full(len(detections), -1), features=features)
     return replace(scene.log, cameras=(replace(scene.log.cameras[0], detections=detections),))
-
-
-def without_names(log: Log) -> Log:
-    """Return the log with one label for all landmarks."""
-    cameras = tuple(
-        replace(c, detections=replace(c.detections, label=np.zeros_like(c.detections.label), label_names=("landmark",)))
-        for c in log.cameras
-        if c.detections is not None
-    )
-    return replace(log, cameras=cameras)
 
 
 def pair_f1(found: Ints, truth: Ints) -> float:

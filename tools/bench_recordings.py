@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "real"))
-from log_parts import part
+from log_parts import part, without_names
 from lost_in_the_woods import read_lost_in_the_woods
 from ycbv import RUNS, read_ycbv
 
@@ -87,7 +87,7 @@ def compare(data: Path, only: str, overrides: list[str], names: bool) -> None:
     )
     for with_range in (False, True) if names else (True,):
         for name, log in drives(data, only, with_range):
-            log = log if names else unnamed(log)
+            log = log if names else without_names(log)
             result, seconds = solve(log, overrides)
             found = judged(log, result, RADIUS if names else UNNAMED_RADIUS)
             scaled = judged(log, result, RADIUS if names else UNNAMED_RADIUS, "sim2")
@@ -98,18 +98,6 @@ def compare(data: Path, only: str, overrides: list[str], names: bool) -> None:
                 f"{found['ate']:8.3f}{seconds:7.1f}",
                 flush=True,
             )
-
-
-def unnamed(log: Log) -> Log:
-    """The same log with one label."""
-    assert log.truth is not None
-    cameras = []
-    for camera in log.cameras:
-        assert camera.detections is not None
-        zeros = np.zeros_like(camera.detections.label)
-        cameras.append(replace(camera, detections=replace(camera.detections, label=zeros, label_names=("landmark",))))
-    objects = tuple(replace(one, label="landmark") for one in log.truth.objects)
-    return replace(log, cameras=tuple(cameras), truth=replace(log.truth, objects=objects))
 
 
 def short(data: Path, only: str, overrides: list[str]) -> None:

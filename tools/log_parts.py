@@ -1,4 +1,4 @@
-"""A part of a recorded drive."""
+"""A part of a recorded drive, and a drive whose landmarks have no names."""
 
 from dataclasses import replace
 
@@ -22,3 +22,16 @@ def part(log: Log, begin: float, end: float) -> Log:
     there = inside(path.stamps)
     odometry = Trajectory(path.stamps[there], path.poses[there])
     return replace(log, odometry=odometry, cameras=(replace(camera, detections=seen),))
+
+
+def without_names(log: Log) -> Log:
+    """The log, and its truth if it has one, with one label for all landmarks."""
+    cameras = tuple(
+        replace(c, detections=replace(c.detections, label=np.zeros_like(c.detections.label), label_names=("landmark",)))
+        for c in log.cameras
+        if c.detections is not None
+    )
+    if log.truth is None:
+        return replace(log, cameras=cameras)
+    objects = tuple(replace(one, label="landmark") for one in log.truth.objects)
+    return replace(log, cameras=cameras, truth=replace(log.truth, objects=objects))
