@@ -687,6 +687,8 @@ def exhausted():
 
 
 ENDLESS = """
+import signal
+
 from objslam.mapping import pipeline
 from objslam.cli import main
 
@@ -698,6 +700,7 @@ def again_and_again(*work):
         run(*work)
 
 pipeline.run = again_and_again
+signal.signal(signal.SIGINT, signal.default_int_handler)  # A suite in the background of a shell inherits "ignore".
 main()
 """
 
