@@ -60,6 +60,20 @@ def test_cut_off_boxes_make_centres_better():
     assert np.exp(np.mean(np.log(ratios))) < 0.93
 
 
+def test_cut_off_boxes_belong_to_no_body_where_no_object_has_a_shape(monkeypatch):
+    log, _ = cut_drive(3)
+    given = []
+
+    def without_shapes(found, boxes, objects, solution):
+        flat = replace(found, shape=np.zeros_like(found.shape))
+        given.append(cut_boxes.cut_edges_of(flat, boxes, objects, solution))
+        return given[0]
+
+    monkeypatch.setattr(fitting, "cut_edges_of", without_shapes)
+    pipeline.run(log, SETTINGS, Ledger())
+    assert given == [None]
+
+
 @pytest.mark.parametrize("short", [0.0, 0.06])
 def test_a_cut_off_box_is_given_to_its_own_body(monkeypatch, short):
     """All objects have one label. At least half of the cut off boxes are given to a body, each to the right one."""

@@ -97,7 +97,8 @@ def _candidates(
     wide = (cut.box[:, 2:] > cut.box[:, :2]).all(axis=1)
     usable = np.flatnonzero((keyframe >= 0) & sees_size & wide)
     origin, axis, angle = _cones(cut, keyframe, usable, boxes)
-    found: list[tuple[Ints, Ints]] = []
+    none = np.zeros(0, dtype=np.int64)
+    found = [(none, none)]
     for at in np.flatnonzero(bodies.shape > 0).tolist():
         mine = np.flatnonzero(cut.label[usable] == association.label[objects[at]])
         mine = mine[~np.isin(keyframe[usable[mine]] * association.count + objects[at], whole)]
@@ -108,7 +109,7 @@ def _candidates(
         off = np.arccos(np.clip((towards * axis[mine]).sum(axis=1), -1.0, 1.0))
         near = mine[off < np.minimum(angle[mine] + np.arcsin(reach / distance), np.pi / 2)]
         found.append((usable[near], np.full(len(near), at)))
-    box, body = (np.concatenate([np.zeros(0, dtype=np.int64), *part]) for part in zip(*found, strict=True))
+    box, body = (np.concatenate(part) for part in zip(*found, strict=True))
     return box, body
 
 
