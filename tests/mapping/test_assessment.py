@@ -13,14 +13,14 @@ from objslam.frontend.bearings import CUT_OFF
 from objslam.mapping.checks.assessment import Evidence, assess
 from objslam.simulation import PoseNoise
 
-GOOD = Evidence(resolved=12, unresolved=1, boxes=1000, cut=100, rays=900, unexplained=90, misses=1.0)
+GOOD = Evidence(resolved=12, unresolved=1, boxes=1000, cut=100, rays=900, unexplained=90, rejected=20, misses=1.0)
 QUIET = {"output": {"recording": False, "picture": False}}
 
 
 def test_a_usual_result_is_good() -> None:
     found = assess(GOOD)
     assert found.level == "good"
-    assert str(found) == "good. 12 objects, and the rays miss them about as far as the settings say, or less."
+    assert str(found) == "good. 12 objects, whose boxes agree to within the expected noise."
 
 
 @pytest.mark.parametrize(
@@ -33,9 +33,14 @@ def test_a_usual_result_is_good() -> None:
         ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
         ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),
         ({"unexplained": 450}, "check", "50 % of the used boxes belong to no object."),
+        ({"rejected": 180}, "check", "20 % of the used boxes miss their object. An object may be two."),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
         ({"fixed": True, "odometry_frame": True}, "check", "The poses are those of the odometry, so its drift is in"),
-        ({"rays": 20, "unexplained": 0}, "check", "Only 20 boxes were used, which is too few to notice wrong input."),
+        (
+            {"rays": 20, "unexplained": 0, "rejected": 0},
+            "check",
+            "Only 20 boxes were used, which is too few to notice wrong input.",
+        ),
     ],
 )
 def test_each_cause_has_its_reason(changes: dict[str, object], level: str, reason: str) -> None:

@@ -16,8 +16,8 @@ _CUT = 1 / 3
 """A result needs a look if the image's edge cuts off more than this share of the boxes. A tenth is usual in the demo's
 rooms. A larger value gives fewer warnings."""
 _UNEXPLAINED = 0.25
-"""A result needs a look if more than this share of the rays belong to no object. A tenth is usual, from false boxes and
-moving things. A larger value gives fewer warnings."""
+"""A result needs a look if more than this share of the rays belong to no object or miss their object. A tenth is usual, from
+false boxes and moving things. A larger value gives fewer warnings."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
 gives more warnings."""
@@ -28,10 +28,10 @@ class Evidence:
     """The numbers that a judgement depends on.
 
     resolved, unresolved: the numbers of objects with and without a position. boxes: the boxes of the log. cut: the boxes
-    that the image's edge cuts off. rays: the used boxes. unexplained: the used boxes without an object. misses: the
-    median residual as a multiple of its expected noise, NaN without objects. odometry_frame: whether the map has the
-    frame of the odometry. fixed: whether the run kept the given poses. findings: the names of the faults of the input.
-    spoilt: whether these faults make positions unreliable.
+    that the image's edge cuts off. rays: the used boxes. unexplained: the used boxes without an object. rejected: the used
+    boxes that miss their object so far that they do not count. misses: the median residual as a multiple of its expected
+    noise, NaN without objects. odometry_frame: whether the map has the frame of the odometry. fixed: whether the run kept
+    the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
     """
 
     resolved: int
@@ -40,6 +40,7 @@ class Evidence:
     cut: int
     rays: int
     unexplained: int
+    rejected: int
     misses: float
     odometry_frame: bool = False
     fixed: bool = False
@@ -75,6 +76,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         cut=summary["dropped"].get(CUT_OFF, 0),
         rays=counts["rays"],
         unexplained=counts["rays_unexplained"],
+        rejected=counts["rays_rejected"],
         misses=misses,
         odometry_frame=summary["map_frame"] == "odometry",
         fixed=summary["mode"] == "fixed",
@@ -87,8 +89,7 @@ def assess(e: Evidence) -> Assessment:
     """Judge a result. The first reasons weigh most."""
     bad, check = _bad(e), _check(e)
     level: Level = "bad" if bad else "check" if check else "good"
-    them = "it" if e.resolved == 1 else "them"
-    good = f"{_objects(e.resolved)}, and the rays miss {them} about as far as the settings say, or less."
+    good = f"{_objects(e.resolved)}, whose boxes agree to within the expected noise."
     frame = "The map lies in the frame of the odometry, which begins where the robot began."
     return Assessment(level, tuple(bad or check or [good]) + ((frame,) if e.odometry_frame and not bad else ()))
 
@@ -122,6 +123,8 @@ def _check(e: Evidence) -> list[str]:
         found.append(f"{100 * e.cut / e.boxes:.0f} % of the boxes were dropped, because the image's edge cuts them off.")
     if e.unexplained > _UNEXPLAINED * e.rays:
         found.append(f"{100 * e.unexplained / e.rays:.0f} % of the used boxes belong to no object.")
+    elif e.unexplained + e.rejected > _UNEXPLAINED * e.rays:
+        found.append(f"{100 * e.rejected / e.rays:.0f} % of the used boxes miss their object. An object may be two.")
     if e.unresolved > e.resolved:
         found.append(f"Only {e.resolved} of {e.resolved + e.unresolved} objects have a place. Drive around the others.")
     if e.rays < _FEW:
