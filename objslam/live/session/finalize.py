@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
 from objslam.core.result import RunResult
@@ -24,6 +25,7 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.labels import labels_tell
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
 
@@ -31,19 +33,17 @@ from objslam.mapping.solution import Solution, without_errors
 def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = None) -> RunResult:
     """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
 
-    If every label is one object, or if there are more rays than live.reassociate, the session's association is kept, and
-    only the solve is done.
+    If every label is one object so far, that association is solved. If many of its rays do not fit, the drive is associated
+    anew as in an offline run. If there are more rays than live.reassociate, the session's association is kept.
 
     name: of the log. path: of the journal, None without one. known: a prior map. If the whole drive is found in it, the
     result is in the frame of that map, as in an offline run. SolveError when no box could be mapped.
     """
-    from objslam.graph.init_unknown_correspondences import InitialEstimate
-
     begin = time.perf_counter()
     settings, ledger = m.given, m.counters.ledger
     found = collect(m, name)
-    keyframes, rays, errors, log = found.keyframes, found.rays, found.errors, found.log
-    if not len(rays):
+    errors, log = found.errors, found.log
+    if not len(found.rays):
         kinds = {"camera": "cameras", "odometry or localisation": "odometry", "detections": "frames"}
         came = m.counters.accepted()
         came["odometry"] = came.get("odometry", 0) + came.get("localization", 0)
@@ -53,11 +53,7 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
     if m.calibration is not None:
         warn_of_others(m.calibration, log, settings, ledger)
     cameras = tuple(one.camera for one in log.cameras)
-    if m.by_label or len(rays) > settings.live.reassociate:
-        solution = _solve_joint(found, settings, ledger)
-    else:
-        start = InitialEstimate(found.map_T_camera, found.association, found.positions)
-        solution = solve(keyframes, rays, cameras, settings, ledger, lambda stage, done, total: None, start, errors)
+    solution = _solved(found, m.by_label, cameras, settings, ledger)
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
@@ -95,6 +91,22 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
         path=Trajectory(stamps, keyframes.map_T_base[first]),
         path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
     )
+
+
+def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], settings: Settings, ledger: Ledger) -> Solution:
+    """Return the solution of a drive. by_label: whether every label is one object so far."""
+    from objslam.graph.init_unknown_correspondences import InitialEstimate
+
+    few = len(found.rays) <= settings.live.reassociate
+    if by_label or not few:
+        own = Ledger()  # Its entries count only if this solution is returned.
+        solution = _solve_joint(found, settings, own)
+        told = settings.association.method == "by_label" or labels_tell(solution.association, solution.estimate)
+        if told or not by_label or not few:  # Else a label has several objects, which no frame showed together.
+            ledger.add(own)
+            return solution
+    start = None if by_label else InitialEstimate(found.map_T_camera, found.association, found.positions)
+    return solve(found.keyframes, found.rays, cameras, settings, ledger, lambda *_: None, start, found.errors)
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
