@@ -35,9 +35,10 @@ class Session(LiveSession):
 
     settings, changes: as in `objslam.run`. The mode is always joint. journal: a file that keeps every accepted message, so
     that a killed program loses nothing. resume: whether to continue an existing journal. name: of the log, in the result.
-    patient: whether frames of any age are accepted, and the session waits for calibrations. A replay that calls `wait` now
-    and then needs this. map: the map of another day, or its file or result folder. Once the session is found in this map,
-    `snapshot().in_map` says so, and snapshots and result are in the frame of the map.
+    patient: for data that do not come from a running robot. A push then waits while the session has too much to do, and the
+    session waits for calibrations, so that nothing is dropped for lack of time. Push in the order of the stamps. map: the
+    map of another day, or its file or result folder. Once the session is found in this map, `snapshot().in_map` says so, and
+    snapshots and result are in the frame of the map.
     """
 
     def __init__(

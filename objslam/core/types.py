@@ -105,6 +105,11 @@ class Detections:
         """(M,) s, the stamp of the frame of each box."""
         return self.frame_stamps[self.frame]
 
+    @property
+    def labels(self) -> list[str]:
+        """The label of each box as text."""
+        return [self.label_names[i] for i in self.label.tolist()]
+
     def take(self, boxes: Bools | Ints) -> Self:
         """Select boxes by a mask or increasing indices. All frames stay."""
         values: dict[str, Any] = {name: getattr(self, name)[boxes] for name in ("boxes", *_BOX_COLUMNS)}

@@ -10,6 +10,7 @@ from robot import Recorder
 from small_log import crowded
 from waiting import LIMIT, pause
 
+import objslam
 from objslam.config import Odometry, load_settings
 from objslam.core.camera import project
 from objslam.core.diagnostics import Ledger
@@ -439,6 +440,38 @@ def test_too_many_frames_are_dropped_by_age_and_counted(log):
     assert 149 <= dropped <= 150
     assert session.snapshot().keyframes <= 150 - dropped
     session.abort()
+
+
+def test_a_patient_session_makes_the_source_wait_and_drops_nothing(log):
+    """All messages at once, while only two frames may wait."""
+    settings = load_settings(None, ("mode=joint", "live.max_frames_waiting=2", "live.max_lag=0.001"))
+    with objslam.Session(settings, patient=True) as session:
+        session.push_camera(log.cameras[0].camera)
+        for _, _, push in events(log):
+            push(session)
+        assert session.wait(LIMIT)
+        assert session.counters.accepted()["frames"] == 150
+        assert not [reason for reason in session.counters.dropped() if "frames" in reason]
+
+
+def test_two_objects_of_a_label_that_no_frame_shows_together_are_two_in_the_end():
+    """While the robot drives, each label is one object, and half of the rays do not fit."""
+    log = make_log(seed=1, classes=6)
+    (camera,) = log.cameras
+    boxes = camera.detections
+    _, first = np.unique(np.stack([boxes.frame, boxes.label]), axis=1, return_index=True)
+    log = replace(log, cameras=(replace(camera, detections=boxes.take(np.sort(first))),))
+    session = drive(log)
+    assert session._mapper.state.by_label
+    found = session.stop().map.resolved()
+    assert sorted(o.label for o in found) == sorted(o.label for o in log.truth.objects)
+    true = [
+        min((t for t in log.truth.objects if t.label == o.label), key=lambda t: np.hypot(*(t.position - o.position)[:2]))
+        for o in found
+    ]
+    here, there = np.array([o.position for o in found]), np.array([t.position for t in true])
+    pose, _ = align(here, there, "se2")
+    assert np.linalg.norm(here @ pose[:3, :3].T + pose[:3, 3] - there, axis=1).max() < 0.2
 
 
 def test_frames_that_come_seconds_late_find_their_place(log):

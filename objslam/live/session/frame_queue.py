@@ -18,7 +18,7 @@ _NEVER_COVERED = "frames that the path never covered"
 
 
 class FrameQueue:
-    """Passes messages to the mapper. patient: whether frames of any age are accepted.
+    """Passes messages to the mapper. patient: whether frames may wait for any time.
 
     lag: the time, s, from the arrival of the last mapped frame until the map contained it. worked: the `time.perf_counter`,
     s, when a frame last left the queue.

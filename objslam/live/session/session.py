@@ -45,9 +45,10 @@ class Session(Intake):
     pushes are refused, and `stop` returns the result of the messages before the error.
 
     journal: the file that receives every accepted message before it is processed. Only one session may write the file.
-    resume: whether to continue an existing journal. Then `start` processes its messages. patient: whether frames of any age
-    are accepted, because the source waits for the session. known: a prior map. Once the session is found in it, snapshots
-    and the result are in the frame of that map. A resumed session needs the same map again.
+    resume: whether to continue an existing journal. Then `start` processes its messages. patient: whether a push waits for
+    the session, so that no frame is dropped because the session is slower than its source. known: a prior map. Once the
+    session is found in it, snapshots and the result are in the frame of that map. A resumed session needs the same map
+    again.
     """
 
     def __init__(
@@ -64,7 +65,7 @@ class Session(Intake):
         self._calibrator = Calibrator(settings, self.counters, self._mapper, self._record, name, patient)
         self._known, self._locator = known, MapLocator(known, self._mapper, self.counters)
         self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, self._calibrator, self._locator, patient)
-        self._name, self._journal_file, self._resume = name, journal, resume
+        self._name, self._journal_file, self._resume, self._patient = name, journal, resume, patient
         live = settings.live
         self._journal = None
         if journal is not None:
@@ -164,6 +165,8 @@ class Session(Intake):
         A note, which stores the state of the clock and of the odometry's frame, only goes into the journal.
         """
         with self._changed:
+            if self._patient:
+                self._changed.wait_for(lambda: not (self._full() and self._running) or self._stopping)
             if self._stopping:
                 self.counters.drop("messages after the end of the session")
                 return False
@@ -184,6 +187,10 @@ class Session(Intake):
                     self._drop_oldest_frame()
                 self._changed.notify_all()
         return True
+
+    def _full(self) -> bool:
+        """Whether another message of some kind would push a frame out of the queue, or be refused."""
+        return self._frames >= self._settings.live.max_frames_waiting or self._others >= _MOST_POSES
 
     def _record(self, message: CalibrationMessage) -> bool:
         """Write a calibration into the journal, and return whether the session may use it."""
