@@ -28,7 +28,8 @@ from objslam.config import Settings, load_settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align, interpolate, make_pose
-from objslam.core.types import Log, Surface, Trajectory
+from objslam.core.result import Surface
+from objslam.core.types import Log, Trajectory
 from objslam.errors import OutputError
 from objslam.io.detections_jsonl import read_detections
 from objslam.mapping import pipeline

@@ -27,9 +27,10 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate
 from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.result import Surface
 from objslam.core.snapshot import CameraFrame
 from objslam.core.trajectory import correct_path
-from objslam.core.types import Log, Surface, Trajectory
+from objslam.core.types import Log, Trajectory
 from objslam.errors import OutputError
 from objslam.io.detections_jsonl import read_detections
 from objslam.live.adapters.replay import events

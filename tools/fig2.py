@@ -24,7 +24,7 @@ from one_line import end_with
 
 from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject
-from objslam.core.types import Surface
+from objslam.core.result import Surface
 from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
 from objslam.results.files import SURFACE

@@ -13,7 +13,7 @@ import open3d as o3d
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse, make_pose
-from objslam.core.types import Surface
+from objslam.core.result import Surface
 
 BACKGROUND = (255, 255, 255)
 _PASSES = 6  # walls seen from behind that a ray may go through

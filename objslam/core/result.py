@@ -1,9 +1,10 @@
-"""The result of a run, from which every output is made, and the doubts about it."""
+"""The result of a run, from which every output is made: the map, the doubts about it, and the surface of the room."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
@@ -11,7 +12,7 @@ from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.object_map import ObjectMap
 from objslam.core.trace import Round
-from objslam.core.types import Association, Images, Keyframes, Rays, Surface, Trajectory
+from objslam.core.types import Association, Images, Keyframes, Rays, Trajectory
 
 DoubtKind = Literal["pair", "split", "unresolved", "boxes"]
 DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "unresolved", "boxes")
@@ -55,6 +56,19 @@ class Doubt:
             **{"kind": self.kind, "reason": self.reason, "label": self.label, "text": self.text},
             **{"objects": list(self.objects), "position": position, "numbers": numbers, "rays": self.rays.tolist()},
         }
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh in map.
+
+    vertices: (V, 3) m. normals: (V, 3). colours: (V, 3) RGB, None if unknown. triangles: (T, 3) indices into vertices.
+    """
+
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    colours: NDArray[np.uint8] | None
+    triangles: NDArray[np.int32]
 
 
 @dataclass(frozen=True)

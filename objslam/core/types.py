@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from objslam.core.appearance.features import FeatureTable, are_unit_vectors
 from objslam.core.arrays import Bools, Floats, Floats32, Ints
@@ -333,19 +332,6 @@ class Association:
     def count(self) -> int:
         """Number of objects, N."""
         return len(self.label)
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A triangle mesh in map.
-
-    vertices: (V, 3) m. normals: (V, 3). colours: (V, 3) RGB, None if unknown. triangles: (T, 3) indices into vertices.
-    """
-
-    vertices: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    colours: NDArray[np.uint8] | None
-    triangles: NDArray[np.int32]
 
 
 def label_table(names: Sequence[str]) -> tuple[tuple[str, ...], Ints]:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from objslam.core.types import Surface
+from objslam.core.result import Surface
 
 
 def write_mesh(surface: Surface, file: Path) -> None:

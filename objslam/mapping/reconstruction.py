@@ -19,7 +19,8 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse
-from objslam.core.types import Log, Surface, Trajectory
+from objslam.core.result import Surface
+from objslam.core.types import Log, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps, read_depth
 from objslam.io.images import decode_colour

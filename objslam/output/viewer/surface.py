@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from objslam.core.result import RunResult
-from objslam.core.types import Surface
+from objslam.core.result import RunResult, Surface
 
 _MAX_VERTICES = 100_000  # The most vertices of a recorded surface, 5 MB. reconstruction.ply has all vertices.
 _CELL = 0.02  # The first edge length, m, of the grid cells.

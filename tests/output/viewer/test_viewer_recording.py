@@ -19,9 +19,9 @@ from waiting import LIMIT
 from objslam.config import Settings
 from objslam.core.calibration import Calibration
 from objslam.core.geometry import inverse
-from objslam.core.result import Doubt, RunResult
+from objslam.core.result import Doubt, RunResult, Surface
 from objslam.core.trace import Iteration, Parameters, Round
-from objslam.core.types import Association, Images, Surface, Truth
+from objslam.core.types import Association, Images, Truth
 from objslam.output.plot.style import object_colours, ray_kinds
 from objslam.output.viewer.application import program
 from objslam.output.viewer.recording import write_recording
