@@ -20,8 +20,8 @@ from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.halves import check_halves, seen_in_both
-from objslam.mapping.checks.mixture import find_mixture
+from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
+from objslam.mapping.checks.parts.mixture import find_mixture
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, seen_something
 

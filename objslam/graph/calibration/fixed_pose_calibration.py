@@ -61,12 +61,18 @@ class PointSystem:
 
 
 def calibrate_at_poses(
-    errors: CalibratedMeasurements, association: Association, positions: Floats, theta: Floats, noise: Noise
+    errors: CalibratedMeasurements,
+    association: Association,
+    positions: Floats,
+    theta: Floats,
+    noise: Noise,
+    *,
+    trusted: bool = True,
 ) -> FixedCalibration:
     """Estimate the shared errors, starting from theta (P,). An error that the rays do not determine stays at its prior.
 
     positions: (N, 3) m, the start, NaN for an object without a position, whose rays do not count. noise: of the poses.
-    SolveError if the linear system has no single solution.
+    trusted: as in `linearise_points`. SolveError if the linear system has no single solution.
     """
     held = np.append(np.isfinite(positions[:, 0]), False)[association.object]  # Index -1 (no object) takes the last entry.
     number, owner = np.unique(association.object[held], return_inverse=True)
@@ -76,7 +82,7 @@ def calibrate_at_poses(
     keyframe = errors.rays.keyframe[held]
     prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
     for _ in range(_ROUNDS):
-        system = linearise_points(errors, theta, points, owner, held, noise)
+        system = linearise_points(errors, theta, points, owner, held, noise, trusted=trusted)
         worse = max(system.variance, _dependence(system, keyframe, prior) / system.curvature**2)
         try:
             covariance = np.asarray(np.linalg.inv(system.matrix / worse + prior), dtype=np.float64)

@@ -107,7 +107,7 @@ def bounded_part(log: Log, settings: Settings) -> Part:
         for number in range(len(starts)):
             mine = np.flatnonzero((window == number) & filled)
             kept[mine[:: max(1, -(-len(mine) * len(log.cameras) // most))]] = True
-        cameras.append(replace(one, detections=_take_frames(one, kept), rgb=None, depth=None))
+        cameras.append(replace(one, detections=take_frames(one, kept), rgb=None, depth=None))
         windows.append(window[kept])
     return Part(replace(log, cameras=tuple(cameras), truth=None), tuple(windows), drifts)
 
@@ -204,7 +204,8 @@ def _window_length(log: Log, settings: Settings) -> float:
     return float(np.clip(seconds / max(way.sum() / _WAY, angle.sum() / _TURN, 1e-9), 10.0, 120.0))
 
 
-def _take_frames(one: CameraLog, kept: Bools) -> Detections:
+def take_frames(one: CameraLog, kept: Bools) -> Detections:
+    """Return the detections of a camera in some of its frames. kept: (F,)."""
     found = one.detections
     assert found is not None
     boxes = found.take(kept[found.frame])

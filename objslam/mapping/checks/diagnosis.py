@@ -7,7 +7,6 @@ from typing import Self
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
@@ -15,14 +14,16 @@ from objslam.frontend.known_errors import coarse, estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.halves import check_halves
 from objslam.mapping.checks.hypotheses import later
-from objslam.mapping.checks.mixture import check_mixture
+from objslam.mapping.checks.parts.halves import check_halves
+from objslam.mapping.checks.parts.mixture import check_mixture
+from objslam.mapping.checks.parts.moved_camera import check_moved_camera
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.ranges import check_ranges
 from objslam.mapping.checks.small_errors import SmallErrors, find_small_errors, with_clock
 from objslam.mapping.checks.stamps import check_stamps
 from objslam.mapping.checks.trials import Trial, crooked, try_hypotheses, verdict
+from objslam.mapping.checks.usual_errors import without_usual_errors
 from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
@@ -39,19 +40,9 @@ _CROWD = 5.0
 """The crowd (`Part.crowd`) above which rays meet anywhere and show nothing. A larger value takes longer."""
 _FEWEST = 60
 """The fewest boxes of a log that are judged by their agreement. Fewer boxes agree by chance."""
-_MOVED = 0.05
-"""If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
-less often."""
-_MOVED_BY_ODOMETRY = 0.1
-"""`_MOVED` for poses by odometry. Their drift looks like a rotation."""
-_MOVED_SIGMAS = 6.0
-"""The least difference of a camera's rotation between the halves, in standard deviations. A larger number warns less
-often."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
 """The clock offsets (s) that are tried besides 0. The search for small errors starts from the one that fits best. More
 offsets take longer."""
-_GAIN_MOVED = 0.03
-"""The least growth of the score if each half has its own camera rotation. A larger value reports fewer moved cameras."""
 _GAIN = 0.02
 """The least growth of the score by a clock offset of `_CLOCKS`, and by the removal of the errors that the run does not
 estimate. A larger value reports fewer errors."""
@@ -130,8 +121,7 @@ def diagnose(
     if impossible:  # Boxes at such poses agree with anything by chance.
         return Diagnosis(tuple(findings), tuple(trials))
     if found is not None and part.boxes >= _FEWEST:
-        mixed = check_mixture(found, part)
-        findings += [mixed] if mixed else _halves(part, found, settings)
+        findings += _parts_differ(part, found, settings)
         if not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
             if errors is not None:
@@ -197,62 +187,20 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
     return errors if after is not None and after.score > least + _GAIN else None
 
 
-def _halves(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
-    """Return findings if one half of the log fits worse than the other, or if a camera was turned between the halves."""
+def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
+    """Return findings if the boxes of some frames, or of one half, fit worse than the others, or if a camera was turned."""
     middle = float(np.median(found.keyframes.stamps))
     late = found.keyframes.stamps[found.rays.keyframe] > middle
-    if min(late.sum(), (~late).sum()) < _FEWEST:
-        return []
-    differ = check_halves(late, found.point >= 0)
-    if differ is not None:
-        return [differ]
-    windows: tuple[Ints, ...] = tuple(
-        window + (window.max(initial=0) + 1) * (one.detections.frame_stamps > middle)
-        if one.detections is not None
-        else window
-        for one, window in zip(part.log.cameras, part.window, strict=True)
-    )
-    apart = agreement(part, part.log, settings, windows)
-    if apart is None:
-        return []
-    return _turned_cameras(part, apart, middle, windows, settings)
+    long = bool(min(late.sum(), (~late).sum()) >= _FEWEST)
 
+    def differ(at: Agreement) -> Finding | None:
+        late = at.keyframes.stamps[at.rays.keyframe] > middle
+        return check_mixture(at, part) or (check_halves(late, at.point >= 0) if long else None)
 
-def _turned_cameras(
-    part: Part, apart: Agreement, middle: float, windows: tuple[Ints, ...], settings: Settings
-) -> list[Finding]:
-    late = apart.keyframes.stamps[apart.rays.keyframe] > middle
-    noise = pose_noise(part, settings)
-    halves, gain = [], 0.0
-    for mask in (~late, late):
-        own = replace(apart, point=np.where(mask, apart.point, -1))
-        half = find_small_errors(part.log, own, settings, noise, ("yaw", "tilt", "roll"))
-        halves.append(half)
-        after = None if half is None else agreement(part, half.corrected(part.log), settings, windows)
-        if after is not None:
-            gain += (
-                after.fit[(after.keyframes.stamps[after.rays.keyframe] > middle) == mask[-1]].sum() - apart.fit[mask].sum()
-            )
-    if gain < _GAIN_MOVED * apart.boxes:
-        return []
-    results = []
-    names = sorted({name for half in halves if half is not None for name in half.names})
-    least = _MOVED_BY_ODOMETRY if part.drifts else _MOVED
-    for name in names:
-        values, variance = [], 0.0
-        for half in halves:
-            known = half is not None and name in half.names
-            at = half.names.index(name) if half is not None and known else 0
-            values.append(float(half.values[at]) if half is not None and known else 0.0)
-            variance += float(half.sigma[at]) ** 2 if half is not None and known else 0.0
-        change = values[1] - values[0]
-        if abs(change) > max(least, _MOVED_SIGMAS * float(np.sqrt(variance))):
-            results.append(
-                Finding(
-                    "camera moved",
-                    f"{name} changes by {np.degrees(change):.1f} deg between the halves of the log: "
-                    "somebody moved the camera on the robot",
-                    basis="halves",
-                )
-            )
-    return results
+    one = differ(found)
+    if one is not None and not part.drifts:
+        # The robot does not turn equally fast in all frames. So a clock, too, lets the boxes of some frames fit badly.
+        one = differ(without_usual_errors(part, found, settings)[0])
+    if one is not None:
+        return [one]
+    return check_moved_camera(part, middle, settings) if long else []

@@ -3,7 +3,7 @@
 The points of an `Agreement` move with the errors. Errors are added one by one. The error that explains most comes first.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,10 +101,12 @@ class SmallErrors:
         return "; ".join(dict.fromkeys(CAUSES[kind(name)] for name in self.harmful))
 
 
-def shared(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors:
-    """Return the examined errors, as parameters of the measurements."""
+def shared(
+    log: Log, keyframes: Keyframes, rays: Rays, settings: Settings, priors: Mapping[str, float] = _PRIORS
+) -> SharedErrors:
+    """Return the examined errors, as parameters of the measurements. priors: standard deviations (s, rad, share, m)."""
     fixed = dict.fromkeys(("scale", "turn_scale", "turn_bias", "range_scale", "tag_scale"), 0.0)
-    of = settings.calibration.model_copy(update={**_PRIORS, **fixed, "use": True, "file": None})
+    of = settings.calibration.model_copy(update={**priors, **fixed, "use": True, "file": None})
     wide = settings.model_copy(update={"calibration": of, "mode": "joint"})
     found = shared_errors(log, keyframes, rays, wide)
     assert found is not None  # Every log has a camera, and every camera has a clock.

@@ -1,0 +1,121 @@
+"""Detect that somebody turned a camera on the robot in the middle of a log.
+
+All other errors of a camera are the same in both halves: its clock, its place, its lens, and the rotation that it had at
+first. They are estimated together with the turn. Otherwise they look like one: a late clock moves all rays to one side while
+the robot turns left, and to the other side while it turns right.
+"""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import Calibration, kind
+from objslam.core.types import CameraLog
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.checks.agreement import Part, agreement, take_frames
+from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.usual_errors import without_usual_errors
+
+_AXES = ("yaw", "tilt", "roll")
+_LATER = ", second half"  # What the name of a camera of the second half ends with.
+_TURN = 0.2
+"""The prior standard deviation (rad) of a turn. With a larger value, larger turns are found."""
+_SAME = 1e-3
+"""The prior standard deviation of the change of all other errors, as a share of their own. It is not 0, because a prior has
+an inverse. A larger value lets the other errors change too."""
+_MOVED = 0.05
+"""If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
+less often."""
+_SIGMAS = 5.0
+"""The least difference of a camera's rotation between the halves, in standard deviations. A larger number warns less
+often."""
+_SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
+"""The least difference, as a multiple of `_MOVED` and in standard deviations, for another round. At first, only the
+rays fit that show a small difference. Larger values take less time, and find fewer turns."""
+_MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
+"""`_MOVED` for poses by odometry, and the least growth of the score (`Agreement.score`) by a turn. Drift looks like a
+rotation, and is not in the standard deviations. Larger values warn less often."""
+
+
+def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Finding]:
+    """Return a finding for each rotation of a camera that differs between the halves of a log.
+
+    middle: s, the stamp that ends the first half.
+    """
+    halves = _halves(part, middle)
+    start = agreement(halves, halves.log, settings)
+    if start is None:
+        return []
+    least, gain = (_MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY) if part.drifts else (_MOVED, 0.0)
+
+    def suspect(found: Calibration) -> bool:
+        return bool(_turns(found, _SUSPECT * least, _SUSPECT_SIGMAS))
+
+    apart, turned = without_usual_errors(halves, start, settings, partial(_prior, turn=_TURN), suspect)
+    turns = {} if turned is None else _turns(turned, least, _SIGMAS)
+    if not turns:
+        return []
+    same, _ = without_usual_errors(halves, start, settings, partial(_prior, turn=0.0))
+    if apart.score <= same.score + gain:
+        return []
+    return [
+        Finding(
+            "camera moved",
+            f"{name} changes by {np.degrees(change):.1f} deg between the halves of the log: "
+            "somebody moved the camera on the robot",
+            basis="halves",
+        )
+        for name, change in turns.items()
+    ]
+
+
+def _halves(part: Part, middle: float) -> Part:
+    """Return the part with two cameras for each one: that of the first half, and that of the second half.
+
+    The halves have windows of their own, and so points of their own.
+    """
+    cameras: list[CameraLog] = []
+    windows: list[Ints] = []
+    for one, window in zip(part.log.cameras, part.window, strict=True):
+        stamps = np.zeros(0) if one.detections is None else one.detections.frame_stamps
+        for late in (False, True):
+            mine = (stamps > middle) == late
+            camera = replace(one.camera, name=one.camera.name + late * _LATER)
+            cameras.append(replace(one, camera=camera, detections=take_frames(one, mine) if len(stamps) else None))
+            windows.append(window[mine] + late * (window.max(initial=0) + 1))
+    return replace(part, log=replace(part.log, cameras=tuple(cameras)), window=tuple(windows))
+
+
+def _prior(errors: SharedErrors, turn: float) -> Floats:
+    """Return a prior covariance (P, P) that lets only the rotations of a camera differ between the halves.
+
+    turn: rad, the standard deviation of this difference. With 0, nothing differs.
+    """
+    sigma = np.sqrt(np.diagonal(errors.prior))
+    prior = np.diag(sigma**2)
+    for i, j in _pairs(errors.names):
+        change = turn if turn and kind(errors.names[i]) in _AXES else _SAME * sigma[i]
+        prior[i, j] = prior[j, i] = sigma[i] ** 2
+        prior[j, j] = sigma[i] ** 2 + change**2
+    return prior
+
+
+def _pairs(names: tuple[str, ...]) -> list[tuple[int, int]]:
+    """Return the indices of each error of a first half, and of the same error of the second half."""
+    split = [name.rpartition(".") for name in names]
+    pairs = [(i, f"{camera}{_LATER}.{what}") for i, (camera, _, what) in enumerate(split)]
+    return [(i, names.index(later)) for i, later in pairs if later in names]
+
+
+def _turns(found: Calibration, least: float, sigmas: float) -> dict[str, float]:
+    """Return the turns (rad) between the halves that are larger than `least` and than a number of standard deviations."""
+    turns = {}
+    for i, j in _pairs(found.names):
+        change, of = float(found.values[j] - found.values[i]), found.covariance
+        sigma = float(np.sqrt(max(of[i, i] + of[j, j] - 2 * of[i, j], 0.0)))
+        if kind(found.names[i]) in _AXES and abs(change) > max(least, sigmas * sigma):
+            turns[found.names[i]] = change
+    return turns
