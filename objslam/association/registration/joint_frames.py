@@ -173,7 +173,7 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
     poses[:, 2, 3] = x[:, 2]
     covariance = own + correlated @ np.swapaxes(correlated, 1, 2)
     known = 4 + errors.shape[1] - np.diagonal(spread, axis1=1, axis2=2)[:, 4:].sum(axis=1)
-    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 * (np.arange(len(x)) == 0)
+    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 / len(x)  # One frame is free to choose. No map is special in that.
     found = JointFrames(poses, spread[:, :4, :4], positions, covariance, own, correlated, weight, noise)
     return _State(found, errors, taken)
 
