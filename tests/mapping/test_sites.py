@@ -219,7 +219,7 @@ def test_sessions_in_any_order_give_one_site():
         again = other.objects.positions @ pose[:3, :3].T + pose[:3, 3]
         for _, at in place.truth.values():
             here = there(site.objects, at).position
-            assert np.linalg.norm(again - here, axis=1).min() < 1e-6
+            assert np.linalg.norm(again - here, axis=1).min() < 1e-5
 
 
 def test_a_session_costs_one_registration(monkeypatch):

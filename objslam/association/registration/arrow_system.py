@@ -81,14 +81,18 @@ class ArrowSystem:
         ridge = _RIDGE * np.trace(self.maps, axis1=1, axis2=2).sum()
         back = np.linalg.inv(self.maps + ridge * np.eye(self.maps.shape[1]))
         count = len(self.objects)
-        system = np.zeros((count, 3, count, 3))
-        system[np.arange(count), :, np.arange(count), :] = self.objects
+        system = np.zeros((3 * count, 3 * count))
+        system.reshape(count, 3, count, 3)[np.arange(count), :, np.arange(count), :] = self.objects
         for s in range(len(self.maps)):
-            mine = np.flatnonzero(self.map == s)
-            at, pull = self.object[mine], self.pull[mine].reshape(3 * len(mine), self.maps.shape[1])
-            less = (pull @ back[s] @ pull.T).reshape(len(mine), 3, len(mine), 3)
-            system[at[:, None], :, at[None, :], :] -= less.swapaxes(1, 2)
-        return system.reshape(3 * count, 3 * count), back
+            at, pull = self._rows(s)
+            system[np.ix_(at, at)] -= pull @ back[s] @ pull.T
+        return system, back
+
+    def _rows(self, s: int) -> tuple[Ints, Floats]:
+        """Return the coordinates (3 n,) of the n objects that map `s` measured, and their blocks (3 n, w) with the map."""
+        mine = np.flatnonzero(self.map == s)
+        at = (3 * self.object[mine, None] + np.arange(3)).reshape(-1)
+        return at, self.pull[mine].reshape(len(at), self.maps.shape[1])
 
     def _to_objects(self, of_maps: Floats) -> Floats:
         """Return the products (3 N,) of the blocks between objects and maps with a vector (S, w) of the maps."""
@@ -117,13 +121,12 @@ class ArrowSystem:
         joint = _inverse(system)
         if not np.isfinite(joint).all():
             return np.zeros((count, 3, 0)), np.full((maps, width, width), np.nan)
-        between = joint.reshape(count, 3, count, 3).copy()
         blocks = back.copy()
         for s in range(maps):
-            mine = np.flatnonzero(self.map == s)
-            at, reach = self.object[mine], (self.pull[mine] @ back[s]).reshape(-1, width)
-            part = between[at[:, None], :, at[None, :], :].swapaxes(1, 2).reshape(len(reach), len(reach))
-            blocks[s] += reach.T @ part @ reach
+            at, pull = self._rows(s)
+            reach = pull @ back[s]
+            blocks[s] += reach.T @ joint[np.ix_(at, at)] @ reach
+        between = joint.reshape(count, 3, count, 3).copy()
         between[np.arange(count), :, np.arange(count), :] -= own
         size, axes = np.linalg.eigh(between.reshape(3 * count, 3 * count))
         good = size > 0
