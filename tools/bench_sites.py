@@ -2,12 +2,12 @@
 
     python tools/bench_sites.py [--sessions 5 10 20 30 40] [--parts growth orders wrong query] [--folders A B ...]
 
-`growth`: simulated sessions of one hall of 40 objects, in frames of their own. The map of each is shifted and turned as a
-whole, has a size of its own, and each object has an error of its own. Robots overlook objects and report phantoms. The times
-are CPU times. The exponent says how they grow with the number of sessions. `add` is the time of the last session alone,
-which joins the site of all others. RMSE and the share of objects inside their 95 % ellipsoids are after alignment in shift
-and yaw. `alone` is the median RMSE of the sessions. `known` is the RMSE of one least-squares problem with the true matches,
-without robust losses, so it is what the errors themselves allow.
+`growth`: simulated sessions of a hall of 40 objects, in frames of their own. The rows are means over three halls. The map of
+each session is shifted and turned as a whole, has a size of its own, and each object has an error of its own. Robots
+overlook objects and report phantoms. The times are CPU times. The exponent says how they grow with the number of sessions.
+`add` is the time of the last session alone, which joins the site of all others. RMSE and the share of objects inside their
+95 % ellipsoids are after alignment in shift and yaw. `alone` is the median RMSE of the sessions. `known` is the RMSE of one
+least-squares problem with the true matches, without robust losses, so it is what the errors themselves allow.
 `orders`: how far the objects are apart if the same sessions come in another order.
 `wrong`: sessions of other places among those of the hall: how many join it, and how far they move its objects. Then one
 session that has eight objects arranged as in the hall.
@@ -71,18 +71,22 @@ def truth_of(place: Place) -> Floats:
     return np.array([at for _, at in place.truth.values()])
 
 
+def score(positions: Floats, covariances: Floats, truth: Floats) -> tuple[float, float]:
+    """Return the RMSE (m) and the share inside 95 % of objects whose true positions are known, after alignment."""
+    pose = align(positions, truth, "se2")[0]
+    off = positions @ pose[:3, :3].T + pose[:3, 3] - truth
+    spread = pose[:3, :3] @ covariances @ pose[:3, :3].T
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
+    return float(np.sqrt((off**2).sum(axis=1).mean())), float((squared < INSIDE).mean())
+
+
 def compare(objects: ObjectMap, truth: Floats, start: Floats) -> tuple[float, float, int]:
     """Return RMSE (m), the share inside 95 %, and how many true objects the map has. start: (4, 4) place_T_map, about."""
     at = objects.positions @ start[:3, :3].T + start[:3, 3]
     apart = np.linalg.norm(at[:, None] - truth, axis=2)
-    near = apart.argmin(axis=0)
     there = apart.min(axis=0) < 0.7
-    index = near[there]
-    pose = align(objects.positions[index], truth[there], "se2")[0]
-    off = objects.positions[index] @ pose[:3, :3].T + pose[:3, 3] - truth[there]
-    spread = pose[:3, :3] @ objects.covariances[index] @ pose[:3, :3].T
-    squared = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[..., None])[..., 0])
-    return float(np.sqrt((off**2).sum(axis=1).mean())), float((squared < INSIDE).mean()), int(there.sum())
+    index = apart.argmin(axis=0)[there]
+    return *score(objects.positions[index], objects.covariances[index], truth[there]), int(there.sum())
 
 
 def rmse_of_known_matches(days: list[Drive], truth: Floats) -> float:
@@ -120,24 +124,27 @@ def timed(sessions: list[Session]) -> tuple[tuple[Island, ...], float]:
     return islands, time.process_time() - begin
 
 
-def growth(counts: list[int]) -> None:
-    """Merge more and more sessions."""
+def growth(counts: list[int], places: int = 3) -> None:
+    """Merge more and more sessions. Each row is the mean over some places, that of squares for the RMSE."""
     print("sessions  islands  objects  RMSE m  inside 95 %  alone m  known m  seconds  add s")
     seconds = []
     for count in counts:
-        place = Place(np.random.default_rng(count), count=40)
-        days, truth = [drive(place, day) for day in range(count)], truth_of(place)
-        islands, took = timed([one.day for one in days])
+        rows = []
+        for number in range(places):
+            place = Place(np.random.default_rng(100 * number + count), count=40)
+            days, truth = [drive(place, day) for day in range(count)], truth_of(place)
+            islands, took = timed([one.day for one in days])
+            island = islands[0]
+            rmse, inside, there = compare(island.objects, truth, days[island.sessions[0]].own)
+            alone = float(np.median([compare(one.day.objects, truth, one.own)[0] for one in days]))
+            site = Day("site", merge_sessions([one.day for one in days[:-1]])[0].objects)
+            _, add = timed([site, days[-1].day])
+            rows.append((len(islands), there, rmse**2, inside, alone, rmse_of_known_matches(days, truth) ** 2, took, add))
+        islands_, there_, squared, inside, alone, known, took, add = np.mean(rows, axis=0)
         seconds.append(took)
-        island = islands[0]
-        rmse, inside, there = compare(island.objects, truth, days[island.sessions[0]].own)
-        alone = float(np.median([compare(one.day.objects, truth, one.own)[0] for one in days]))
-        site = Day("site", merge_sessions([one.day for one in days[:-1]])[0].objects)
-        _, add = timed([site, days[-1].day])
-        known = rmse_of_known_matches(days, truth)
         print(
-            f"{count:8d}  {len(islands):7d}  {there:3d} / {len(truth)}  {rmse:6.4f}  {inside:11.2f}  {alone:7.4f}"
-            f"  {known:7.4f}  {took:7.2f}  {add:5.2f}",
+            f"{count:8d}  {islands_:7.2f}  {there_:7.2f}  {np.sqrt(squared):6.4f}  {inside:11.2f}  {alone:7.4f}"
+            f"  {np.sqrt(known):7.4f}  {took:7.2f}  {add:5.2f}",
             flush=True,
         )
     if len(counts) > 1:
@@ -218,11 +225,11 @@ def folders(paths: list[Path]) -> None:
     known = {o.label: o.position for o in truth.objects}
     islands, took = timed(sessions)
     for name, objects in [*((s.name, s.objects) for s in sessions), *(("site", one.objects) for one in islands)]:
-        some = [o for o in objects if o.label in known and o.covariance is not None]
-        kept, at = ObjectMap(tuple(some)), np.array([known[o.label] for o in some])
-        rmse, inside, there = compare(kept, at, align(kept.positions, at, "se2")[0])
-        size = align(kept.positions, at, "sim2")[1]
-        print(f"{name}: {there} of {len(known)} objects, RMSE {rmse:.4f} m, inside 95 % {inside:.2f}, size {1 / size:.4f}")
+        some = ObjectMap(tuple(o for o in objects if o.label in known and o.covariance is not None))
+        at = np.array([known[o.label] for o in some])
+        rmse, inside = score(some.positions, some.covariances, at)
+        size = 1 / align(some.positions, at, "sim2")[1]
+        print(f"{name}: {len(some)} of {len(known)} objects, RMSE {rmse:.4f} m, inside 95 % {inside:.2f}, size {size:.4f}")
     print(f"{len(islands)} islands in {took:.2f} s")
 
 
