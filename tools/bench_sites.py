@@ -82,11 +82,14 @@ def score(positions: Floats, covariances: Floats, truth: Floats) -> tuple[float,
 
 def compare(objects: ObjectMap, truth: Floats, start: Floats) -> tuple[float, float, int]:
     """Return RMSE (m), the share inside 95 %, and how many true objects the map has. start: (4, 4) place_T_map, about."""
-    at = objects.positions @ start[:3, :3].T + start[:3, 3]
-    apart = np.linalg.norm(at[:, None] - truth, axis=2)
-    there = apart.min(axis=0) < 0.7
-    index = apart.argmin(axis=0)[there]
-    return *score(objects.positions[index], objects.covariances[index], truth[there]), int(there.sum())
+    pose = start
+    for _ in range(3):  # The first session gives the frame, with its errors. So the start is not exact.
+        at = objects.positions @ pose[:3, :3].T + pose[:3, 3]
+        apart = np.linalg.norm(at[:, None] - truth, axis=2)
+        index, there = apart.argmin(axis=0), apart.min(axis=0) < 0.7
+        pose = align(objects.positions[index[there]], truth[there], "se2")[0]
+    kept = index[there]
+    return *score(objects.positions[kept], objects.covariances[kept], truth[there]), int(there.sum())
 
 
 def rmse_of_known_matches(days: list[Drive], truth: Floats) -> float:
