@@ -21,7 +21,7 @@ from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
 from objslam.mapping.sites.covariances import Row, measured_objects, site_covariances
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
-from objslam.mapping.sites.placement import Part, mean_labels, place_sessions
+from objslam.mapping.sites.placement import Part, mean_labels, place_sessions, sessions_behind
 from objslam.mapping.sites.session import Session
 
 _YOUNG = 2
@@ -212,7 +212,7 @@ def _objects(
             id=number,
             position=solved.positions[at],
             covariance=covariance[at],
-            labels=mean_labels([o for _, _, o in of], [1 if o.life is None else o.life.sessions_seen for _, _, o in of]),
+            labels=mean_labels([o for _, _, o in of], [sessions_behind(o) for _, _, o in of]),
             body=_surest_body(solved, of),
             ray_point=None,
             first_seen=min(o.first_seen for _, _, o in of),

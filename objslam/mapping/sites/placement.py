@@ -89,7 +89,8 @@ def _joined(a: Part, b: Part, a_T_b: Floats, log_odds: float) -> Part:
         present[at] |= k < len(b.objects.objects)
     items = [*ours, *(o for k, o in enumerate(theirs) if k not in match)]
     for k, at in match.items():
-        items[at] = _with_labels_of(items[at], theirs[k], (len(a.tracks[at]), len(b.tracks[k])))
+        often = [sum(sessions_behind(o) for _, o in seen) for seen in (a.tracks[at], b.tracks[k])]
+        items[at] = _with_labels_of(items[at], theirs[k], often)
     items = [
         replace(o, position=position, covariance=covariance, life=None)
         for o, position, covariance in zip(items, solved.positions, solved.covariance, strict=True)
@@ -114,10 +115,15 @@ def _pairs(ours: list[MapObject], theirs: list[MapObject], a_T_b: Floats) -> lis
     return [(k, i) for i, k in same_objects(ours, theirs, a.positions, a.covariances, positions, spread).tolist()]
 
 
-def _with_labels_of(ours: MapObject, theirs: MapObject, often: tuple[int, int]) -> MapObject:
+def _with_labels_of(ours: MapObject, theirs: MapObject, often: Sequence[int]) -> MapObject:
     """Return `ours` with the mean label shares of both, and the label that they tell. often: how many sessions saw each."""
     shares = mean_labels([ours, theirs], often)
     return ours if shares is None else replace(ours, labels=shares, label=next(iter(shares)))
+
+
+def sessions_behind(item: MapObject) -> int:
+    """Return how many sessions an object stands for: those that saw it if it is of a site, else one."""
+    return 1 if item.life is None else item.life.sessions_seen
 
 
 def mean_labels(items: Sequence[MapObject], often: Sequence[int]) -> dict[str, float] | None:
