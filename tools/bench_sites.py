@@ -1,9 +1,10 @@
 """Measure the merge of many sessions of one place, and spatial queries in a large map.
 
-    python tools/bench_sites.py [--sessions 5 10 20 30 40] [--parts growth orders wrong query] [--folders A B ...]
+    python tools/bench_sites.py [--sessions 5 10 20 30 40] [--halls 3] [--parts growth orders wrong query]
+    python tools/bench_sites.py --folders A B ...
 
-`growth`: simulated sessions of a hall of 40 objects, in frames of their own. The rows are means over three halls. The map of
-each session is shifted and turned as a whole, has a size of its own, and each object has an error of its own. Robots
+`growth`: simulated sessions of a hall of 40 objects, in frames of their own. The rows are means over `--halls` halls. The
+map of each session is shifted and turned as a whole, has a size of its own, and each object has an error of its own. Robots
 overlook objects and report phantoms. The times are CPU times. The exponent says how they grow with the number of sessions.
 `add` is the time of the last session alone, which joins the site of all others. RMSE and the share of objects inside their
 95 % ellipsoids are after alignment in shift and yaw. `alone` is the median RMSE of the sessions. `known` is the RMSE of one
@@ -127,13 +128,13 @@ def timed(sessions: list[Session]) -> tuple[tuple[Island, ...], float]:
     return islands, time.process_time() - begin
 
 
-def growth(counts: list[int], places: int = 3) -> None:
-    """Merge more and more sessions. Each row is the mean over some places, that of squares for the RMSE."""
+def growth(counts: list[int], halls: int) -> None:
+    """Merge more and more sessions. Each row is the mean over some halls, that of squares for the RMSE."""
     print("sessions  islands  objects  RMSE m  inside 95 %  alone m  known m  seconds  add s")
     seconds = []
     for count in counts:
         rows = []
-        for number in range(places):
+        for number in range(halls):
             place = Place(np.random.default_rng(100 * number + count), count=40)
             days, truth = [drive(place, day) for day in range(count)], truth_of(place)
             islands, took = timed([one.day for one in days])
@@ -154,7 +155,7 @@ def growth(counts: list[int], places: int = 3) -> None:
         print(f"exponent {np.polyfit(np.log(counts), np.log(seconds), 1)[0]:.2f}")
 
 
-def orders(counts: list[int]) -> None:
+def orders(counts: list[int], halls: int) -> None:
     """Merge the same sessions in other orders."""
     place, count = Place(np.random.default_rng(1), count=40), min(10, max(counts))
     days = [drive(place, day).day for day in range(count)]
@@ -169,7 +170,7 @@ def orders(counts: list[int]) -> None:
     print(f"{count} sessions in 3 other orders: objects at most {worst * 1000:.6f} mm apart")
 
 
-def wrong(counts: list[int]) -> None:
+def wrong(counts: list[int], halls: int) -> None:
     """Merge sessions of other places with those of one place, and a session of a place that looks alike."""
     rng, count = np.random.default_rng(2), min(10, max(counts))
     place = Place(rng, count=40)
@@ -195,7 +196,7 @@ def wrong(counts: list[int]) -> None:
     )
 
 
-def query(count: int = 1_000_000, asked: int = 200) -> None:
+def query(counts: list[int], halls: int, count: int = 1_000_000, asked: int = 200) -> None:
     """Ask a map of a million objects, one on each square metre of a square."""
     rng = np.random.default_rng(4)
     points, spread = np.column_stack([rng.uniform(0, np.sqrt(count), (count, 2)), rng.uniform(0, 2, count)]), np.eye(3)
@@ -236,11 +237,12 @@ def folders(paths: list[Path]) -> None:
     print(f"{len(islands)} islands in {took:.2f} s")
 
 
-PARTS = {"growth": growth, "orders": orders, "wrong": wrong, "query": lambda counts: query()}
+PARTS = {"growth": growth, "orders": orders, "wrong": wrong, "query": query}
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, nargs="+", default=[5, 10, 20, 30, 40])
+    parser.add_argument("--halls", type=int, default=3)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--folders", type=Path, nargs="+", default=[])
     given = parser.parse_args()
@@ -248,4 +250,4 @@ if __name__ == "__main__":
         folders(given.folders)
     else:
         for part in given.parts:
-            PARTS[part](given.sessions)
+            PARTS[part](given.sessions, given.halls)
