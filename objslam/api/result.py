@@ -52,7 +52,7 @@ class Result:
 
         stamps, first = np.unique(result.keyframes.stamps, return_index=True)
         return cls(
-            ObjectMap(**vars(result.map)),
+            ObjectMap.of(result.map),
             Trajectory(stamps, result.map_T_base[first]),
             Trajectory(result.path_after.stamps, result.path_after.poses),
             rays_table(result),

@@ -82,7 +82,7 @@ class Session(LiveSession):
         """Return the present map, path and counts, usually in milliseconds. It is the last snapshot if the session has
         stopped or is busy for 5 s."""
         found = super().snapshot()
-        return replace(found, map=ObjectMap(**vars(found.map)))
+        return replace(found, map=ObjectMap.of(found.map))
 
     def result(self) -> Result:
         """End the session, solve the whole map once more, and return the result. SolveError if no box could be mapped."""

@@ -30,7 +30,7 @@ def merge(sessions: Sequence[Given]) -> tuple[Island, ...]:
     if not sessions:
         raise ValueError("merge needs at least one session")
     found = merge_sessions([_session(one, f"session {number}") for number, one in enumerate(sessions)])
-    return tuple(replace(one, objects=ObjectMap(**vars(one.objects))) for one in found)
+    return tuple(replace(one, objects=ObjectMap.of(one.objects)) for one in found)
 
 
 def diff(a: Given, b: Given) -> Comparison:

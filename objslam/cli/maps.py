@@ -49,8 +49,9 @@ def merge_results(
 ) -> None:
     """Join the maps of several sessions to one map of the site, with the life of each object.
 
-    Give the sessions in the order of time. The first one gives the frame. Sessions that share no objects stay apart, each
-    group in a folder of its own.
+    Give the sessions in the order of time. The first one gives the frame. Each session is registered to the map of the
+    others, so the time grows with their number. Sessions that share no objects stay apart, each group in a folder of its
+    own. To add a session later, give the site and the new result.
     """
     from objslam.api.sites import load_session, warnings_of
     from objslam.mapping.sites.merge import merge_sessions

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Literal, Self, overload
 
 import numpy as np
@@ -14,6 +15,7 @@ from objslam.core.arrays import Bools, Floats, Floats32
 from objslam.core.bodies.body import Body, surer_body
 from objslam.core.bodies.body_entry import BODY_COLUMNS, body_row
 from objslam.core.bodies.tag_pose import TAG_COLUMNS, TagPose, tag_row
+from objslam.core.maps.spatial_index import SpatialIndex, corners_of, place_of
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
@@ -156,15 +158,21 @@ def _life_row(life: Life | None) -> tuple[str | float | None, ...]:
 class ObjectMap:
     """The objects of one map, in the coordinate frame that `frame` names.
 
-    A map is a sequence of its objects. Spatial queries return resolved objects only. A point is x, y, z in m, or x, y to
-    ignore heights. gone: objects of earlier sessions that are no longer there. shared_covariance: (7, 7) of the error that
-    all objects share (`core.maps.shared_covariance`). The covariances of the objects contain it. None if it is not known.
+    A map is a sequence of its objects. Spatial queries return resolved objects only. The first query makes an index, and the
+    next ones are quick in large maps too. A point is x, y, z in m, or x, y to ignore heights. gone: objects of earlier
+    sessions that are no longer there. shared_covariance: (7, 7) of the error that all objects share
+    (`core.maps.shared_covariance`). The covariances of the objects contain it. None if it is not known.
     """
 
     objects: tuple[MapObject, ...]
     frame: str = "map"
     gone: tuple[MapObject, ...] = ()
     shared_covariance: Floats | None = None
+
+    @classmethod
+    def of(cls, other: ObjectMap) -> Self:
+        """Return the same map as an object of this class."""
+        return cls(**{field.name: getattr(other, field.name) for field in fields(ObjectMap)})
 
     def __len__(self) -> int:
         return len(self.objects)
@@ -211,20 +219,20 @@ class ObjectMap:
 
     def nearest(self, point: ArrayLike, label: str | None = None) -> MapObject | None:
         """Return the nearest object to a point, among those with `label` or among all. None if there is no such object."""
-        return next((o for _, o in self._by_distance(point, label)), None)
+        objects, index = self._placed(label)
+        found = index.nearest(place_of(point))
+        return None if found is None else objects[found]
 
     def in_radius(self, point: ArrayLike, radius: float, label: str | None = None) -> tuple[MapObject, ...]:
         """Return the objects at most `radius` m from a point, the nearest first."""
-        return tuple(o for distance, o in self._by_distance(point, label) if distance <= radius)
+        objects, index = self._placed(label)
+        return tuple(objects[i] for i in index.within(place_of(point), radius).tolist())
 
     def in_box(self, low: ArrayLike, high: ArrayLike, label: str | None = None) -> tuple[MapObject, ...]:
         """Return the objects inside or on the box with sides along the axes and the opposite corners `low` and `high`."""
-        lower, upper = _point(low), _point(high)
-        if lower.shape != upper.shape:
-            raise ValueError("both corners must have two coordinates, or both three")
-        objects, positions = self._placed(label)
-        inside = ((positions[:, : len(lower)] >= lower) & (positions[:, : len(lower)] <= upper)).all(axis=1)
-        return tuple(objects[i] for i in np.flatnonzero(inside))
+        corners = corners_of(low, high)
+        objects, index = self._placed(label)
+        return tuple(objects[i] for i in index.inside(*corners).tolist())
 
     def search(self, vector: ArrayLike, k: int = 5) -> tuple[tuple[MapObject, float], ...]:
         """Return the k objects that look most like an appearance vector (D,), and their cosines to it, the largest first.
@@ -253,22 +261,17 @@ class ObjectMap:
         both = (*objects, *(replace(o, id=number + k) for k, o in enumerate(rest)))
         return replace(self, objects=both, shared_covariance=None)
 
-    def _placed(self, label: str | None) -> tuple[list[MapObject], Floats]:
-        objects = [o for o in self.resolved() if label in (None, o.label)]
-        return objects, np.array([o.position for o in objects], dtype=np.float64).reshape(-1, 3)
+    def _placed(self, label: str | None) -> tuple[tuple[MapObject, ...], SpatialIndex]:
+        """Return the resolved objects with a label, and the index of their positions, made by the first query."""
+        if label not in self._indices:
+            objects = tuple(o for o in self.resolved() if label in (None, o.label))
+            points = np.array([o.position for o in objects], dtype=np.float64).reshape(-1, 3)
+            self._indices[label] = objects, SpatialIndex(points)
+        return self._indices[label]
 
-    def _by_distance(self, point: ArrayLike, label: str | None) -> list[tuple[float, MapObject]]:
-        at = _point(point)
-        objects, positions = self._placed(label)
-        distance = np.linalg.norm(positions[:, : len(at)] - at, axis=1)
-        return [(float(distance[i]), objects[i]) for i in np.argsort(distance, kind="stable")]
-
-
-def _point(values: ArrayLike) -> Floats:
-    point = np.asarray(values, dtype=np.float64)
-    if point.shape not in ((2,), (3,)) or np.isnan(point).any():
-        raise ValueError(f"a point is x, y or x, y, z in metres, got {values!r}")
-    return point
+    @cached_property
+    def _indices(self) -> dict[str | None, tuple[tuple[MapObject, ...], SpatialIndex]]:
+        return {}
 
 
 def _same_objects(ours: tuple[MapObject, ...], theirs: tuple[MapObject, ...]) -> list[tuple[int, int]]:

@@ -13,8 +13,7 @@ from objslam import __version__
 from objslam.fleet.keys import key_of
 
 LEAF = 4
-"""The most sessions of one group. A larger number makes fewer tasks, and each of them longer, because all pairs of sessions
-in a group are registered."""
+"""The most sessions of one group. A larger number makes fewer tasks, and each of them longer."""
 MERGES = "merges"
 """The folder of the nodes in the store."""
 

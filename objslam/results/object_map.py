@@ -25,7 +25,7 @@ class ObjectMap(object_map.ObjectMap):
         from objslam.results.read import load_map  # deferred, because it imports scipy
 
         found = read_objects(Path(path)) if Path(path).is_file() else load_map(Path(path))
-        return cls(found.objects, found.frame, found.gone, found.shared_covariance)
+        return cls.of(found)
 
     def save(self, file: str | PathLike[str]) -> None:
         """Write the map as JSON. `load` returns the same map, bit by bit. OutputError if the file cannot be written."""

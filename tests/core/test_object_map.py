@@ -55,6 +55,25 @@ def test_queries_find_what_a_loop_finds(seed: int, dimensions: int, label: str |
     assert [o.id for o in objects.in_box(low, high, label)] == boxed
 
 
+def test_queries_at_equal_distances_and_open_boxes() -> None:
+    """The first of several nearest objects counts, and a corner of a box may be at infinity."""
+    objects = ObjectMap(
+        tuple(thing(i, "cup", [x, y, i]) for i, (x, y) in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1), (3, 3)]))
+    )
+    nearest = objects.nearest([0, 0])
+    assert nearest is not None
+    assert nearest.id == 0
+    assert [o.id for o in objects.in_radius([0, 0], 1)] == [0, 1, 2, 3]
+    assert [o.id for o in objects.in_radius([0, 0], np.inf)] == [0, 1, 2, 3, 4]
+    assert objects.in_radius([0, 0], -1) == ()
+    assert [o.id for o in objects.in_box([-np.inf, 0, -np.inf], [np.inf, np.inf, 3])] == [0, 1, 2]
+    assert [o.id for o in objects.in_box([0, 1], [0, 1])] == [1]
+    assert objects.in_box([1, 1], [0, 0]) == ()
+    assert replace(objects, objects=objects.objects[4:]).nearest([0, 0]) == objects[4]  # A new map has an index of its own.
+    with pytest.raises(ValueError, match="finite"):
+        objects.nearest([np.inf, 0])
+
+
 @pytest.mark.parametrize("point", [[1.0], [1, 2, 3, 4], [np.nan, 0], "door"])
 def test_points_that_are_none(point: object) -> None:
     with pytest.raises(ValueError):

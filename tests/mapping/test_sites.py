@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mapping.site_days import DAY, Day, Place, session
+from scipy.optimize import least_squares
 
-from objslam.core.geometry import align, inverse
+from objslam.association.registration.object_maps import register
+from objslam.core.geometry import align, inverse, lift_se2
 from objslam.core.maps.shared_covariance import jacobian
 from objslam.core.object_map import ObjectMap
 from objslam.mapping.sites.compare import compare
@@ -204,3 +206,99 @@ def test_a_site_takes_the_size_of_the_session_that_knows_it():
         for o in island.objects:
             part = jacobian(o.position) @ island.objects.shared_covariance @ jacobian(o.position).T
             assert np.linalg.eigvalsh(o.covariance - part).min() > -1e-9
+
+
+def test_sessions_in_any_order_give_one_site():
+    """Only the frame differs, which is that of the first session."""
+    place = Place(np.random.default_rng(10), count=20)
+    days = [session(place, day)[0] for day in range(6)]
+    (site,) = merge_sessions(days)
+    for order in ([5, 4, 3, 2, 1, 0], [3, 0, 5, 1, 4, 2]):
+        (other,) = merge_sessions([days[k] for k in order])
+        pose = site.site_T_session[order[0]]
+        again = other.objects.positions @ pose[:3, :3].T + pose[:3, 3]
+        for _, at in place.truth.values():
+            here = there(site.objects, at).position
+            assert np.linalg.norm(again - here, axis=1).min() < 1e-5
+
+
+def test_a_session_costs_one_registration(monkeypatch):
+    from objslam.mapping.sites import placement
+
+    place, calls = Place(np.random.default_rng(11), count=15), []
+    days = [quiet(place, day)[0] for day in range(6)]
+    monkeypatch.setattr(placement, "register", lambda a, b: calls.append(1) or register(a, b))
+    assert len(merge_sessions(days)) == 1
+    assert len(calls) == len(days) - 1
+
+
+def test_a_bridge_joins_what_was_seen_before_it():
+    """Two sessions of the two ends of a hall share nothing. A third one saw its middle."""
+    place, days = Place(np.random.default_rng(12), count=60, size=16.0), []
+    for day, (low, high) in enumerate([(0, 7), (9, 16), (3, 13)]):
+        whole = place.truth
+        place.truth = {k: one for k, one in whole.items() if low <= one[1][0] <= high}
+        days.append(quiet(place, day))
+        place.truth = whole
+    apart = merge_sessions([day for day, _ in days[:2]])
+    assert [len(island.sessions) for island in apart] == [1, 1]
+    (island,) = merge_sessions([day for day, _ in days])
+    assert island.sessions == (0, 1, 2)
+    own = np.array([frame for _, frame in days])
+    np.testing.assert_allclose(island.site_T_session[:, :3, 3], own[:, :3, 3], atol=0.15)
+    assert np.isnan(island.log_odds).tolist() == [True, False, False]
+
+
+def test_a_session_of_a_place_that_looks_alike_does_not_bend_the_site():
+    """A session of another place has eight objects that stand to each other as eight of the site do, and is placed there."""
+    place = Place(np.random.default_rng(13), count=25)
+    days = [quiet(place, day)[0] for day in range(4)]
+    (alone,) = merge_sessions(days)
+    other, rng = Place(np.random.default_rng(14), count=20, size=40.0), np.random.default_rng(15)
+    corner = sorted(place.truth.values(), key=lambda one: float(np.hypot(*one[1][:2])))[:8]
+    for label, at in corner:
+        other.truth[100 + len(other.truth)] = (label, at + rng.normal(0, 0.03, 3))
+    (island,) = [one for one in merge_sessions([*days, quiet(other, 4)[0]]) if 0 in one.sessions]
+    assert island.sessions == (0, 1, 2, 3, 4)  # No evidence is against it: it saw eight objects where they should be.
+    moved = [there(island.objects, at).position - there(alone.objects, at).position for _, at in place.truth.values()]
+    assert np.sqrt(np.mean(np.sum(np.square(moved), axis=1))) < 0.01  # A third of the noise of one session.
+
+
+def test_a_merge_is_one_graph_of_all_measurements():
+    """Each session measures objects from several poses, in units of its own that its robot knows to 0.4 %. One least-squares
+    problem over all these measurements gives the same map."""
+    rng, again = np.random.default_rng(16), 0.01  # m, what each map adds to the errors of its objects.
+    place, views, sigma, size_sigma = Place(rng, count=12, size=6.0), 5, 0.02, 0.004
+    ids, truth = list(place.truth), np.array([at for _, at in place.truth.values()])
+    raw, days = [], []
+    for day in range(3):
+        whole, own = all_in_view(place, day)
+        frame, size = inverse(own), [0.006, -0.002, 0.003][day]
+        at = np.linspace([0, 0, 0], [4, 2, 0], views)  # The path in the session's own units: no error but its size.
+        local = (truth @ frame[:3, :3].T + frame[:3, 3]) * (1 + size)
+        seen = local + rng.normal(0, sigma / 20, (views, len(ids), 3)) - at[:, None]
+        raw.append((at, seen, inverse(frame)))
+        place_of = (seen + at[:, None]).mean(axis=0)
+        shared = np.zeros((7, 7))
+        shared[6, 6] = size_sigma**2
+        spread = sigma**2 / views * np.eye(3) + size_sigma**2 * place_of[:, :, None] * place_of[:, None, :]
+        found = (replace(o, position=p, covariance=c) for o, p, c in zip(whole.objects, place_of, spread, strict=True))
+        days.append(Sees(whole.name, ObjectMap(tuple(found), shared_covariance=shared)))
+
+    def residuals(z):
+        points, sizes, frames = z[:36].reshape(12, 3), z[36:39], np.vstack([np.zeros(4), z[39:].reshape(2, 4)])
+        parts = [sizes / size_sigma]
+        for (at, seen, _), size, (x, y, h, yaw) in zip(raw, sizes, frames, strict=True):
+            pose = lift_se2(np.array([x, y, yaw]))
+            inside = (points - [x, y, h]) @ pose[:3, :3] * (1 + size)
+            parts.append(((inside - at[:, None] - seen) / np.hypot(sigma, np.sqrt(views) * again)).ravel())
+        return np.concatenate(parts)
+
+    starts = [[*own[:3, 3], np.arctan2(own[1, 0], own[0, 0])] for _, _, own in raw[1:]]
+    batch = least_squares(residuals, np.concatenate([truth.ravel(), np.zeros(3), *starts]), xtol=1e-12, ftol=1e-12)
+    expected = batch.x[:36].reshape(12, 3)
+    (island,) = merge_sessions(days)
+    got = np.array([island.objects.by_id(k).position for k in ids])
+    np.testing.assert_allclose(got, expected, atol=3e-4)
+    moved = np.linalg.norm(got - days[0].objects.positions, axis=1)
+    assert moved.max() > 0.02  # The sizes move the objects a hundred times as far as that tolerance.

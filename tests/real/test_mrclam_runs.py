@@ -6,10 +6,14 @@ from mrclam import mapped
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import align
+from objslam.core.maps.shared_covariance import jacobian
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
+from objslam.mapping.sites.merge import merge_sessions
+from objslam.mapping.sites.session import Session
 from objslam.sources import SourceOptions, read
 
 RADIUS = 2.0  # m; labels say who is whom, the error is what is asked
@@ -49,3 +53,41 @@ def test_landmarks_without_names(data_dir):
     assert found["matched"] >= 12
     assert found["false"] <= 2
     assert found["ate"] <= 0.35
+
+
+def of_truth(objects, truth):
+    """The positions of the map, and the true ones moved onto it."""
+    known = {o.label: o.position for o in truth.objects}
+    at = np.array([known[o.label] for o in objects])
+    pose = align(at, objects.positions, "se2")[0]
+    return objects.positions, at @ pose[:3, :3].T + pose[:3, 3]
+
+
+def test_three_robots_without_a_common_frame_are_one_map(data_dir):
+    """Three drives in frames of their own. Their own errors and their shared ones hold the truth of the whole map, as one
+    vector: the covariances of objects alone would be too wide for it, those of one graph of all keyframes far too small."""
+    sessions = []
+    for robot in (1, 3, 5):
+        log, result, _ = mapped(data_dir, robot, True)
+        sessions.append(Session(f"robot {robot}", result.map))
+        found, true = of_truth(result.map, log.truth)
+        moves = jacobian(found)
+        shared = result.map.shared_covariance
+        own = result.map.covariances - moves @ shared @ np.swapaxes(moves, 1, 2)
+        count = len(found)
+        whole = np.einsum("iak,kl,jbl->iajb", moves, shared, moves)
+        whole[np.arange(count), :, np.arange(count), :] += own
+        level = np.arange(3 * count).reshape(count, 3)[:, :2].ravel()
+        inverse = np.linalg.inv(whole.reshape(3 * count, -1)[np.ix_(level, level)])
+        frame = moves[:, :2][:, :, [0, 1, 5]].reshape(2 * count, 3)  # The alignment is a free choice.
+        off = (found - true)[:, :2].ravel()
+        left = off - frame @ np.linalg.solve(frame.T @ inverse @ frame, frame.T @ inverse @ off)
+        assert 0.2 < left @ inverse @ left / (2 * count - 3) < 2.0
+    (island,) = merge_sessions(sessions)
+    found, true = of_truth(island.objects, log.truth)
+    off = found - true
+    assert len(island.objects) == 15
+    assert all(o.life.sessions_seen == 3 for o in island.objects)
+    assert np.sqrt((off**2).sum(axis=1).mean()) <= 0.05
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(island.objects.covariances, off[..., None])[..., 0])
+    assert (squared < 7.815).all()

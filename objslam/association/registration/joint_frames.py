@@ -3,9 +3,9 @@
 Each map measures its objects in a frame of its own. A frame has x, y, z and yaw, because z is up in all maps. The first
 frame is the frame of the result. All objects of a map share an error: a shift, a turn and a wrong size
 (`core.maps.shared_covariance`). It is a variable too, with its covariance as the prior. So a map whose size is uncertain
-takes the size of a map whose size is known. Each Gauss-Newton step eliminates the objects first (Schur complement). So its
-time grows with the number of measurements, and with the cube of the small number of maps. Cauchy's weights limit what moved
-objects do.
+takes the size of a map whose size is known. The time of a Gauss-Newton step grows with the number of measurements, and with
+the cube of the number of objects or of maps, whichever is smaller (`ArrowSystem`). Cauchy's weights limit what moved objects
+do.
 
 The errors that are not shared may be larger than the covariances say: objects are nudged, and their boxes differ from day to
 day. The residuals show this. With at least three maps, the variance of each map is estimated against all others (variance
@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import gammaincinv
 
+from objslam.association.registration.arrow_system import ArrowSystem
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import lift_se2, split_se2
 from objslam.core.maps.shared_covariance import NUMBERS, jacobian
@@ -40,19 +41,17 @@ maps less. Without it, one pair of nearly exact objects would decide about the s
 _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 """Squared lengths of normal residuals (chi-squared, 3 degrees of freedom) at equal steps of probability. The mean over them
 gives the expectation of a weighted squared residual. More steps give it more exactly."""
-_RIDGE = 1e-12
-"""The share of the trace of the linear system that is added to its diagonal. Frames that no object determines then stay
-where they are. A larger share slows the solve down."""
-_STILL = 1e-9
-"""The largest step (m, rad) that ends the solve. A larger value ends it sooner."""
+_STILL = 1e-6
+"""The largest step (m, rad) that ends the solve. A larger value ends it sooner. With Cauchy's weights, each step is about
+half of the one before. So the positions then miss about as much, which is a thousandth of the errors of the best maps."""
 
 
 @dataclass(frozen=True)
 class Measured:
     """R measurements: map (R,) has object (R,) at position (R, 3) m in its own frame.
 
-    covariance: (R, 3, 3) m^2, without the shared errors. roots: (S, 7, 7) `root_of` the covariances of the shared errors of
-    the S maps, None if no map has any.
+    A map has an object once at most. covariance: (R, 3, 3) m^2, without the shared errors. roots: (S, 7, 7) `root_of` the
+    covariances of the shared errors of the S maps, None if no map has any.
     """
 
     map: Ints
@@ -146,9 +145,7 @@ def _frames(poses: Floats) -> Floats:
 
 def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, errors: Floats) -> _State:
     measured = replace(measured, covariance=measured.covariance * noise[measured.map, None, None])
-    maps, width = len(site_T_map), 4 + errors.shape[1]
     x = _frames(site_T_map)
-    free = np.arange(4, maps * width)  # The first frame stays. Its shared errors do not.
     weight = np.ones(len(measured.object))
     alone = np.bincount(measured.object, minlength=count)[measured.object] < 2
     positions: Floats | None = None
@@ -160,38 +157,25 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
         pulls = _sums((information @ moved[..., None])[..., 0], measured.object, count)
         positions = np.asarray(np.linalg.solve(total, pulls[..., None])[..., 0], dtype=np.float64)
         miss = positions[measured.object] - moved
-        system, gradient, half = _reduced(measured, lever, information, total, miss, errors)
-        step = np.zeros(maps * width)
-        if len(free):
-            inner = system[np.ix_(free, free)]
-            step[free] = np.linalg.solve(inner + _RIDGE * np.trace(inner) * np.eye(len(free)), gradient[free])
-        by_map = step.reshape(maps, width)
-        x, errors = x + by_map[:, :4], errors + by_map[:, 4:]
+        system, gradient = _linearised(measured, lever, information, total, miss, errors)
+        step = system.step(gradient)
+        x, errors = x + step[:, :4], errors + step[:, 4:]
         if np.abs(step).max(initial=0.0) < _STILL:
             break
         weight = np.where(alone, 1.0, 1 / (1 + np.einsum("ri,rij,rj->r", miss, plain, miss) / HALF_RAY))
     # Normal residuals have weights below 1 too. Without their mean, the covariances of normal errors would be too large.
     information = information / _mean_weight(information, total, measured.object)[:, None, None]
     total = _sums(information, measured.object, count)
-    system, _, half = _reduced(measured, lever, information, total, miss, errors)
-    system = system[np.ix_(free, free)]
+    system, _ = _linearised(measured, lever, information, total, miss, errors)
+    own, correlated, spread = system.covariances()
+    spread[0, :4], spread[0, :, :4] = 0.0, 0.0  # The first frame stays.
     assert positions is not None
-    spread = np.zeros((maps * width, maps * width))
-    if len(free):
-        held = np.linalg.cond(system) < 1e14
-        spread[np.ix_(free, free)] = np.linalg.inv(system) if held else np.nan
-    own = np.asarray(np.linalg.inv(total), dtype=np.float64)
-    gain = np.swapaxes(own[:, None] @ half, 1, 2).reshape(count, 3, maps * width)  # The derivatives of the objects.
-    size, axes = np.linalg.eigh(np.nan_to_num((spread + spread.T) / 2))
-    correlated: Floats = np.asarray(gain @ (axes * np.sqrt(np.maximum(size, 0.0))), dtype=np.float64)
-    own = np.asarray((own + np.swapaxes(own, 1, 2)) / 2, dtype=np.float64)
     poses = lift_se2(x[:, [0, 1, 3]])
     poses[:, 2, 3] = x[:, 2]
-    blocks = np.array([spread[width * s : width * s + 4, width * s : width * s + 4] for s in range(maps)])
     covariance = own + correlated @ np.swapaxes(correlated, 1, 2)
-    known = width - np.diagonal(spread).reshape(maps, width)[:, 4:].sum(axis=1)
-    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 * (np.arange(maps) == 0)
-    found = JointFrames(poses, blocks, positions, covariance, own, correlated, weight, noise)
+    known = 4 + errors.shape[1] - np.diagonal(spread, axis1=1, axis2=2)[:, 4:].sum(axis=1)
+    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 / len(x)  # One frame is free to choose. No map is special in that.
+    found = JointFrames(poses, spread[:, :4, :4], positions, covariance, own, correlated, weight, noise)
     return _State(found, errors, taken)
 
 
@@ -225,28 +209,21 @@ def _moved(measured: Measured, x: Floats, errors: Floats, positions: Floats | No
     return turned + x[measured.map, :3], lever, rotation
 
 
-def _reduced(
+def _linearised(
     measured: Measured, lever: Floats, information: Floats, total: Floats, miss: Floats, errors: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return the matrix (m, m) and the right side (m,) of the linear system of the frames and shared errors of all maps.
-
-    Also return the information (N, S, 3, 4 + r) between each object and each map.
-    """
-    count, (maps, shared) = len(total), errors.shape
-    width = 4 + shared
+) -> tuple[ArrowSystem, Floats]:
+    """Return the linear system of objects, frames and shared errors, and the right side (S, 4 + r) of all maps."""
+    maps, shared = errors.shape
     pull = information @ lever
-    half = np.zeros((count, maps, 3, width))
-    np.add.at(half, (measured.object, measured.map), pull)
     own = _sums(np.swapaxes(lever, 1, 2) @ pull, measured.map, maps)
     own[:, 4:, 4:] += np.eye(shared)  # The prior of the shared errors.
-    flat = np.swapaxes(half, 1, 2).reshape(3 * count, maps * width)
-    carried = np.swapaxes(np.linalg.inv(total)[:, None] @ half, 1, 2).reshape(3 * count, maps * width)
-    system = -flat.T @ carried
-    for s in range(maps):
-        system[width * s : width * (s + 1), width * s : width * (s + 1)] += own[s]
     gradient = _sums((np.swapaxes(pull, 1, 2) @ miss[..., None])[..., 0], measured.map, maps)
     gradient[:, 4:] -= errors
-    return system, gradient.reshape(-1), half
+    # The first frame stays. Its shared errors do not.
+    pull[measured.map == 0, :, :4] = 0.0
+    own[0, :4], own[0, :, :4], gradient[0, :4] = 0.0, 0.0, 0.0
+    own[0, :4, :4] = np.eye(4)
+    return ArrowSystem(total, own, pull, measured.object, measured.map), gradient
 
 
 def _sums(values: Floats, group: Ints, count: int) -> Floats:

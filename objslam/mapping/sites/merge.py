@@ -8,13 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
 from objslam.association.registration.joint_frames import JointFrames, solve_frames
-from objslam.association.registration.map_registration import Registration
-from objslam.association.registration.object_maps import register
 from objslam.association.visibility import thinned
 from objslam.core.arrays import Floats
 from objslam.core.bodies.body import Body, surer_body, turned
@@ -24,7 +21,7 @@ from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
 from objslam.mapping.sites.covariances import Row, measured_objects, site_covariances
 from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
-from objslam.mapping.sites.matching import same_objects
+from objslam.mapping.sites.placement import Part, mean_labels, place_sessions, sessions_behind
 from objslam.mapping.sites.session import Session
 
 _YOUNG = 2
@@ -52,101 +49,42 @@ class Island:
 
 
 def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
-    """Register all pairs of sessions, and join each group that shares objects to one island. The largest island comes first.
+    """Join each group of sessions that share objects to one island. The largest island comes first.
 
-    sessions: in the order of time. The first session of an island gives its frame. A session whose registrations are all
-    refused is an island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions
-    (`visits`) are read only for the objects that it lacks.
+    sessions: in the order of time. The first session of an island gives its frame. A session that fits no other one is an
+    island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions (`visits`) are
+    read only for the objects that it lacks.
     """
-    edges = {
-        (a, b): found
-        for a, b in combinations(range(len(sessions)), 2)
-        if (found := register(sessions[b].objects, sessions[a].objects)).accepted
-    }
-    left = list(range(len(sessions)))
-    islands = []
-    while left:
-        order, starts, odds = _tree(left, edges)
-        left = [s for s in left if s not in order]
-        islands.append(_island(sessions, order, starts, odds))
-    return tuple(sorted(islands, key=lambda one: -len(one.sessions)))
+    islands = [_island(sessions, part) for part in place_sessions(sessions)]
+    return tuple(sorted(islands, key=lambda one: (-len(one.sessions), one.sessions)))
 
 
-def _tree(
-    left: list[int], edges: dict[tuple[int, int], Registration]
-) -> tuple[list[int], list[tuple[int, Floats]], list[float]]:
-    """Return the spanning tree of the registrations `edges` with the best log odds, from the first session of `left` (Prim).
-
-    The three lists are its sessions, the parent of each session with the pose (4, 4) in the parent's frame, and the log
-    odds.
-    """
-    order, starts, odds = [left[0]], [(left[0], np.eye(4))], [np.nan]
-    while True:
-        ties = [
-            (found.log_odds, -s, p, s, pose)
-            for (a, b), found in edges.items()
-            for p, s, pose in ((a, b, found.b_T_a), (b, a, inverse(found.b_T_a)))
-            if p in order and s not in order
-        ]
-        if not ties:
-            return order, starts, odds
-        evidence, _, parent, session, pose = max(ties, key=lambda tie: tie[:2])
-        order.append(session)
-        starts.append((parent, pose))
-        odds.append(evidence)
-
-
-def _island(sessions: Sequence[Session], order: list[int], starts: list[tuple[int, Floats]], odds: list[float]) -> Island:
-    tracks: list[Track] = []
-    rows: list[Row] = []  # Each measurement: its session, its track, its object.
-    frames = np.zeros((0, 4, 4))
+def _island(sessions: Sequence[Session], part: Part) -> Island:
+    """Return the sessions of a part as one map: their joint solve, and the life of each object."""
+    order = sorted(part.site_T_session)
+    turn = {s: number for number, s in enumerate(order)}
+    # Each measurement: its session, its track, its object. The tracks are in the order in which the sessions found them.
+    begun = sorted(part.tracks, key=lambda seen: min((turn[s], o.id) for s, o in seen))
+    rows: list[Row] = sorted(
+        ((turn[s], at, o) for at, seen in enumerate(begun) for s, o in seen), key=lambda row: (row[0], row[1])
+    )
     shared = [sessions[s].objects.shared_covariance for s in order]
-    solved: JointFrames | None = None
-    for number, (s, (parent, pose)) in enumerate(zip(order, starts, strict=True)):
-        start = pose if solved is None else frames[order.index(parent)] @ pose
-        items = _items(sessions[s].objects)
-        pairs = {} if solved is None else dict(_matched(tracks, solved, items, start))
-        for k, item in enumerate(items):
-            at = pairs.get(k, len(tracks))
-            if at == len(tracks):
-                tracks.append(Track(item))
-            rows.append((number, at, item))
-        measured = measured_objects(rows, shared[: number + 1])
-        solved = solve_frames(measured, np.concatenate([frames, start[None]]), len(tracks), judged=False)
-        frames = solved.site_T_map
-    solved = solve_frames(measured_objects(rows, shared), frames, len(tracks))
-    frames = solved.site_T_map
+    back = inverse(part.site_T_session[order[0]])
+    start = np.array([back @ part.site_T_session[s] for s in order])
+    solved = solve_frames(measured_objects(rows, shared), start, len(begun))
+    tracks = [Track(seen[0][1]) for seen in begun]
     for row, (_, at, _) in enumerate(rows):
         tracks[at].places.append(row)
     alive = _live(sessions, order, tracks, rows, solved)
     objects, track_of = _objects(tracks, alive, rows, solved, shared)
     seen_by = {number: tuple(order[rows[row][0]] for row in tracks[at].places) for number, at in track_of.items()}
-    again = {at for at, track in enumerate(tracks) if len(track.places) > 1}
-    common = tuple(sum(n == number and at in again for n, at, _ in rows) for number in range(len(order)))
-    by_time = sorted(range(len(order)), key=order.__getitem__)
+    often = np.bincount([at for _, at, _ in rows], minlength=len(tracks))
+    common = np.bincount([n for n, at, _ in rows if often[at] > 1], minlength=len(order))
+    odds = [part.log_odds[s] for s in order]
+    odds[int(np.isnan(odds).argmax())], odds[0] = odds[0], np.nan  # The earliest session gives the frame of the island.
     return Island(
-        objects,
-        tuple(order[n] for n in by_time),
-        frames[by_time],
-        solved.frame_covariance[by_time],
-        np.array(odds)[by_time],
-        tuple(common[n] for n in by_time),
-        seen_by,
+        objects, tuple(order), solved.site_T_map, solved.frame_covariance, np.array(odds), tuple(common.tolist()), seen_by
     )
-
-
-def _items(objects: ObjectMap) -> list[MapObject]:
-    """Return the objects that can be matched: those with a covariance. Gone objects may come back, so they count."""
-    return [o for o in (*objects.objects, *objects.gone) if o.status == "ok" and o.covariance is not None]
-
-
-def _matched(tracks: list[Track], solved: JointFrames, items: list[MapObject], start: Floats) -> list[tuple[int, int]]:
-    """Return pairs of indices into `items` and `tracks` that are one object. start: (4, 4) site_T_session at the start."""
-    positions = np.array([o.position for o in items]).reshape(-1, 3) @ start[:3, :3].T + start[:3, 3]
-    spread = np.array([o.covariance for o in items]).reshape(-1, 3, 3)
-    turned = start[:3, :3] @ spread @ start[:3, :3].T
-    old = [t.item for t in tracks]
-    return [(k, i) for i, k in same_objects(old, items, solved.positions, solved.covariance, positions, turned).tolist()]
 
 
 def _live(
@@ -158,9 +96,11 @@ def _live(
 ) -> list[int]:
     """Update the lives of the tracks, session by session in the order of time. Return the tracks left after `_follow`."""
     begun: list[int] = []
-    for turn, number in enumerate(sorted(range(len(order)), key=order.__getitem__)):
-        session = sessions[order[number]]
-        here = {at: item for n, at, item in rows if n == number}
+    found: list[dict[int, MapObject]] = [{} for _ in order]
+    for number, at, item in rows:
+        found[number][at] = item
+    for turn, here in enumerate(found):
+        session = sessions[order[turn]]
         fresh = [at for at in here if at not in begun]
         for at in fresh:
             tracks[at].life, tracks[at].begun, tracks[at].since = here[at].life, turn, here[at].first_seen
@@ -170,8 +110,8 @@ def _live(
         if site:
             _join_lives(tracks, begun, here)
         for at in fresh:
-            tracks[at].item = _in_site(here[at], None, solved.site_T_map[number])
-        back = inverse(solved.site_T_map[number])
+            tracks[at].item = _in_site(here[at], None, solved.site_T_map[turn])
+        back = inverse(solved.site_T_map[turn])
         missed = [at for at in begun if at not in here]
         begun += fresh
         some = begun if not site else [at for at in fresh if tracks[at].life is None]
@@ -180,7 +120,7 @@ def _live(
             for visit in session.visits():
                 _visit(tracks, missed, {}, visit.session, solved.positions, visit.session_T_site @ back)
         for at, item in here.items():
-            tracks[at].item, tracks[at].met = _in_site(item, tracks[at].item, solved.site_T_map[number]), turn
+            tracks[at].item, tracks[at].met = _in_site(item, tracks[at].item, solved.site_T_map[turn]), turn
         begun = _follow(tracks, begun, solved.positions, fresh if site and turn else ())
     return begun
 
@@ -272,7 +212,7 @@ def _objects(
             id=number,
             position=solved.positions[at],
             covariance=covariance[at],
-            labels=_labels([o for _, _, o in of]),
+            labels=mean_labels([o for _, _, o in of], [sessions_behind(o) for _, _, o in of]),
             body=_surest_body(solved, of),
             ray_point=None,
             first_seen=min(o.first_seen for _, _, o in of),
@@ -303,15 +243,3 @@ def _best_tag(solved: JointFrames, of: list[Row]) -> TagPose | None:
     """Return the rotation and size of a fiducial from the session with the surest rotation. None for other objects."""
     best = min(((o.tag.sigma_deg, n, o.tag) for n, _, o in of if o.tag is not None), key=lambda one: one[:2], default=None)
     return None if best is None else best[2].turned(solved.site_T_map[best[1], :3, :3])
-
-
-def _labels(items: list[MapObject]) -> dict[str, float] | None:
-    """Return the mean share of each label over an object's sessions, the largest first. None if a session has no shares."""
-    if any(o.labels is None for o in items):
-        return None
-    often = [1 if o.life is None else o.life.sessions_seen for o in items]
-    total: dict[str, float] = {}
-    for o, weight in zip(items, often, strict=True):
-        for name, share in (o.labels or {}).items():
-            total[name] = total.get(name, 0.0) + share * weight / sum(often)
-    return dict(sorted(total.items(), key=lambda entry: -entry[1]))
