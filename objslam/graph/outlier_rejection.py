@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH
@@ -94,13 +95,14 @@ def reject_outliers(
 class _Solver:
     """Solves the graph of the same measurements for different inliers.
 
-    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves.
+    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves. graph: the last one of GTSAM.
     """
 
     measured: Measurements
     association: Association
     trace: Trace | None
     near: tuple[Ints, NormalEquations] | None
+    graph: gtsam.NonlinearFactorGraph | None = None
 
     def solve(
         self, map_T_camera: Floats, positions: Floats, used: Bools, tolerance: float, last: Optimum | None = None
@@ -108,8 +110,8 @@ class _Solver:
         """Return poses (K, 4, 4), positions (N, 3) and the optimum for the inliers `used` (R,).
 
         A solve on arrays takes a fraction of the time, because it has the normal equations already. GTSAM goes on where it
-        ends before an optimum, and names a variable that is not determined. last: the optimum of the same graph, where GTSAM
-        begins.
+        ends before an optimum, and names a variable that is not determined. last: the optimum of the same inliers, where
+        GTSAM goes on.
         """
         steps, loss, settings = 0, self.measured.settings.joint.loss, self.measured.settings
         if self.near is not None and np.array_equal(self.near[0], known_landmarks(positions)):
@@ -118,11 +120,13 @@ class _Solver:
             if found.ended:
                 values = make_values(map_T_camera, positions, known_landmarks(positions))
                 return map_T_camera, positions, Optimum(values, found.cost_before, found.cost_after, steps)
-        graph, values = self.measured.whole(self.association.object, used, map_T_camera, positions, loss)
-        values = values if last is None or steps else last.values
-        landmarks, others = known_landmarks(positions), range(int(used.sum()), graph.size())
+        if last is None or self.graph is None:
+            self.graph, values = self.measured.whole(self.association.object, used, map_T_camera, positions, loss)
+        else:
+            values = last.values
+        landmarks, others = known_landmarks(positions), range(int(used.sum()), self.graph.size())
         traced = trace_solve(self.trace, positions, landmarks)
-        optimum = optimize(graph, values, loss, settings, others, tolerance, traced, STILL)
+        optimum = optimize(self.graph, values, loss, settings, others, tolerance, traced, STILL)
         optimum = replace(optimum, iterations=steps + optimum.iterations)
         return read_poses(optimum.values), with_points(positions, landmarks, optimum.values), optimum
 
@@ -143,7 +147,7 @@ class _Solver:
 
         most = self.measured.settings.joint.max_iterations
         found = gauss_newton(graph, map_T_camera, normal, most, tolerance, STILL, on_step)
-        self.near = graph.landmarks, found.normal
+        self.near, self.graph = (graph.landmarks, found.normal), None  # A graph of GTSAM had other inliers.
         return found, placed(found.landmarks)
 
 
