@@ -89,9 +89,9 @@ def log_se3(pose: Floats) -> Floats:
     angle, small, safe = _angles(omega)
     half = safe / 2
     share = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / safe**2)
-    place, across = pose[..., :3, 3:], skew(omega)
-    once = across @ place  # The inverse of the left Jacobian, times the place (Barfoot, eq. 8.35).
-    return np.concatenate([omega, (place - once / 2 + share * (across @ once))[..., 0]], axis=-1)
+    place = pose[..., :3, 3]
+    once = np.cross(omega, place)  # The inverse of the left Jacobian, times the place (Barfoot, eq. 8.35).
+    return np.concatenate([omega, place - once / 2 + share * np.cross(omega, once)], axis=-1)
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
@@ -126,24 +126,20 @@ def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
 
 def exp_se3(twist: Floats) -> Floats:
     """Return the exponential (N, 4, 4) of twists (N, 6) (Barfoot, State Estimation for Robotics, eq. 8.31-8.35)."""
-    omega = twist[..., :3]
-    return make_pose(rotation_from_vector(omega), (_left_jacobian(omega) @ twist[..., 3:, None])[..., 0])
-
-
-def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return for rotation vectors (..., 3) three arrays (..., 1, 1): the angles, whether each is so small that a series is
-    needed, and the angles as divisors, with 1 for the small ones."""
-    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
-    small = angle < 1e-4
-    return angle, small, np.where(small, 1.0, angle)
-
-
-def _left_jacobian(omega: Floats) -> Floats:
+    omega, place = twist[..., :3], twist[..., 3:]
     angle, small, safe = _angles(omega)
     a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    w = skew(omega)
-    return np.eye(3) + a * w + b * (w @ w)
+    once = np.cross(omega, place)
+    return make_pose(rotation_from_vector(omega), place + a * once + b * np.cross(omega, once))
+
+
+def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
+    """Return for rotation vectors (..., 3) three arrays (..., 1): the angles, whether each is so small that a series is
+    needed, and the angles as divisors, with 1 for the small ones."""
+    angle = np.sqrt(np.einsum("...i,...i->...", omega, omega))[..., None]
+    small = angle < 1e-4
+    return angle, small, np.where(small, 1.0, angle)
 
 
 def adjoint(pose: Floats) -> Floats:
@@ -173,8 +169,9 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     inside = (query >= stamps[0]) & (query <= stamps[-1])
     valid = inside & ((span <= max_gap) | exact)
     fraction = np.divide(query - stamps[before], span, out=np.zeros(len(query)), where=span > 0)
-    step = inverse(poses[before[valid]]) @ poses[after[valid]]
-    result[valid] = poses[before[valid]] @ exp_se3(log_se3(step) * fraction[valid, None])
+    first = poses[before[valid]]
+    step = inverse(first) @ poses[after[valid]]
+    result[valid] = first @ exp_se3(log_se3(step) * fraction[valid, None])
     return result, valid
 
 

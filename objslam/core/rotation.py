@@ -30,10 +30,16 @@ def skew(v: Floats) -> Floats:
 
 def rotation_from_vector(omega: Floats) -> Floats:
     """Return the rotations (..., 3, 3) about vectors (..., 3) by their lengths, rad (Rodrigues' formula)."""
-    squared = (omega * omega).sum(axis=-1)[..., None, None]
+    squared = np.einsum("...i,...i->...", omega, omega)
     turns = np.sqrt(squared) / np.pi
-    across = omega[..., :, None] * omega[..., None, :] - squared * np.eye(3)  # the square of the cross-product matrix
-    return np.asarray(np.eye(3) + np.sinc(turns) * skew(omega) + np.sinc(turns / 2) ** 2 / 2 * across)
+    twice = np.sinc(turns / 2) ** 2 / 2
+    across = np.sinc(turns)[..., None] * omega
+    rotation = (twice[..., None] * omega)[..., :, None] * omega[..., None, :]
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        rotation[..., i, i] += 1 - twice * squared
+        rotation[..., k, j] += across[..., i]
+        rotation[..., j, k] -= across[..., i]
+    return rotation
 
 
 def rotation_vector(rotation: Floats) -> Floats:

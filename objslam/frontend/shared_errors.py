@@ -146,10 +146,12 @@ class SharedErrors:
         base_T_camera, direction, sigma = poses.base_T_camera.copy(), rays.direction, rays.sigma.copy()
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
-            base_T_camera[mine] = corrected_mount(base_T_camera[mine], error, one.camera.name)
+            mounts = base_T_camera[mine] if one.mount is not None else base_T_camera[mine][:1]
+            base_T_camera[mine] = corrected_mount(mounts, error, one.camera.name)
             lens = lens_errors(error, one.camera.name)
-            direction = refocused(direction, mine[rays.keyframe], lens)
-            sigma[mine[rays.keyframe]] /= 1 + lens[0]
+            if any(lens):
+                direction = refocused(direction, mine[rays.keyframe], lens)
+                sigma[mine[rays.keyframe]] /= 1 + lens[0]
         gathered, step, wander = keyframes.drift, keyframes.step, keyframes.wander
         if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.

@@ -68,7 +68,8 @@ class Multiframes:
         """Return the rays of images as the rays of the multiframes, in the frame of the first camera."""
         if len(self.first) == len(images):
             return rays
-        first_T_camera = inverse(images.base_T_camera[self.first])[self.number] @ self._motion(images) @ images.base_T_camera
+        path_T_camera = _path(images) @ images.base_T_camera
+        first_T_camera = inverse(path_T_camera[self.first])[self.number] @ path_T_camera
         own = self.first[self.number] == np.arange(len(images))
         first_T_camera[own] = np.eye(4)  # With rounding errors, they would need factors with an offset.
         offset, direction = rays.in_map(first_T_camera)
@@ -83,5 +84,10 @@ class Multiframes:
 
     def _motion(self, images: Keyframes) -> Floats:
         """Return the motions (K, 4, 4) of base from the first image of the multiframe to each image."""
-        path = images.map_T_base if images.odom_T_base is None else images.odom_T_base
+        path = _path(images)
         return inverse(path[self.first])[self.number] @ path
+
+
+def _path(images: Keyframes) -> Floats:
+    """Return the poses (K, 4, 4) of base from which motions are taken: those of the odometry, if there is one."""
+    return images.map_T_base if images.odom_T_base is None else images.odom_T_base

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH
@@ -12,9 +13,12 @@ from objslam.core.trace import Trace
 from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_at
+from objslam.graph.least_squares.gauss_newton import Solution, gauss_newton
+from objslam.graph.least_squares.joint_rows import JointGraph
+from objslam.graph.least_squares.normal_equations import NormalEquations
 from objslam.graph.optimizers import STILL, Optimum, optimize, trace_solve
 from objslam.graph.robust_cost import truncated_cost
-from objslam.graph.variables import read_poses, with_points
+from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
 """A rejected ray gets a second chance if at least the share `_MOST` of the rays from `_BESIDE` before it to `_BESIDE` after
@@ -55,19 +59,21 @@ def reject_outliers(
     trace: Trace | None,
     tolerance: float = 1e-6,
     rounds: int = ROUNDS,
+    near: NormalEquations | None = None,
 ) -> JointSolution:
     """Solve, and test which rays agree with their objects, until the inliers stay the same, or at most `rounds` times.
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the relative
     decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger. With inliers of
-    an earlier solve, which seldom change, the first solve goes to the end already.
+    an earlier solve, which seldom change, the first solve goes to the end already. near: the normal equations of a solve on
+    arrays that ended near the start, with Huber's loss and the same variables. The solves go on from them.
     """
-    loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)
     if measured.tags is not None:
         positions = measured.tags.placed(measured.rays, map_T_camera, positions)
+    solver = _Solver(measured, association, trace, None if near is None else (known_landmarks(positions), near))
     for _ in range(rounds):
         moved, agreeing = second_opinion(measured, map_T_camera, association, positions, used)
         if optimum is None:
@@ -75,21 +81,79 @@ def reject_outliers(
         elif (agreeing == used).all():
             break  # These inliers are solved already.
         positions, used = moved, agreeing
-        graph, values = measured.whole(association.object, used, map_T_camera, positions, loss)
-        landmarks, others = np.flatnonzero(np.isfinite(positions[:, 0])), range(int(used.sum()), graph.size())
-        traced = trace_solve(trace, positions, landmarks)
-        optimum = optimize(graph, values, loss, measured.settings, others, limit, traced, STILL)
+        map_T_camera, positions, optimum = solver.solve(map_T_camera, positions, used, limit)
         cost_before = optimum.cost_before if np.isnan(cost_before) else cost_before
         iterations += optimum.iterations
-        map_T_camera = read_poses(optimum.values)
-        positions = with_points(positions, landmarks, optimum.values)
     assert optimum is not None
-    if tolerance < limit and loss != "gnc":
-        optimum = optimize(graph, optimum.values, loss, measured.settings, others, tolerance, traced, STILL)
+    if tolerance < limit and measured.settings.joint.loss != "gnc":
+        map_T_camera, positions, optimum = solver.solve(map_T_camera, positions, used, tolerance, optimum)
         iterations += optimum.iterations
-        map_T_camera = read_poses(optimum.values)
-        positions = with_points(positions, landmarks, optimum.values)
     return JointSolution(map_T_camera, positions, used, optimum, cost_before, iterations)
+
+
+@dataclass
+class _Solver:
+    """Solves the graph of the same measurements for different inliers.
+
+    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves. graph: the last one of GTSAM.
+    """
+
+    measured: Measurements
+    association: Association
+    trace: Trace | None
+    near: tuple[Ints, NormalEquations] | None
+    graph: gtsam.NonlinearFactorGraph | None = None
+
+    def solve(
+        self, map_T_camera: Floats, positions: Floats, used: Bools, tolerance: float, last: Optimum | None = None
+    ) -> tuple[Floats, Floats, Optimum]:
+        """Return poses (K, 4, 4), positions (N, 3) and the optimum for the inliers `used` (R,).
+
+        A solve on arrays takes a fraction of the time, because it has the normal equations already. GTSAM goes on where it
+        ends before an optimum, and names a variable that is not determined. last: the optimum of the same inliers, where
+        GTSAM goes on.
+        """
+        steps, loss, settings = 0, self.measured.settings.joint.loss, self.measured.settings
+        if self.near is not None and np.array_equal(self.near[0], known_landmarks(positions)):
+            found, positions = self._on_arrays(map_T_camera, positions, used, tolerance, self.near[1])
+            map_T_camera, steps = found.map_T_camera, found.steps
+            if found.ended:
+                values = make_values(map_T_camera, positions, known_landmarks(positions))
+                return map_T_camera, positions, Optimum(values, found.cost_before, found.cost_after, steps)
+        if last is None or self.graph is None:
+            self.graph, values = self.measured.whole(self.association.object, used, map_T_camera, positions, loss)
+        else:
+            values = last.values
+        landmarks, others = known_landmarks(positions), range(int(used.sum()), self.graph.size())
+        traced = trace_solve(self.trace, positions, landmarks)
+        optimum = optimize(self.graph, values, loss, settings, others, tolerance, traced, STILL)
+        optimum = replace(optimum, iterations=steps + optimum.iterations)
+        return read_poses(optimum.values), with_points(positions, landmarks, optimum.values), optimum
+
+    def _on_arrays(
+        self, map_T_camera: Floats, positions: Floats, used: Bools, tolerance: float, normal: NormalEquations
+    ) -> tuple[Solution, Floats]:
+        """Return where the solve on arrays ends, and its positions (N, 3)."""
+        graph = JointGraph.of(self.measured, self.association, used, positions)
+
+        def placed(landmarks: Floats) -> Floats:
+            moved = positions.copy()
+            moved[graph.landmarks] = landmarks
+            return moved
+
+        def on_step(cost: float, poses: Floats, landmarks: Floats) -> None:
+            if self.trace is not None:
+                self.trace.iteration("solve", cost, poses, placed(landmarks))
+
+        most = self.measured.settings.joint.max_iterations
+        found = gauss_newton(graph, map_T_camera, normal, most, tolerance, STILL, on_step)
+        self.near, self.graph = (graph.landmarks, found.normal), None  # A graph of GTSAM had other inliers.
+        return found, placed(found.landmarks)
+
+
+def known_landmarks(positions: Floats) -> Ints:
+    """Return the landmarks (m,) with a position. An unknown position (N, 3) is NaN."""
+    return np.flatnonzero(np.isfinite(positions[:, 0]))
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:

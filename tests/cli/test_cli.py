@@ -279,6 +279,20 @@ def test_a_run_imports_what_it_uses(log_folder, tmp_path):
     assert not lean & {"torch", "open3d", "onnxruntime", "rerun", "matplotlib"}
 
 
+def test_no_object_is_searched_at_the_exit():
+    """Python searches all objects that its collector knows once more at its exit. The commands leave it none."""
+    script = """
+import atexit, gc, sys
+kept = [[i] for i in range(100_000)]
+atexit.register(lambda: print("searched", len(gc.get_objects())))
+from objslam.cli import main
+sys.argv = ["objslam", "--version"]
+main()
+"""
+    told = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
+    assert int(told.split("searched")[1]) < 1000
+
+
 # How it fails: 2 for wrong use
 
 

@@ -14,3 +14,12 @@ assert "scipy.linalg" in sys.modules and "numpy.f2py.crackfortran" not in sys.mo
 assert callable(numpy.f2py.run_main) and "numpy.f2py.crackfortran" in sys.modules
 """
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_the_pipeline_leaves_them_to_its_first_stage():
+    script = """
+import sys, objslam.mapping.pipeline
+
+assert not {"gtsam", "scipy", "numpy.f2py", "torch", "cv2"} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)

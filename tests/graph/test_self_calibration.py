@@ -229,3 +229,23 @@ def test_below_ties_the_path_is_the_instrument_of_the_clock():
         found[every] = noise_shares(state, system, errors)[k], measured.motions.tied
     assert found[1][1] == 0
     assert 0.2 < found[7][1] <= found[7][0] <= 1
+
+
+@pytest.mark.parametrize("localized", [False, True])
+def test_products_with_instruments_need_no_columns(localized):
+    """A clock whose images are half of all, against the product with the columns themselves."""
+    place = {"localization": PoseNoise()} if localized else {}
+    made, errors = drive({}, frames=200, false=0.0, **place)
+    theta, every = np.zeros(len(errors.names)), np.ones(len(made.rays), dtype=bool)
+    measured = Measurements.of(*errors.at(theta))
+    true = made.map_T_base @ made.keyframes.base_T_camera
+    system = linearise(Linearised(measured, made.association, true, made.points, every), errors, theta)
+    k, rng = errors.names.index("front.clock"), np.random.default_rng(0)
+    some = {k: np.arange(len(made.keyframes)) % 2 == 0}
+    clocks, columns = replace(system.clocks, moved=some), np.zeros((len(system.residual), 5))
+    velocity, residual = rng.normal(size=(len(made.keyframes), 6, 5)), rng.normal(size=len(system.residual))
+    clocks.put(columns, k, velocity)
+    np.testing.assert_allclose(clocks.products(residual, k, velocity), residual @ columns, rtol=1e-9)
+    if system.motions is not None:
+        back = system.motions.to_rows @ system.motions.to_twist
+        np.testing.assert_allclose(back, np.broadcast_to(np.eye(6), back.shape), atol=1e-6)

@@ -70,14 +70,34 @@ class ClockInstruments:
 
     def put(self, instruments: Floats, clock: int, velocity: Floats) -> None:
         """Write the instruments of a clock for velocities (K, 6, n) into columns (M, n)."""
-        own = np.where(self.moved[clock][:, None, None], velocity, 0.0)
+        own = self._own(clock, velocity)
         if self.motions is not None:
-            first, last = self.moves
-            change = own[last] - self.back @ own[first]
-            instruments[self.motions.rows] = -self.motions.whitened(change)
+            instruments[self.motions.rows] = -self.motions.whitened(self._changes_of_motions(own))
         if len(self.absolute):
             rows = (self.absolute @ own).reshape(-1, own.shape[2])
             instruments[self.first : self.first + len(rows)] = -rows
+
+    def products(self, residual: Floats, clock: int, velocity: Floats) -> Floats:
+        """Return the products (n,) of residuals (M,) with the columns that `put` writes, without these columns."""
+        own = self._own(clock, velocity)
+        products = np.zeros(own.shape[2])
+        if self.motions is not None:
+            pull = np.einsum("kji,kj->ki", self.motions.to_rows, residual[self.motions.rows].reshape(-1, 6))
+            products -= np.einsum("ki,kin->n", pull, self._changes_of_motions(own))
+        if len(self.absolute):
+            last = self.first + 6 * len(self.absolute)
+            pull = np.einsum("kji,kj->ki", self.absolute, residual[self.first : last].reshape(-1, 6))
+            products -= np.einsum("ki,kin->n", pull, own)
+        return products
+
+    def _own(self, clock: int, velocity: Floats) -> Floats:
+        """The velocities (K, 6, n) of the poses that a clock moves, 0 for the others."""
+        return np.where(self.moved[clock][:, None, None], velocity, 0.0)
+
+    def _changes_of_motions(self, own: Floats) -> Floats:
+        """The changes (s, 6, n) of the motions by velocities (K, 6, n)."""
+        first, last = self.moves
+        return np.asarray(own[last] - self.back @ own[first])
 
     def changes(self, poses: Floats) -> Floats:
         """Return the changes (K, 6, n) of the velocities for changes (K, 6, n) of the poses, twists of the cameras."""

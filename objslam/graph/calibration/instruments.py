@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.geometry import adjoint
+from objslam.core.geometry import adjoint, inverse
 from objslam.graph.calibration.linearised_graph import Linearised
 
 ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
@@ -22,13 +22,14 @@ often stands had a standard deviation five times as large. With a smaller ratio,
 class Motions:
     """The measured motions in the graph: s twists of base, with the rotation first.
 
-    to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. weight: (s,) robust. covariance: (s, 6, 6) of the
-    twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their standard deviations. The rest is
-    of the interpolated path. seconds: (s,) durations. rows: of the motions in the linear system. tied: the share of the
-    motions between keyframes that are below ties.
+    to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. to_rows: (s, 6, 6) back. weight: (s,) robust.
+    covariance: (s, 6, 6) of the twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their
+    standard deviations. The rest is of the interpolated path. seconds: (s,) durations. rows: of the motions in the linear
+    system. tied: the share of the motions between keyframes that are below ties.
     """
 
     to_twist: Floats
+    to_rows: Floats
     weight: Floats
     covariance: Floats
     by_odometry: Floats
@@ -47,12 +48,14 @@ class Motions:
         covariance = to_base @ odometry.covariance @ np.swapaxes(to_base, 1, 2)
         near = from_neighbours(covariance.reshape(-1, 36), seconds).reshape(-1, 6, 6)
         near = np.where((np.einsum("kii->k", near) > 0)[:, None, None], near, covariance)
-        to_twist = to_base @ np.linalg.inv(robust[:, None, None] * of.graph.motion_roots)
+        roots = robust[:, None, None] * of.graph.motion_roots
+        to_rows = roots @ adjoint(inverse(keyframes.base_T_camera[after]))
         noise = np.einsum("kij,kjl,kil->ki", to_base, odometry.noise, to_base)
         by_odometry = np.sqrt(noise / np.einsum("kii->ki", covariance))
         first = of.graph.first_motion
         rows = slice(first, first + 6 * len(after))
-        return cls(to_twist, robust, _alike(near, covariance), by_odometry, seconds, rows, odometry.tied)
+        to_twist, like = to_base @ np.linalg.inv(roots), _alike(near, covariance)
+        return cls(to_twist, to_rows, robust, like, by_odometry, seconds, rows, odometry.tied)
 
     def twists(self, columns: Floats) -> Floats:
         """Return the twists (s, 6, n) of columns (M, n) of the linear system."""
@@ -60,7 +63,7 @@ class Motions:
 
     def whitened(self, twists: Floats) -> Floats:
         """Return the rows (6 s, n) of twists (s, 6, n)."""
-        return np.asarray(np.linalg.solve(self.to_twist, twists).reshape(6 * len(twists), twists.shape[2]))
+        return np.asarray((self.to_rows @ twists).reshape(6 * len(twists), twists.shape[2]))
 
     def predicted(self, twists: Floats) -> Floats:
         """Return the twists (s, 6, n) that neighbours predict for twists (s, 6, n)."""

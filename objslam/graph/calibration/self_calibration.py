@@ -110,7 +110,10 @@ def calibrate(
         if same:
             break
     nothing = np.zeros(len(state.used), dtype=bool)
-    final = reject_outliers(state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace)
+    near = state.factored if state.measured.settings.joint.loss == "huber" and state.measured.tags is None else None
+    final = reject_outliers(
+        state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace, near=near
+    )
     state = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used).ordered()
     system = linearise(state, fit.errors, theta, at.noise)
     reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)

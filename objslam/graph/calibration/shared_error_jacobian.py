@@ -88,9 +88,7 @@ class LinearSystem:
                 slope[others, k] = variance[others, k]
                 # The path, and with it the instrument, depends on the parameters too. Without this part, the noise that the
                 # path and the side have in common would be in the slope.
-                follows = np.zeros_like(sides)
-                self.clocks.put(follows, k, velocity)
-                slope[k] += share * (residual @ follows)
+                slope[k] += share * self.clocks.products(residual, k, velocity)
                 noise[k] *= 1 - share
         return ReducedSystem(
             information=information,

@@ -258,9 +258,8 @@ def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kep
 
 def _summed(values: Floats, window: Ints) -> Floats:
     """Return the sums (W, D) of the rows of (n, D) in each window (n,)."""
-    sums = np.zeros((int(window.max()) + 1, values.shape[1]))
-    np.add.at(sums, window, values)
-    return sums
+    members = sparse.csr_matrix((np.ones(len(window)), (window, np.arange(len(window)))))
+    return np.asarray(members @ values)
 
 
 def _range_noise(

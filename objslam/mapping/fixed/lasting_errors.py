@@ -11,7 +11,6 @@ from objslam.association.observations import MIN_DEPTH
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.graph.fixed_pose_triangulation import noise_of_poses
-from objslam.graph.posterior.marginals import largest_sigma
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
 
@@ -67,6 +66,8 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
     seen = _cells_of(solution, settings)
     if not seen:
         return solution
+    from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
+
     variance = lasting_variances(list(seen.values()))
     covariance = solution.estimate.covariance.copy()
     for j, cells in seen.items():

@@ -1,0 +1,95 @@
+"""Solve a joint graph on arrays, from near its optimum, by Gauss-Newton steps that share their normal equations.
+
+A GTSAM graph has an object for each ray and each motion. To make and linearise them takes longer than such a solve.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import exp_se3
+from objslam.errors import SolveError
+from objslam.graph.least_squares.joint_rows import JointGraph
+from objslam.graph.least_squares.normal_equations import NormalEquations
+
+_SLOW = 0.5
+"""Normal equations are made anew if a step promises more than this share of what the step before it promised. A larger share
+makes them anew more rarely, and takes more steps. With old ones, a step takes a third of the time."""
+
+OnStep = Callable[[float, Floats, Floats], None]
+"""A function that is called after each step with the cost, the poses (P, 4, 4) and the positions (m, 3)."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The values where a solve ended: map_T_camera (P, 4, 4) and landmarks (m, 3), m.
+
+    cost_before, cost_after: half the sums of the squared residuals, with the robust losses. steps: the number of steps.
+    ended: whether the last step was as small as asked for. If not, no step lowered the cost, or the steps ran out, or the
+    linear system has no single solution. normal: the normal equations of the last steps.
+    """
+
+    map_T_camera: Floats
+    landmarks: Floats
+    cost_before: float
+    cost_after: float
+    steps: int
+    ended: bool
+    normal: NormalEquations
+
+
+def gauss_newton(
+    graph: JointGraph,
+    map_T_camera: Floats,
+    normal: NormalEquations,
+    most: int,
+    tolerance: float,
+    still: float,
+    on_step: OnStep | None = None,
+) -> Solution:
+    """Minimise the cost of a graph from poses (P, 4, 4) and the landmarks `graph.weak`.
+
+    A step takes the normal equations of the step before (chord method), as long as the steps become short quickly. Only the
+    robust weights and the directions change between steps. The gradient is fresh, so the optimum is the same.
+
+    Args:
+        graph: the measurements.
+        map_T_camera: (P, 4, 4) the first poses.
+        normal: the normal equations of a solve that ended nearby, with the same variables.
+        most: the most steps.
+        tolerance: the solve ends after a step that promises to decrease the cost by less than this share.
+        still: it also ends after a step that promises a smaller decrease than this, for example `optimizers.STILL`.
+        on_step: called after each step.
+    """
+    poses, landmarks = map_T_camera, graph.weak
+    rows, promised, ended, steps = graph.rows(poses, landmarks), np.inf, False, 0
+    before, anew = rows.cost, False
+    while steps < most and not ended and np.isfinite(rows.cost):
+        gradient = rows.jacobian.T @ rows.residual
+        if anew:
+            try:
+                normal = NormalEquations.of(rows.jacobian, normal.order)
+            except SolveError:
+                break
+        step = -normal.solve(gradient)
+        decrease = float(-(gradient @ step)) / 2
+        if not anew and decrease > _SLOW * promised:
+            anew = True
+            continue
+        moved = poses @ exp_se3(step[landmarks.size :].reshape(-1, 6))
+        places = landmarks + step[: landmarks.size].reshape(-1, 3)
+        after = graph.rows(moved, places)
+        ended = decrease <= max(still, tolerance * rows.cost)
+        if after.cost <= rows.cost:
+            poses, landmarks, rows, promised = moved, places, after, decrease
+            anew, steps = False, steps + 1
+            if on_step is not None:
+                on_step(rows.cost, poses, landmarks)
+        elif anew:
+            ended = False
+            break
+        else:
+            anew, ended = True, False
+    return Solution(poses, landmarks, before, rows.cost, steps, ended, normal)
