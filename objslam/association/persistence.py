@@ -19,7 +19,7 @@ _BY_CHANCE = 0.02
 """The probability that a session finds something at a place where there is no object. A larger value trusts a find less."""
 _CONCENTRATION = 5.0
 """How alike the detection rates of an object are in different sessions: the sum of the parameters of their beta
-distribution. A larger value makes many misses count more. Offline association finds values around this one."""
+distribution. With a larger value, many misses count more. Offline association finds values around this one."""
 _RATE = 0.5
 """The assumed share of looks that detect a new object. A larger value makes a miss count more."""
 _LOOKS = 4.0

@@ -15,7 +15,8 @@ STRETCH = 0.5
 """The drift of the heading in a stretch, in grid steps (one standard deviation). A larger value makes longer stretches, in
 which the odometry counts as exact."""
 _STRETCH_SHIFTS = 2.0
-"""The length of a stretch, in grid steps. A larger value makes longer stretches, to which fewer states apply well."""
+"""The length of a stretch, in grid steps. A larger value makes longer stretches, for which a single correction is less
+exact."""
 
 Cells = NDArray[np.float32]
 
