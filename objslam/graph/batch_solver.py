@@ -166,7 +166,7 @@ def solve_joint(
     if back.any():
         attempt = trace.aside() if trace is not None else None
         before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
-        for limit in (1, rounds - 1):  # Rays that belong to their objects lower the misfit in the first round already.
+        for limit in (1, rounds - 1):  # Returned rays that belong to their objects lower the misfit after the first round.
             tried = reject_outliers(
                 measured, association, other.map_T_camera, other.positions, other.used, again, attempt, tolerance, limit
             )

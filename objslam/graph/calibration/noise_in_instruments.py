@@ -25,7 +25,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     in the eliminated side. Neighbours have independent noise, but the poses that are eliminated spread the noise of a motion
     over the residuals of its neighbours. For a clock, it is the square of the noise in the eliminated side. The products are
     traces, which random probes measure (Hutchinson 1990). A probe is a random walk at the stamps of the odometry, because
-    keyframes between two stamps share a step. The noise is at most as rough as the measured motions, and leaves at most the
+    keyframes between two stamps share a step. The noise is limited by the roughness of the measured motions and by the
     residuals of the solution. Commanded motions are smooth: their residuals come from the robot and not from the
     measurement, so the sides have no noise.
 

@@ -49,7 +49,7 @@ def motions(
 
 
 def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) -> Floats:
-    """Return the covariances (M, 6, 6) of motions by the interpolation between two poses of the odometry.
+    """Return the covariances (M, 6, 6) that the interpolation between poses of the odometry adds to motions.
 
     Like `Keyframes.drift`, they are in the frame of odom_T_base. Half of the noise of a motion inside a step is at each end.
 
