@@ -58,7 +58,7 @@ def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solut
     near = near[(~edges.bound[near]).sum(axis=1) >= _FEWEST]
     if not len(near):
         return None
-    # A detector may know less about cut off things than about whole ones.
+    # A detector may be less exact for cut off things than for whole ones.
     noisier = max(1.0, float(np.median(np.abs(deviation[near])[use[near] > 0]) / NORMAL_MEDIAN))
     found = edges.take(near)
     return replace(found, **{name: noisier * getattr(found, name) for name in ("sigma", "shift", "size")})

@@ -29,8 +29,8 @@ slower."""
 _LOOSE = 1.0
 """The prior standard deviation (m) of the error of a solved position. With a larger value, the rays decide more."""
 _POOLED = 20.0
-"""The number of rays at which the scatter inside cells weighs as much as the noise in the settings. A larger number trusts
-the settings more."""
+"""With this many rays, the scatter inside cells weighs as much as the noise in the settings. A larger number trusts the
+settings more."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
 
 
 def lasting_variances(seen: list[Cells]) -> Floats:
-    """Return the expected squared factor of the errors of each of the times `_TIMES`. The sum is that of all lasting errors.
+    """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum is the factor of all errors.
 
     seen: the cells of each object.
     """
