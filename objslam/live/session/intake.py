@@ -41,7 +41,7 @@ _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A lar
 _POSES = 10_000
 """The number of newest poses of each path that are kept. They show when a program starts again and repeats its messages. A
 larger number recognises a longer repetition and costs memory, 0.3 kB a pose."""
-_SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. A larger value only costs care.
+_SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. It only allows for rounding.
 _WAIT = 2.0
 """A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
 larger value misses more such stamps."""
@@ -232,7 +232,7 @@ class Intake:
         if path == "odometry":
             pose = self._continuous(at, pose)
             if not valid_positions(pose[:3, 3]):
-                return self._refuse("odometry that leads too far away", where)
+                return self._refuse("odometry with a position out of range", where)
         message = PoseMessage(path, at, pose)
         if not self._hand_on(message):
             return False
