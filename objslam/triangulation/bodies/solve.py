@@ -28,7 +28,7 @@ from objslam.triangulation.bodies.shared import (
 Measure = Callable[[Floats | None], BoxEdges]
 """The edges of the boxes, given the points (B, 4, 3) in map at which the bodies touch them. None means unknown points."""
 More = Callable[["Bodies"], "BoxEdges | None"]
-"""More edges, which are only found by the bodies, such as those of cut off boxes. None if there are none."""
+"""More edges that can only be found with the bodies, such as those of cut off boxes. None if there are none."""
 
 _POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
 _ROUNDS = 2
@@ -197,7 +197,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
 
 
 def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> Bodies:
-    """Return the bodies from some edges, given those that `others` are of once more, from all edges."""
+    """Return the bodies of `edges`. Fit those that also have edges in `others` once more, to all edges."""
     mine = np.unique(others.body)
     at = np.flatnonzero(np.isin(edges.body, mine))
     both = edges.take(at).joined(others)
