@@ -19,7 +19,7 @@ _FEWEST = 3
 """The least number of objects with a shared error. Two objects do not tell a turn about their line."""
 _FLOOR = 1e-3
 """The least standard deviation (m) of an object's own error. A larger value keeps linear systems better conditioned, and
-takes less of exact maps as shared. This value is far below the errors of real maps."""
+counts less of the errors of exact maps as shared. This value is far below the errors of real maps."""
 _INDEFINITE = 1e-10
 """The least eigenvalue of the information about the shared error, relative to the largest one, with lengths in units of the
 map's extent. Directions below it have no shared error. A larger value leaves out more directions."""
@@ -40,10 +40,10 @@ def shared_covariance(points: Floats, covariance: Floats, factor: Floats) -> Flo
 
     covariance: (N, 3, 3) m^2 of the objects. factor: (N, 3, m) m, the part of their errors that is correlated: the joint
     covariance is its product with its own transpose, plus a block for each object. The result is the covariance of the best
-    linear estimate of the seven numbers from objects with this joint covariance, less that from objects with the blocks
-    alone (Gauss and Markov). It is exact if all correlated errors are shifts, turns and sizes. Other correlated errors, such
-    as bends of the path, then count as errors of the objects. The covariance of each object is never below its part of the
-    shared error.
+    linear estimate of the seven numbers from objects with this joint covariance, minus the covariance from objects with the
+    blocks alone (Gauss and Markov). It is exact if all correlated errors are shifts, turns and sizes. Other correlated
+    errors, such as bends of the path, then count as errors of the objects. The covariance of each object is never below its
+    part of the shared error.
     """
     if len(points) < _FEWEST or not factor.shape[2]:
         return None
