@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _GB = 1e9
 _RAY_MEMORY = 4.0
-"""The memory limit of a task on a cluster, GB, where the user gives none. A larger value lets larger logs pass."""
+"""The memory limit of a task on a cluster, GB, if the user gives none. A larger value lets larger logs pass."""
 _TENTHS = 10  # The lines of progress of a stage, if stderr is no terminal. More lines show the progress more finely.
 
 Sources = Annotated[
@@ -28,7 +28,7 @@ Sources = Annotated[
 ]
 OutUrl = Annotated[str, typer.Option("-o", "--out", help="Folder or URL for results, sites and tables.")]
 By = Annotated[
-    str, typer.Option("--by", help="What makes a site: a field of --layout, `folder` (that of a log), or `none` (one site).")
+    str, typer.Option("--by", help="The site of a log: a field of --layout, `folder` (its folder), or `none` (one for all).")
 ]
 LayoutOption = Annotated[
     str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")

@@ -11,7 +11,7 @@ from objslam.core.types import Detections, label_table
 from objslam.core.validity import box_rules, is_name, valid_corners, valid_depths
 from objslam.io.text import drop_rows, in_order
 
-UNUSABLE_FEATURES = "features of a box that are zero, not finite, or of another length than most (the box stays without)"
+UNUSABLE_FEATURES = "features of a box that are zero, not finite, or of another length than most (the box stays)"
 """The reason to leave out the appearance vector of a box."""
 
 

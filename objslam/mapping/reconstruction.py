@@ -193,7 +193,7 @@ def load_shot(
     except LogError:
         image = None
     if image is None or image.shape[:2] != (camera.height, camera.width):
-        ledger.drop("colour image that cannot be decoded or has not the camera's size", where=str(shot.rgb))
+        ledger.drop("colour image that cannot be decoded or does not have the camera's size", where=str(shot.rgb))
         return None, None
     return depth, np.ascontiguousarray(lens.straighten(image, smooth=True)[..., ::-1], dtype=np.float32) / np.float32(255)
 
