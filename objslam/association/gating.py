@@ -28,13 +28,13 @@ _SIZE_POOLED = 5.0
 """With this many boxes, the measured spread of a landmark's sizes weighs as much as `_SIZE_SPREAD`. A larger number trusts
 the measured spread less."""
 _SIZED_BY = 5
-"""The least number of boxes that tell the size of a landmark. A larger number leaves more landmarks without a size."""
+"""The least number of boxes that give a landmark a size. A larger number leaves more landmarks without a size."""
 _SIZE_FREE = 5.99
 """A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. With a larger
 value, only larger differences of size count."""
 SIZE_LOSS = 6.0
-"""The largest cost of a size. It is less than a usual gate, because a half hidden thing still has its bearing. A larger
-value loses more boxes of half hidden things."""
+"""The largest cost of a size. It is less than a usual gate, so that the bearing alone can still match a half hidden thing. A
+larger value loses more boxes of half hidden things."""
 
 
 @dataclass(frozen=True)

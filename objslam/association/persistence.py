@@ -36,7 +36,7 @@ def persistence(before: Floats, days: Floats, found: Bools, looks: Ints, past_lo
         days: (N,) the time since that session.
         found: (N,) whether the session found the object.
         looks: (N,) in how many frames of the session it should have been detected if it was there.
-        past_looks, past_detections: (N,) the looks and detections of all sessions before, which tell the detection rate.
+        past_looks, past_detections: (N,) the looks and detections of all sessions before. They give the detection rate.
     """
     prior = np.clip(before * np.exp(-np.maximum(days, 0.0) / LIFETIME), _LEAST, _MOST)
     missed = np.maximum(missed_by_all(looks, past_looks, past_detections), np.where(looks > 0, _OVERLOOKED, 1.0))

@@ -140,7 +140,7 @@ def _say_nothing(result: RunResult, more: str, out: Path, removed: tuple[str, ..
 
 
 def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
-    """Take the place of `say_result` with --json: print the objects, the summary and the names of the files."""
+    """Print the objects, the summary and the names of the files as JSON. With --json, this replaces `say_result`."""
     import json
 
     from objslam.io.objects_json import dump_objects

@@ -16,7 +16,7 @@ from objslam.core.geometry import inverse, log_se3
 from objslam.core.types import Trajectory
 
 _SHARED = 1.0
-"""In the estimate for a step, the mean change of velocity on the whole path counts like this number of changes. With a
+"""In the estimate for a step, the mean change of velocity on the whole path weighs as much as this number of changes. With a
 larger number, all steps wander more alike. With 0, a robot would never turn inside a step whose neighbours have its
 velocity: on simulated drives, errors of six standard deviations were seen, and four with 1."""
 

@@ -1,4 +1,4 @@
-"""Find the clocks of cameras before any map: bearings turn against the robot's turns at the right offset of the clock."""
+"""Find the clocks of cameras before any map: at the right clock offset, bearings turn opposite to the robot."""
 
 import numpy as np
 
@@ -72,7 +72,7 @@ def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
 
 
 def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Floats) -> Floats:
-    """Return the mean angle (m,), rad, between second bearings and first ones that turn against the odometry.
+    """Return the mean angle (m,), rad, between second bearings and first ones that are turned opposite to the odometry.
 
     stamps: (n, 2) s and bearings: (n, 2, 3), of `_pairs`. offsets: (m,) s, of the clock.
     """

@@ -184,7 +184,7 @@ def load_shot(
     depth = lens.straighten(raw, smooth=False).astype(np.float32) / np.float32(camera.depth_scale)
     depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # NaN becomes 0 too.
     if not depth[::_TOUCH, ::_TOUCH].any():
-        ledger.drop("depth images without a depth in reach", where=str(shot.depth))
+        ledger.drop("depth images without a depth up to reconstruction.max_depth", where=str(shot.depth))
         return None, None
     if shot.rgb is None:
         return depth, None

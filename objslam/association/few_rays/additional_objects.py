@@ -1,4 +1,4 @@
-"""Find objects that few rays show, among the rays that the global association leaves over.
+"""Find objects from few rays, among the rays to which the global association gave no object.
 
 The objects of the global association stay as they are. A new object needs no least number of rays: it has to be likelier
 than stray boxes that meet by chance.

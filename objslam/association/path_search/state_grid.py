@@ -1,4 +1,4 @@
-"""The states of a stretch of a path: planar corrections on a grid, and the stretches of a path."""
+"""Divide a path into stretches. The states of a stretch are planar corrections on a grid."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -119,7 +119,7 @@ def solve_frames(measured: Measured, site_T_map: Floats, count: int, *, judged: 
 
 
 def _noise(measured: Measured, at: _State) -> Floats:
-    """Return the factor (S,) on the covariances of each map: its squared residuals over their expectation."""
+    """Return the factor (S,) on the covariances of each map: its squared residuals divided by their expectation."""
     found = at.found
     moved, _, rotation = _moved(measured, _frames(found.site_T_map), at.errors, found.positions)
     claimed = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2))

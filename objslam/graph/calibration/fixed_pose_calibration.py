@@ -46,7 +46,7 @@ class PointSystem:
 
     matrix: (P, P). vector: (P,) half the gradient of the cost. cost: the sum of the weighted squared deviations. variance:
     the factor (at least 1) by which the cost exceeds its expectation. curvature: 0 to 1, the mean curvature of Cauchy's loss
-    over the mean curvature of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3, P) the
+    divided by that of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3, P) the
     derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
     """
 
@@ -162,7 +162,8 @@ def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
 
     Rays of one frame share the error of its pose. Rays of some seconds share the error of the localisation, or of the
     detector. The sums over stretches of the drive show this (cluster-robust covariance; Liang and Zeger 1986). The largest
-    factor of all shared errors is used. prior: (P, P) information. An error is ignored if its prior says more than the rays.
+    factor of all shared errors is used. prior: (P, P) information. An error is ignored if its prior has more information
+    than the rays.
     """
     told = np.diagonal(system.matrix) > np.diagonal(prior)
     if not told.any():

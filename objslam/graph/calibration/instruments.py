@@ -105,7 +105,7 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
     """Predict motions (n, D) at the rate of four motions near each: two before, two after. seconds: (n,) the durations.
 
-    The motions directly beside it do not count: they may share a step of the odometry with it, and so its noise.
+    The motions directly beside a motion do not count: they may share a step of the odometry with it, and so its noise.
     """
 
     def near(values: Floats) -> Floats:

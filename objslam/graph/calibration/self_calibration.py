@@ -50,8 +50,8 @@ _SAME_NOISE = 0.1
 """The relative change of the noise below which it is not estimated again. A larger value ends sooner."""
 
 _SAME_SHARES = 0.5
-"""The relative change of the noise below which its shares in the information stay as they were. They change slowly with the
-noise. A larger value computes them less often."""
+"""The shares of noise in the information are computed again if the noise changes by more than this share. They change slowly
+with the noise. A larger value computes them less often."""
 
 _LEAST_GROWTH = 0.5
 """The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
@@ -186,7 +186,7 @@ class _Fit:
 
     @property
     def prior_residuals(self) -> float:
-        """The weight of the nominal noise: it counts like this number of residuals."""
+        """The weight of the nominal noise, as a number of residuals."""
         return self.errors.settings.noise.prior
 
     def shared_errors(self, state: InnerSolve, theta: Floats, converged: float, noise: Floats | None = None) -> _Found:

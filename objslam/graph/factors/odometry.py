@@ -55,7 +55,7 @@ def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) 
 
     Args:
         before, after: (M,), (M,) the keyframes, with odometry.
-        walk: whether the path inside a step is a random walk that the poses of the odometry do not hold. Otherwise it is a
+        walk: whether the path inside a step is a free random walk, not fixed at the poses of the odometry. Otherwise it is a
             bridge (`frontend.odometry_bridge`).
     """
     if keyframes.step is None or keyframes.wander is None or keyframes.odom_T_base is None:

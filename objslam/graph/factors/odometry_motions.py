@@ -90,7 +90,7 @@ class OdometryMotions:
 
 
 def _in_camera(keyframes: Keyframes, last: Ints, covariance: Floats) -> Floats:
-    """Return covariances (M, 6, 6), in the frame of odom_T_base, in the frames of the keyframes `last` (M,)."""
+    """Move covariances (M, 6, 6) from the frame of odom_T_base into the frames of the keyframes `last` (M,)."""
     if not covariance.any():
         return covariance
     assert keyframes.odom_T_base is not None

@@ -29,7 +29,7 @@ _GROWTH = 1.5  # A full solve follows when keyframes have grown by this factor. 
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
 _LARGE = 400  # With more keyframes, a rebuild in slices replaces the full solve. A larger number delays the next frame more.
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
-_HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
+_HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share redoes more landmarks.
 _VISITS = 6
 """The least number of changes between inliers and outliers, in time order, that shows two objects of a label. Drift makes
 one run of outliers, which has two changes. A larger number needs more visits to both objects."""

@@ -142,8 +142,8 @@ def _by_bearings(found: Agreement) -> Finding | None:
 def _in_words(ratio: float, than: str, *, spoils: bool = True) -> Finding:
     """Return the finding for ranges that are `ratio` times too long, or too short if the ratio is below 1.
 
-    than: what they are compared with, in words. spoils: whether a ratio that is not that of a unit makes positions
-    unreliable.
+    than: what they are compared with, in words. spoils: whether the ratio makes positions unreliable, if it is not the ratio
+    of two units.
     """
     for factor, unit in _UNITS.items():
         if abs(np.log(ratio / factor)) < _CLOSE:

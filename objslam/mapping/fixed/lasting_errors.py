@@ -21,8 +21,8 @@ _MOST_CELLS = 48
 """The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
 slower."""
 _TIMES = (1.0, 4.0, 16.0, 64.0)
-"""The times (s) after which the correlation of an error has fallen to 1/e, from a jump of a scan matcher to an error of the
-map around a place. More times are finer and slower."""
+"""The correlation times (s) of errors, after which the correlation is 1/e. The shortest fits a jump of a scan matcher, the
+longest an error of the map around a place. More times are finer and slower."""
 _FACTORS = np.append(0.0, np.geomspace(0.1, 20.0, 40))
 """The tried standard deviations of lasting errors, as multiples of the noise in `localization`. More factors are finer and
 slower."""

@@ -41,7 +41,7 @@ _RARE = 20.0
 _STEPS = 12
 """The most steps of a fit that chooses a shape. A fit of the right shape needs fewer. More steps are slower."""
 _ENOUGH = 1e-3
-"""`STILL` for these fits: they end when a step would lower the cost by less. A larger value ends sooner."""
+"""`STILL` for a fit that chooses a shape: it ends when a step would lower the cost by less. A larger value ends sooner."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
     """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
     weights = _weights(edges, sides, now)
     rounds = fit(edges, now.rounds, now.prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
-    if now.best is None:  # The ellipsoid tells the cuboid where to begin.
+    if now.best is None:  # The fit of the cuboid begins at the ellipsoid.
         now = replace(now, cuboids=_cuboid_starts(rounds.values))
     square, square_prior = _best_cuboids(edges, now.cuboids, now.prior, weights)
     ball_prior = sphere_prior(now.prior)
