@@ -1,10 +1,10 @@
 """The motions by odometry that a graph gets: from keyframe to keyframe, and across the steps of a slow odometry.
 
-Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent: a robot that turned
-late in one motion turned more in the next, because the poses of the odometry hold the whole step. So the motions inside a
-step get the loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact:
-let motions with the shares d of a step have the noise D d of the odometry and the bridge W (diag(d) - d d'). Then their
-information is that of independent motions with the noise (D + W) d, and that of a tie: 1 / D - 1 / (D + W).
+Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent, because the odometry
+knows the whole step: a robot that turned late in one motion turned more in the next. So the motions inside a step get the
+loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact: let motions
+with the shares d of a step have the noise D d of the odometry and the bridge W (diag(d) - d d'). Then their information is
+the sum of two: that of independent motions with the noise (D + W) d, and that of a tie, 1 / D - 1 / (D + W).
 """
 
 from dataclasses import dataclass, replace
