@@ -268,8 +268,8 @@ def log_places(state: State, strays: Strays, rates: Rates) -> Floats:
 
 
 def log_volume(information: Floats, distance: Floats) -> Floats:
-    """Return ln of the volume (N,) m^3 of a position with this information (N, 3, 3) m^-2. It is never longer than the
-    distance (N,) m from the cameras."""
+    """Return ln of the volume (N,) m^3 of a position with this information (N, 3, 3) m^-2. In each direction, its extent is
+    at most the distance (N,) m from the cameras."""
     least = 1 / np.maximum(distance, 1e-3) ** 2
     eigen = np.maximum(np.linalg.eigvalsh(information), least[:, None])
     return np.asarray(1.5 * np.log(2 * np.pi) - 0.5 * np.log(eigen).sum(axis=1))
