@@ -65,9 +65,9 @@ def reject_outliers(
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the relative
-    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger. With inliers of
-    an earlier solve, which seldom change, the first solve goes to the end already. near: the normal equations of a solve on
-    arrays that ended near the start, with Huber's loss and the same variables. The solves go on from them.
+    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger. Inliers of an
+    earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations
+    of a solve on arrays that ended near the start, with Huber's loss and the same variables. The solves go on from them.
     """
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)
