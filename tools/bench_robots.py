@@ -1,6 +1,6 @@
 """Measure whether maps are honest on robots whose errors come from hardware, not from the noise model of the package.
 
-    python tools/bench_robots.py [--kinds wheels gyro vio slow] [--robots 8] [--first 0]
+    python tools/bench_robots.py [--kinds wheels gyro vio slow] [--robots 8] [--first 0] [--unnamed]
 
 Each robot drives to random points of a room, with stops. wheels: encoders with ticks, wrong radii, a wrong track width, slip
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
@@ -8,6 +8,8 @@ wheels, but only one or two odometry poses in a second. The camera has a wrong c
 to pixels, sit beside the object by a share of its size that depends on the side, and 1 % have a wrong name. Robots with an
 even number measure depths too. All settings are the defaults of joint mode. A line for each robot, then for each kind. Then,
 for each parameter of the calibration, the robots whose true value is within 1.96 and within 3 of its standard deviations.
+
+With --unnamed, all objects of a robot have one label, so the map must also find out which box is of which object.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import time
 from typing import Any
 
 import numpy as np
+from log_parts import without_names
 
 from objslam.config import load_settings
 from objslam.core.arrays import Floats
@@ -34,6 +37,8 @@ KINDS = ("wheels", "gyro", "vio", "slow")
 STEP = 0.005  # s, of the simulated motion
 SIDES = 0.04  # the offset of a box from its object, as a share of the size of the object, for each of five terms
 SLIPS = 90.0  # s between sudden slips, on average
+RADIUS, UNNAMED_RADIUS = 3.0, 0.5
+"""The radius of a match, m, with labels and without. Labels identify objects, so a large error is no missed object."""
 
 
 def main() -> None:
@@ -41,6 +46,7 @@ def main() -> None:
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--robots", type=int, default=8, help="robots of each kind")
     parser.add_argument("--first", type=int, default=0, help="the seed of the first robot")
+    parser.add_argument("--unnamed", action="store_true", help="one label for all objects of a robot")
     options = parser.parse_args()
     settings = load_settings(None, ("mode=joint", "output.recording=false"))
     for kind in options.kinds:
@@ -48,6 +54,7 @@ def main() -> None:
         errors: dict[str, list[float]] = {}
         for seed in range(options.first, options.first + options.robots):
             (log, true), ranged, begin = robot(seed, kind), seed % 2 == 0, time.process_time()
+            log = without_names(log) if options.unnamed else log
             try:
                 result = pipeline.run(log, settings, Ledger())
             except ObjslamError as error:
@@ -55,7 +62,8 @@ def main() -> None:
                 continue
             seconds = time.process_time() - begin
             assert log.truth is not None
-            found = evaluate(result.map, log.truth, align="se2", radius=3.0).to_dict()
+            radius = UNNAMED_RADIUS if options.unnamed else RADIUS
+            found = evaluate(result.map, log.truth, align="se2", radius=radius).to_dict()
             inside, squared = found["inside_95_3d"] * found["matched"], found["mahalanobis_median"]
             rows[ranged].append(
                 (found["matched"], len(log.truth.objects), found["false"], inside, found["position_rmse"], squared, seconds)
