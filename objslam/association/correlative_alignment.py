@@ -11,7 +11,7 @@ _GRID_SIGMAS = 3.0  # The half width of the grid of corrections, in standard dev
 _MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most grid steps in yaw and along x or y. A larger value costs time.
 _FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m). Finer corrections are left to association.
 _LANDMARK_SIGMA = 0.03  # The assumed standard deviation (m) of a landmark's position.
-_MIN_LEVEL = 0.1  # Heading noise is a ray's noise over the cosine of its elevation. This is the least cosine.
+_MIN_LEVEL = 0.1  # The least cosine of an elevation. A ray's heading noise is its noise divided by this cosine.
 _AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
 _MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared deviations. Some ranges are wrong.
 

@@ -147,7 +147,7 @@ def individual_covariances(f: Filter, expected: Expected) -> Floats:
 def within_reach(f: Filter, sight: Sight, ray: Ints, gate: float) -> Bools:
     """Return which pairs (n, N) of a ray (n,) and a landmark may have a squared deviation within the gate.
 
-    This quick test leaves no such pair out. It takes the trace of a landmark's covariance, which no variance exceeds.
+    This quick test keeps all such pairs. It uses the trace of a landmark's covariance, because no variance exceeds it.
     """
     turn, centre = f.map_T_base[:3, :3], f.map_T_base[:3, 3]
     moved = _carried(f.position - centre)

@@ -13,8 +13,8 @@ from objslam.core.statistics import logistic, poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
-_CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead drops fewer.
-_POOLED_BOXES = 100.0  # The number of boxes at which the rate of a class weighs as much as the rate of all classes.
+_CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
+_POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
 _MOST_PRIOR = 3.0  # The largest prior odds. A class with few boxes has them. A larger value keeps more weak objects.
 _EXPECTED_STRAYS = 5.0  # Each class is assumed to have this number of stray boxes in addition to the observed ones.
@@ -148,7 +148,7 @@ def rest_odds(state: State, fitted: int = 0) -> Floats:
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
     the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes,
     which looks like motion. So only a few rays count, and motion within the object's size does not count. fitted: the number
-    of measured coordinates that a moving point explains even by chance. They matter where rays are few.
+    of measured coordinates that a moving point explains even by chance. They matter if there are few rays.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]

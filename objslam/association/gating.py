@@ -22,19 +22,19 @@ _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated togethe
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
 _SIZE_SPREAD = 0.25
-"""The expected standard deviation of the logarithms of width and height over the boxes of a landmark, which change with the
-side and with the detector. A larger value needs larger differences of size."""
+"""The expected standard deviation of ln width and ln height over the boxes of a landmark. The sizes change with the side and
+with the detector. With a larger value, only larger differences of size count."""
 _SIZE_POOLED = 5.0
-"""With this many boxes, the spread of a landmark's own sizes weighs as much as `_SIZE_SPREAD`. A larger number trusts own
-sizes less."""
+"""With this many boxes, the measured spread of a landmark's sizes weighs as much as `_SIZE_SPREAD`. A larger number trusts
+the measured spread less."""
 _SIZED_BY = 5
-"""The least number of boxes that tell the size of a landmark. A larger number leaves more landmarks without a size."""
+"""The least number of boxes that give a landmark a size. A larger number leaves more landmarks without a size."""
 _SIZE_FREE = 5.99
-"""A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. A larger
-value needs larger differences of size."""
+"""A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. With a larger
+value, only larger differences of size count."""
 SIZE_LOSS = 6.0
-"""The largest cost of a size. It is less than a usual gate, because a half hidden thing still has its bearing. A larger
-value loses more boxes of half hidden things."""
+"""The largest cost of a size. It is less than a usual gate, so that the bearing alone can still match a half hidden thing. A
+larger value loses more boxes of half hidden things."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
     """Return the rays and the landmarks of pairs that may be within the gate. The landmark of each pair is in front of the
-    camera. If there are more than `_FEW_PAIRS` pairs, a bound on the deviation, by fast matrix products, leaves out most."""
+    camera. If there are more than `_FEW_PAIRS` pairs, a fast bound on the deviation excludes most of them."""
     pairs = len(obs.label) * len(landmarks.noise)
     if pairs <= _FEW_PAIRS:
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
@@ -102,7 +102,7 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
         return ray[ahead], index[ahead]
     spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
     turn, move = np.zeros((2, len(obs.label)))
-    if pose is not None:  # Twice its diagonal blocks bound it, however strongly both are correlated.
+    if pose is not None:  # Twice its diagonal blocks are an upper bound of the covariance for any correlation.
         turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
     centre = obs.origin.mean(axis=0)
@@ -165,8 +165,9 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
 def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: Ints) -> tuple[Ints, Bools]:
     """Return the best edge of each value of `one`, and (E,) whether each edge is in a part without conflicts.
 
-    one, other: (E,) the ray and the place of each edge, or the place and the ray. In a part without conflicts, no two best
-    edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the lowest landmark wins.
+    one, other: (E,) the ray and the landmark in the frame of each edge, or the reverse. In a part without conflicts, no two
+    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the lowest landmark
+    wins.
     """
     order = np.lexsort((landmark, -gain, one))
     best = order[np.flatnonzero(np.diff(one[order], prepend=-1))]
@@ -294,7 +295,7 @@ def alternate(
 
 
 def explained(state: State, gate: float) -> Floats:
-    """Return for each label (L,) by how much its landmarks lower the cost of its rays, against rays without a landmark."""
+    """Return for each label (L,) how much lower the cost of its rays is with its landmarks than without any landmark."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray] == edges.landmark
     gain = gate - edges.cost + _appearance_gain(state, edges)

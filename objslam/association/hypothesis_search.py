@@ -9,7 +9,7 @@ from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, 
 from objslam.core.arrays import Floats, Ints
 
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.
-_LARGE = 1 << 26  # The number of pairs of a ray and a point from which on torch is used. It can use CUDA, numpy cannot.
+_LARGE = 1 << 26  # With at least this many pairs of a ray and a point, torch is used. It can use CUDA, numpy cannot.
 _DRAWS_EACH = 8  # The number of ray pairs drawn for each hypothesis. Most pairs of rays do not meet.
 _REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
 _MIN_LEFT = 0.6

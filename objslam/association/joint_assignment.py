@@ -75,8 +75,8 @@ def _is_unambiguous(pairings: Pairings, allowed: Bools) -> bool:
 def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
     """Return the hypothesis that has all pairings `which` (n,).
 
-    None if a pairing is outside the gate given all others, or if the hypothesis is better without it. This takes one inverse
-    of the joint covariance, instead of one for each step of growth.
+    None if a pairing is outside the gate given all others, or if the hypothesis is better without it. This needs one inverse
+    of the joint covariance. Growth needs one for each step.
     """
     residual, rarity = pairings.residual[which], pairings.rarity[which]
     size, dimension = residual.shape

@@ -19,7 +19,7 @@ _BY_CHANCE = 0.02
 """The probability that a session finds something at a place where there is no object. A larger value trusts a find less."""
 _CONCENTRATION = 5.0
 """How alike the detection rates of an object are in different sessions: the sum of the parameters of their beta
-distribution. A larger value makes many misses count more. Offline association finds values around this one."""
+distribution. With a larger value, many misses count more. Offline association finds values around this one."""
 _RATE = 0.5
 """The assumed share of looks that detect a new object. A larger value makes a miss count more."""
 _LOOKS = 4.0
@@ -36,7 +36,7 @@ def persistence(before: Floats, days: Floats, found: Bools, looks: Ints, past_lo
         days: (N,) the time since that session.
         found: (N,) whether the session found the object.
         looks: (N,) in how many frames of the session it should have been detected if it was there.
-        past_looks, past_detections: (N,) the looks and detections of all sessions before, which tell the detection rate.
+        past_looks, past_detections: (N,) the looks and detections of all sessions before. They give the detection rate.
     """
     prior = np.clip(before * np.exp(-np.maximum(days, 0.0) / LIFETIME), _LEAST, _MOST)
     missed = np.maximum(missed_by_all(looks, past_looks, past_detections), np.where(looks > 0, _OVERLOOKED, 1.0))

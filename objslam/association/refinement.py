@@ -11,7 +11,7 @@ RANGE_GAIN = 6.0
 RANGE_LOSS = 4.0
 """A wrong range raises the cost of a match by at most this. About one correct box in ten has a wrong range."""
 BEHIND = 1e6
-"""The finite number of standard deviations that stands for a point behind the camera."""
+"""The deviation, in standard deviations, of a point behind the camera: large, but finite."""
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
 _DAMPING = 1e-6  # The share of the information added in all directions. Unobserved directions then stay unchanged.
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.

@@ -55,8 +55,8 @@ def fit_point(obs: Observations, rng: np.random.Generator, slack: float = 0.0) -
 
 
 def _consensus(obs: Observations, rng: np.random.Generator, slack: float) -> Floats | None:
-    """Return the point (3,) with the least robust cost: the midpoint of two rays, or the end of a range. None without
-    both."""
+    """Return the point (3,) with the least robust cost: the midpoint of two rays, or the end of a range. None if there is
+    neither."""
     count = len(obs)
     some = np.arange(count) if count <= _MOST_RAYS else np.sort(rng.permutation(count)[:_MOST_RAYS])
     a, b = (some[i] for i in np.triu_indices(len(some), 1))

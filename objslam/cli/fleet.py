@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _GB = 1e9
 _RAY_MEMORY = 4.0
-"""The memory limit of a task on a cluster, GB, where the user gives none. A larger value lets larger logs pass."""
+"""The memory limit of a task on a cluster, GB, if the user gives none. With a larger value, larger logs can be mapped."""
 _TENTHS = 10  # The lines of progress of a stage, if stderr is no terminal. More lines show the progress more finely.
 
 Sources = Annotated[
@@ -28,7 +28,7 @@ Sources = Annotated[
 ]
 OutUrl = Annotated[str, typer.Option("-o", "--out", help="Folder or URL for results, sites and tables.")]
 By = Annotated[
-    str, typer.Option("--by", help="What makes a site: a field of --layout, `folder` (that of a log), or `none` (one site).")
+    str, typer.Option("--by", help="The site of a log: a field of --layout, `folder` (its folder), or `none` (one for all).")
 ]
 LayoutOption = Annotated[
     str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")
@@ -49,7 +49,7 @@ MemoryLimit = Annotated[
     ),
 ]
 TimeLimit = Annotated[float, typer.Option("--time-limit", min=0.0, help="Time limit of a task, s; 0 for none.")]
-Retries = Annotated[int, typer.Option("--retries", min=0, help="How often a task begins again after its process died.")]
+Retries = Annotated[int, typer.Option("--retries", min=0, help="How many times a task begins again after its process died.")]
 Gpus = Annotated[
     float, typer.Option("--gpus", min=0.0, help="With --ray and --detector: the share of a GPU that each task takes.")
 ]

@@ -82,7 +82,7 @@ def _session_line(told: dict[str, Any]) -> str:
 
 def diff_results(
     a: Annotated[Path, typer.Argument(metavar="MAP_A", help="The earlier map: result folder, site, or objects.json.")],
-    b: Annotated[Path, typer.Argument(metavar="MAP_B", help="The later one: a result folder, which says what was in view.")],
+    b: Annotated[Path, typer.Argument(metavar="MAP_B", help="The later map: a result folder, which says what was in view.")],
     picture: Annotated[Path | None, typer.Option("-o", "--out", help="Draw the changes into this PNG file.")] = None,
     json: Json = False,
 ) -> None:

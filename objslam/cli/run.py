@@ -136,11 +136,11 @@ def run_log(
 
 
 def _say_nothing(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
-    """Take the place of `say_result` with --quiet."""
+    """Print nothing. With --quiet, this replaces `say_result`."""
 
 
 def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:
-    """Take the place of `say_result` with --json: print the objects, the summary and the names of the files."""
+    """Print the objects, the summary and the names of the files as JSON. With --json, this replaces `say_result`."""
     import json
 
     from objslam.io.objects_json import dump_objects
@@ -160,7 +160,7 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         if any(of["observable"] for of in calibration["parameters"].values()):
             console().print(calibration_table(calibration))
         else:
-            say("errors that all measurements share: this log tells none of them, so their priors count")
+            say("errors that all measurements share: this log determines none of them, so their priors are used")
     noise = result.summary.get("noise") or {}
     factors = {words: f"{noise.get(name, 1.0):.2g}" for name, words in _NOISE.items()}
     if found := [f"{words} {factor}" for words, factor in factors.items() if factor != "1"]:

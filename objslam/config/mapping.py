@@ -108,7 +108,7 @@ class AssociationSettings(Section):
     needed while the poses have not converged. A larger value finds fewer and more certain objects."""
     few_rays: bool = True
     """Search for objects with fewer rays than min_rays, in fixed mode with a localisation. Two rays, or one ray with a
-    depth, are enough where so few hardly meet by chance. The probability of such an object still has to reach
+    depth, are enough if such rays hardly meet by chance. The probability of such an object still has to reach
     min_existence."""
     duplicate_distance: Positive = 1.0
     """Distance in m above which two objects of one label are never merged. A larger value merges more on a drifted path."""

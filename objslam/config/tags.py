@@ -11,7 +11,7 @@ class Tags(Section):
     """Configure fiducials whose four corners are known. Each becomes a landmark with a position and a rotation."""
 
     use: bool = True
-    """Use the corners. false: a fiducial is a point where its diagonals meet, as other objects are."""
+    """Use the corners. false: a fiducial is one point, where its diagonals meet."""
     size: Positive | None = None
     """Side in m of every fiducial, from corner to corner as the detector reports them. This length gives the map its scale.
     null: the size of each fiducial is estimated, in the scale that the poses have."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from objslam.errors import one_line
 
 _EXAMPLES = 3  # The most places that are kept for each reason. A larger number makes the lines of text longer.
-_MOST_WARNINGS = 1000  # The most warnings. A larger number costs memory if somebody makes up what is warned of.
+_MOST_WARNINGS = 1000  # The most warnings. A larger number costs memory if made-up messages cause warnings.
 
 
 @dataclass

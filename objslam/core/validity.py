@@ -32,8 +32,8 @@ _RIGID = 1e-3
 """The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations. Rotations that
 are printed with four decimals are below it."""
 _ROUNDING = 1e-12
-"""R stays unchanged, bit by bit, if no entry of R^T R differs from the identity by more. A larger value leaves more
-rotations inexact. A product of a hundred rotations is below it."""
+"""R stays unchanged, bit by bit, if no entry of R^T R differs from the identity by more than this. A larger value leaves
+more rotations inexact. A product of a hundred rotations is below it."""
 _SHORTEST, _LONGEST = 1e-6, 1e3
 """The bounds of the length of a quaternion. Wider bounds accept more wrong quaternions. A valid quaternion has length 1, but
 some programs do not normalise theirs."""

@@ -40,8 +40,8 @@ def hash_log(path: Path) -> str:
 def hash_settings(settings: Settings, options: SourceOptions, files: Mapping[str, bytes]) -> str:
     """Return the hash of all that decides a result besides its log: settings, options of the source, version and `files`.
 
-    files: the content of each file that a setting names, by the dotted key of the setting, of each file that an option
-    names, by the name of the option, and of the detector, by the key "detector". The path of a file does not count.
+    files: the content of each file by its key. The key is the dotted key of the setting that names the file, the name of the
+    option that does, or "detector". The path of a file does not count.
     """
     values = change_settings(settings, dict.fromkeys((key for key in files if "." in key), "a file")).model_dump(mode="json")
     said: dict[str, Any] = {"version": __version__, "settings": values}

@@ -20,7 +20,7 @@ _PRIORS = {"translation": 0.05, "focal": 0.02, "centre": 0.02}
 somebody measured with a ruler, of a field of view from a data sheet, and of an image centre taken as the middle of the
 image. A calibrated camera errs less. With larger values, a log must show more before an error counts as known."""
 COARSE = 0.3
-"""The noise of given poses, m, from which on they reveal no error of a camera. A robot at 1 to 2 m/s drives less than this
+"""The least noise of given poses, m, at which they reveal no error of a camera. A robot at 1 to 2 m/s drives less than this
 during its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
 

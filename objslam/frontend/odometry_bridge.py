@@ -16,16 +16,16 @@ from objslam.core.geometry import inverse, log_se3
 from objslam.core.types import Trajectory
 
 _SHARED = 1.0
-"""The mean change of the velocity over the whole path counts like this number of changes beside a step. With a larger
-number, all steps wander more alike. With 0, a robot would never turn inside a step whose neighbours have its velocity: on
-simulated drives, errors of six standard deviations were seen, and four with 1."""
+"""In the estimate for a step, the mean change of velocity on the whole path weighs as much as this number of changes. With a
+larger number, all steps wander more alike. With 0, a robot would never turn inside a step whose neighbours have its
+velocity: on simulated drives, errors of six standard deviations were seen, and four with 1."""
 
 
 @dataclass(frozen=True)
 class OdometryBridge:
     """The variance of the interpolated path of an odometry with N poses.
 
-    stamps: (N,) s. wander: (N-1, 6) of each step, of a twist of base with the rotation first.
+    stamps: (N,) s. wander: (N-1, 6) the `wander` of each step, for a twist of base with the rotation first.
     """
 
     stamps: Floats
@@ -38,8 +38,8 @@ class OdometryBridge:
         The mean velocities in two neighbouring steps of T and U seconds differ. If the velocity is white noise of density q,
         their difference has the variance q (1 / T + 1 / U), and the path wanders by q T. If the velocity is a random walk of
         density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, the latter has the mean of p T^3
-        / 15 * s (1 - s). From a step to the next but one, white noise changes the velocity as much as to the next, and a
-        random walk has 2.5 times the variance. This tells, for each axis, which share of the changes is a random walk.
+        / 15 * s (1 - s). Between a step and the next but one, white noise gives the same variance as between neighbours, and
+        a random walk gives 2.5 times as much. This tells, for each axis, which share of the changes is a random walk.
         """
         seconds = np.diff(odometry.stamps)[:, None]
         velocity = log_se3(inverse(odometry.poses[:-1]) @ odometry.poses[1:]) / seconds

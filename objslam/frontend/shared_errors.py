@@ -30,7 +30,7 @@ _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
 noisy and change abruptly. The clocks of the MRCLAM robots converge in half the rounds with 0.1 s instead of 0.01 s."""
 _STEP = 0.01
-"""The step of every other parameter, in its unit. The measurements are nearly linear over this step."""
+"""The step of each parameter that is not in `_STEPS`, in its unit. The measurements are nearly linear over this step."""
 _MOST_SIGMAS = 6.0
 """The bound of a parameter is the absolute value of its prior mean, plus this many standard deviations of its prior.
 MOST_SCALE bounds scales further. Clocks have their own bound. A larger value lets a parameter move farther from its
@@ -137,8 +137,8 @@ class SharedErrors:
         The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. The noise of
         directions follows the focal length for the same reason: with a longer one, all angles are smaller. Keyframes stay
         on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
-        pose. drift: whether the drift is computed for the corrected odometry. If not, it stays as measured, and so does what
-        the interpolated path may be off.
+        pose. drift: whether the drift is computed for the corrected odometry. If not, the drift and the variance of the
+        interpolated path stay as measured.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)

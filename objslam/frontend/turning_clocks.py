@@ -1,4 +1,4 @@
-"""Find the clocks of cameras before any map: bearings turn against the robot's turns at the right offset of the clock."""
+"""Find the clocks of cameras before any map: at the right clock offset, bearings turn opposite to the robot."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
     Two bearings of one label from neighbouring images differ by the turn of the robot between the images, and by parallax.
     The offset at which they differ least from the turns of the odometry is judged with the prior of the clock, by Laplace's
     distribution of unknown width. A search that begins at a clock 0.2 s off can end at a wrong optimum, where a large noise
-    of turns takes the place of the clock.
+    of turns explains what the clock causes.
     """
     theta, odometry, cameras = errors.mean.copy(), errors.log.odometry, [one.camera.name for one in errors.log.cameras]
     if odometry is None or len(odometry) < 2 or errors.keyframes.odom_T_base is None:
@@ -72,7 +72,7 @@ def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
 
 
 def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Floats) -> Floats:
-    """Return the mean angle (m,), rad, between second bearings and first ones that turn against the odometry.
+    """Return the mean angle (m,), rad, between second bearings and first ones that are turned opposite to the odometry.
 
     stamps: (n, 2) s and bearings: (n, 2, 3), of `_pairs`. offsets: (m,) s, of the clock.
     """

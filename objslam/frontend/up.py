@@ -9,11 +9,11 @@ from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Up
 
 _STEADY = 0.7
-"""The least length of the mean of the cameras' unit up vectors. If the mean is shorter, the cameras roll too much to tell
-where up is, and z is taken. A larger value takes z more often."""
+"""The least length of the mean of the cameras' unit up vectors. If the mean is shorter, the cameras roll too much to show
+where up is, and z is used. With a larger value, z is used more often."""
 _TILT = np.radians(45)
 """The angle, rad, between the mean of the up vectors and the map's z axis, above which the map lies on its side. Cameras on
-robots look up or down by less. A larger angle takes z more often."""
+robots look up or down by less. With a larger angle, z is used more often."""
 _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
 """The axes that point right and to the top of a view from above. With the axis to the viewer, they are right-handed."""
 

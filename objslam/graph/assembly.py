@@ -78,7 +78,7 @@ class Measurements:
     ) -> Self:
         """Compute the measurements from keyframes and rays. Without multiframes, each keyframe has its own pose.
 
-        ties: (T, 2) the ties between multiframes, from `find_ties`. If it is None, they are found anew.
+        ties: (T, 2) the ties between multiframes, from `find_ties`. If it is None, the function finds them.
         """
         joined = Multiframes.single(len(images)) if multiframes is None else multiframes
         keyframes, rays = joined.keyframes(images), joined.rays(images, rays)

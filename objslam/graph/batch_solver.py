@@ -126,9 +126,8 @@ def solve_joint(
     start and places solve nearly the same measurements. Stretches that this solution rejects are not tried again. errors:
     the same keyframes and rays as a function of shared errors. The shared errors are estimated, starting from theta (P,) or
     from their mean. Their covariance is added to the covariance of objects. hold: whether the shared errors stay at theta,
-    and the noise as it is. In this case, no covariance is added.
-    progress(done, total) counts the keyframes in the growing graph.
-    The corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
+    and the noise stays too. In this case, no covariance is added. progress(done, total) counts the keyframes in the growing
+    graph. The corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
     """
     tags = TagCorners.of(rays, association, settings)
     if trace is not None:
@@ -166,7 +165,7 @@ def solve_joint(
     if back.any():
         attempt = trace.aside() if trace is not None else None
         before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
-        for limit in (1, rounds - 1):  # Rays that belong to their objects lower the misfit in the first round already.
+        for limit in (1, rounds - 1):  # Returned rays that belong to their objects lower the misfit after the first round.
             tried = reject_outliers(
                 measured, association, other.map_T_camera, other.positions, other.used, again, attempt, tolerance, limit
             )

@@ -155,7 +155,8 @@ class _Exploration:
         found = assign_jointly(Pairings(row, column, expected.residual, total, rarity, SAME_POINT_WIDE))
         sure = found.margin >= _SURE
         chosen = found.chosen[sure]
-        # A ray is doubtful if two landmarks compete for it, or if alone it would surely match a landmark without a ray.
+        # A ray is doubtful if two landmarks compete for it. It is also doubtful if, taken alone, it would surely match a
+        # landmark without a ray.
         could = rarity - 0.5 * np.linalg.slogdet(2 * np.pi * alone[near])[1] >= _SURE
         could &= ~np.isin(column, column[chosen]) & ~np.isin(row, row[chosen])
         self.doubtful[rays[np.concatenate([row[found.chosen[~sure & found.rival]], row[could]])]] = True
@@ -237,7 +238,7 @@ def _likeliest(squared: Floats) -> Ints:
 
 def _log_spread(sight: ekf.Sight) -> Floats:
     """Return the log (R,) of the area (rad^2), or with a range the volume (rad^2 m), over which rays to new landmarks
-    spread. All rays together are taken as an example of such rays."""
+    spread. All rays together serve as a sample of such rays."""
     n, noise = sight.direction, np.median(sight.sigma)
     angles = np.arctan2(n[:, 1], n[:, 0]), np.arcsin(np.clip(n[:, 2], -1.0, 1.0))
     extent = sum(0.5 * np.log(12 * np.var(angle) + 2 * np.pi * noise**2) for angle in angles)

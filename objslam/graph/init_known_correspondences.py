@@ -28,7 +28,7 @@ _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
 median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both."""
 _MORE_RAYS = 1
-"""A new landmark needs this number of agreeing rays more than association.min_rays. With a larger number, landmarks are
+"""The number of agreeing rays beyond association.min_rays that a new landmark needs. With a larger number, landmarks are
 added later. With a smaller one, false boxes agree by chance too often."""
 _SHORTEST = 4
 """The shortest step is joint.grow_step divided by this number, and at least 2. A larger number allows slower growth."""

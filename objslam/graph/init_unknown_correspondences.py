@@ -35,7 +35,7 @@ landmark was observed. A larger value recognises landmarks after a longer absenc
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _PLACE = 0.1
-"""The error (m) that a measured range may have beyond 4 standard deviations of its noise. A larger value accepts more wrong
+"""A measured range may err by this (m) in addition to 4 standard deviations of its noise. A larger value accepts more wrong
 ranges."""
 _LEFT, _TURN, _SHIFT = 0.1, np.radians(0.5), 0.02
 """The uncertainty of the poses in a step after their alignment with the landmarks. It is the share `_LEFT` of the drift's
@@ -50,8 +50,8 @@ _STRAIN = 200.0
 """A loop closure may raise the cost (a sum of squared deviations) by this amount for each joined landmark. A larger amount
 closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for each landmark, wrong ones by 240 or more."""
 _LESSON = 50
-"""Half the number of rays with a landmark from which the likelihood ratio of appearances is learnt first. It is learnt again
-each time the number has doubled. A larger number learns later."""
+"""The likelihood ratio of appearances is learnt first when twice this number of rays have a landmark. It is learnt again
+each time the number of rays has doubled. A larger number learns later."""
 _PAIRS = 150
 """The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
 next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.

@@ -137,7 +137,7 @@ def indeterminate(error: RuntimeError) -> SolveError:
     reason = " ".join(str(error).strip().partition("\n\n")[0].split()) or type(error).__name__
     return SolveError(
         f"the factor graph has no single solution: {reason.rstrip('.')}",
-        hint="some pose or object is not held by any measurement; a smaller joint.prior_sigma holds every object",
+        hint="no measurement determines some pose or object; a smaller joint.prior_sigma holds every object",
     )
 
 

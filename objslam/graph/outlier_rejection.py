@@ -60,8 +60,8 @@ def reject_outliers(
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the relative
-    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger. With inliers of
-    an earlier solve, which seldom change, the first solve goes to the end already.
+    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger. Inliers of an
+    earlier solve seldom change. So with them, the first solve already ends at `tolerance`.
     """
     loss = measured.settings.joint.loss
     optimum, cost_before, iterations = None, np.nan, 0

@@ -125,8 +125,8 @@ class SlidingWindow:
 def _at_a_point(positions: Floats, points: Floats) -> Bools:
     """Return which positions (N, 3) are at one of the points (K, 3), K > 0.
 
-    Only points that are near along the longest axis of the path are compared. A search tree would do, but the import of
-    scipy.spatial takes 0.07 s.
+    Only points that are near along the longest axis of the path are compared. A search tree would do the same, but the
+    import of scipy.spatial takes 0.07 s.
     """
     axis = int(np.ptp(points, axis=0).argmax())
     order = np.argsort(points[:, axis])

@@ -11,7 +11,7 @@ from objslam.core.types import Detections, label_table
 from objslam.core.validity import box_rules, is_name, valid_corners, valid_depths
 from objslam.io.text import drop_rows, in_order
 
-UNUSABLE_FEATURES = "features of a box that are zero, not finite, or of another length than most (the box stays without)"
+UNUSABLE_FEATURES = "features of a box that are zero, not finite, or of another length than most (the box stays)"
 """The reason to leave out the appearance vector of a box."""
 
 
@@ -113,7 +113,7 @@ class BoxCollector:
     def _valid_features(self, good: Bools, ledger: Ledger) -> Floats32 | None:
         """Return the unit appearance vectors (M, D) of all boxes, NaN for a box without a valid one. None if all are wrong.
 
-        A log has vectors of one length: the most frequent one, and of two such lengths the one that comes first.
+        A log has vectors of one length, the most frequent one. If two lengths are equally frequent, the first one counts.
         """
         boxes = np.array(list(self.features), dtype=np.int64)
         lengths = np.array([vector.size for vector in self.features.values()])

@@ -27,7 +27,7 @@ _FORMS = {
     "base_T_camera": f"base_T_camera: {{translation: [x, y, z], {_AHEAD}}} for a camera that looks straight ahead",
     "rotation_xyzw": f"{_AHEAD} for a camera that looks straight ahead",
 }
-"""How to write the keys that people write in another way."""
+"""The right form of keys that people often write in another way."""
 _Mapping = dict[str, yaml.Node]
 
 

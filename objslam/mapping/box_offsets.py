@@ -27,7 +27,7 @@ _LOOSE = 1.0
 """The prior standard deviation (m) of the error of a solved position, in `_share`. With a larger value, the rays decide
 more."""
 _POOLED = 20.0
-"""The number of an object's rays at which their scatter weighs as much as the scatter of all rays. With a larger number,
+"""With this many rays, the scatter of an object's own rays weighs as much as the scatter of all rays. With a larger number,
 objects differ less."""
 
 
@@ -180,7 +180,8 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
 
 
 def _summed(axes: Floats, cell: Ints, weight: Floats, values: Floats) -> Floats:
-    """Return the weighted sum (C, 2, D) of the values (R, 3, D) of each side `cell` (R,), along its two axes (C, 3, 2)."""
+    """Return the weighted sums (C, 2, D) of values (R, 3, D) along the two axes (C, 3, 2) of each side. cell: (R,) the
+    side."""
     sums = np.zeros((len(axes), *values.shape[1:]))
     np.add.at(sums, cell, weight[:, None, None] * values)
     return np.einsum("cia,cid->cad", axes, sums)

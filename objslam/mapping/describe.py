@@ -127,8 +127,8 @@ def describe(
 def _best_view(rays: Rays, mine: Ints, image: Floats) -> Floats32 | None:
     """Return the appearance vector (D,) of the best of the rays `mine`, None if they have none.
 
-    The best view is the largest box that lies inside its image, or the largest box if none does. A mean of vectors would be
-    that of no view. image: (R, 2) width and height of the image of each ray, px.
+    The best view is the largest box that lies inside its image, or the largest box if none does. A mean of vectors would fit
+    no real view. image: (R, 2) width and height of the image of each ray, px.
     """
     if rays.feature is None or rays.feature_table is None or not (rays.feature[mine] >= 0).any():
         return None

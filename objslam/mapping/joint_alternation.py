@@ -30,11 +30,11 @@ _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve, and on a path from a grid. A larger factor tolerates
 larger residuals."""
 _STILL = 0.01
-"""The share of rays that may get another object along the most likely path, without another round. A larger share ends the
-rounds sooner. A few rays change in each round, because the path has the steps of a grid."""
+"""The rounds along the most likely path end if at most this share of the rays changes its object. A larger share ends them
+sooner. A few rays change in each round, because the path has the steps of a grid."""
 _WORSE = 2
-"""The number of rounds along the most likely path, one after the other, that explain no more than the best one before the
-rounds end. A larger number takes longer, and crosses more rounds in which close objects merged."""
+"""The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
+takes longer, and continues after more rounds in which close objects merged."""
 
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
@@ -122,9 +122,9 @@ class JointState:
     def alternated(self, map_T_base: Floats, guess: Guess | None) -> Self:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
-        If an earlier association returns, a few rays could change for ever. Then the state since the earlier one counts
-        whose rays are best `explained`. A few changed rays hardly change the shared errors, which take most of the time of a
-        solve. So these stay as the first round found them until the rounds end, and are then estimated again.
+        If an earlier association returns, a few rays could change for ever. Then the best `explained` state since then is
+        returned. A few changed rays hardly change the shared errors, which take most of the time of a solve. So these stay
+        as the first round found them until the rounds end, and are then estimated again.
         """
         state, earlier, held = self, dict[bytes, Self](), False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
@@ -151,7 +151,8 @@ class JointState:
         return replace(state.released(self.hold) if held else state, hold=self.hold, settled=False)
 
     def released(self, hold: bool) -> Self:
-        """Return the state after one more solve, which estimates the shared errors again unless they are to `hold`."""
+        """Return the state after one more solve. hold: whether the shared errors stay. If not, the solve estimates them
+        again."""
         assert self.association is not None
         state = replace(self, hold=hold)
         return state.solve("association", self.association, self.solved_poses).merged()

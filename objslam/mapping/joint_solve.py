@@ -33,8 +33,8 @@ _NOISIER = 1.5
 A larger factor explores fewer logs twice."""
 _CLEAR = 0.95
 """The share of agreeing rays above which a log is not explored again, whatever its noise. A larger share explores more logs
-twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: a
-real robot in a forest has its log explored twice for nothing."""
+twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: the log
+of a real robot in a forest is explored twice without need."""
 _LOOSE = 3.0
 """The factor on the noise of the odometry in the second exploration, if the solve found only the rays to be noisy. A larger
 factor suits worse odometry, and loses more objects of good odometry."""
@@ -74,7 +74,7 @@ def solve_joint(
 
 
 def _with_clocks(state: JointState) -> JointState:
-    """Return the state that begins at the clocks which the robot's turns show."""
+    """Return the state that begins at the clock offsets which the robot's turns show."""
     if state.errors is None or state.theta is not None:
         return state
     theta = clocks_of_turns(state.errors)
@@ -108,7 +108,7 @@ def _by_label(state: JointState) -> tuple[JointState, bool]:
     if state.settings.association.method == "by_label":
         return solved, True
     told = labels_tell(association, solved.estimate)
-    if (association.object < 0).any():  # Noise or a wrong clock do not draw two boxes of one label.
+    if (association.object < 0).any():  # Noise or a wrong clock cannot cause a second box of one label.
         return _with_doubles(solved) if told else (solved, False)
     if told:
         return solved, True

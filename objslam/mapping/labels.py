@@ -19,8 +19,8 @@ MANY, SECOND = 5, 0.25
 find fewer."""
 _DOUBLE = 0.1
 """One object for each label is tried if at most this share of labels has several boxes in a keyframe, over all keyframes. A
-detector draws some boxes twice, and some false ones. With a larger share, more logs are tried in vain, which takes a solve
-each."""
+detector draws some boxes twice, and some false ones. With a larger share, more logs are tried without success. Each try
+takes a solve."""
 _AGREES = 3.0
 """A ray agrees with the object of its label if it is off by at most this many standard deviations. With a larger value,
 fewer boxes can show a second object."""
@@ -156,6 +156,6 @@ def warn_of_noise(errors: SharedErrors, estimate: Estimate, ledger: Ledger) -> N
     factors = ", ".join(f"{kind} {factor:.2g}" for kind, factor in estimate.noise.to_dict(None).items() if factor > _LARGER)
     if factors:
         ledger.warn(
-            f"the settings say too little noise for this log (factors found: {factors}), and many boxes are rejected; "
+            f"the settings have too little noise for this log (factors found: {factors}), and many boxes are rejected; "
             f"leave the noise out of the settings, or set {', '.join(f'noise.{kind}=true' for kind in sorted(said))}"
         )

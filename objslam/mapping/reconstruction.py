@@ -184,7 +184,7 @@ def load_shot(
     depth = lens.straighten(raw, smooth=False).astype(np.float32) / np.float32(camera.depth_scale)
     depth = np.where((depth > 0) & (depth <= max_depth), depth, np.float32(0))  # NaN becomes 0 too.
     if not depth[::_TOUCH, ::_TOUCH].any():
-        ledger.drop("depth images without a depth in reach", where=str(shot.depth))
+        ledger.drop("depth images without a depth up to reconstruction.max_depth", where=str(shot.depth))
         return None, None
     if shot.rgb is None:
         return depth, None
@@ -193,7 +193,7 @@ def load_shot(
     except LogError:
         image = None
     if image is None or image.shape[:2] != (camera.height, camera.width):
-        ledger.drop("colour image that cannot be decoded or has not the camera's size", where=str(shot.rgb))
+        ledger.drop("colour image that cannot be decoded or does not have the camera's size", where=str(shot.rgb))
         return None, None
     return depth, np.ascontiguousarray(lens.straighten(image, smooth=True)[..., ::-1], dtype=np.float32) / np.float32(255)
 

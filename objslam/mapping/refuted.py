@@ -32,7 +32,8 @@ _NOISE = 2.0
 """The largest noise of rays and odometry, as a multiple of the settings, in a solve that explains the boxes. With more
 noise, wrong boxes fit too. Larger values refute more findings. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
-"""A finding stands only if a solve without the fault explains this share of the rays more. A larger share refutes more."""
+"""A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
+more."""
 _QUIETER = 0.5
 """If a solve needs noise, a finding stands if its corrected log needs at most this share of the noise. A larger share
 refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with mirrored images, because with these the
@@ -52,7 +53,7 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
     fault explains them no better. If the solution needs noisy odometry, the log without the fault must need it too. If the
     log without the fault needs noisy odometry, the finding is right only if the solution needs far more noise, of any kind.
     "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree on the objects.
-    "frames": the finding is wrong if the rays of the solution do not fit by whole frames.
+    "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
     """
     kept = tuple(
         one

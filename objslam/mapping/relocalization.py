@@ -1,4 +1,4 @@
-"""Assign the rays of a solved log anew, along the most likely path through its map."""
+"""Assign the rays of a solved log again, along the most likely path through its map."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from objslam.triangulation.point_to_lines import PointSolution, minimise_distanc
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
 """The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle."""
-_NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score alike.
+_NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score the same.
 _MOST_NOISE = 0.25  # Noise takes at most this share of the view. With a larger share, very noisy rays agree with any point.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
 _MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end earlier if the agreement stops growing.

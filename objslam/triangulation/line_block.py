@@ -97,8 +97,8 @@ def full(six: Tensor) -> Tensor:
 
 def solve_symmetric(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """Return x (3, B) with A x = b by Cramer's rule, and the regularity (B,) of A, from 0 to 1. The regularity is the
-    determinant over the cube of the mean eigenvalue. a: (6, B) positive semidefinite. b: (3, B). If A is singular, x has no
-    meaning."""
+    determinant divided by the cube of the mean eigenvalue. a: (6, B) positive semidefinite. b: (3, B). If A is singular, x
+    has no meaning."""
     xx, yy, zz, xy, xz, yz = a
     c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     determinant = xx * c0 + xy * c1 + xz * c2

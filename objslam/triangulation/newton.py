@@ -12,7 +12,8 @@ from objslam.triangulation.line_block import LineBlock, dot, norm, solve_symmetr
 _WEIGHTED_STEPS = 3
 """The number of weighted least-squares steps before Newton's. With fewer, outliers keep more weight."""
 _SMOOTHING = 0.05
-"""A line at distance d has the weight 1 / sqrt(d^2 + this^2), in mean distances. More keeps more weight on outliers."""
+"""A line at distance d has the weight 1 / sqrt(d^2 + this^2), in mean distances. A larger value keeps more weight on
+outliers."""
 _SINGLE_STEPS = 3
 """The most Newton steps in single precision, which take half the time of those in double precision. More steps do not
 improve a single-precision point."""

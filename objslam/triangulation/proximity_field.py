@@ -33,7 +33,7 @@ class ProximityField:
 
 
 def proximity(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the mean distance (...), m, of points (..., 3) from R > 0 rays: the cost of Eq. 1 over R.
+    """Return the mean distance (...), m, of points (..., 3) from R > 0 rays: the cost of Eq. 1 divided by R.
 
     origins: (R, 3) m. directions: (R, 3) unit.
     """

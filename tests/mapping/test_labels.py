@@ -58,7 +58,7 @@ def test_too_little_noise_in_the_settings_makes_no_second_object(seed, changes):
     result, ledger = mapped(log, *THIRD)
     assert result.summary["rounds"] == []  # one object for each label
     assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)
-    (said,) = [warning for warning in ledger.warnings if "the settings say too little noise" in warning]
+    (said,) = [warning for warning in ledger.warnings if "the settings have too little noise" in warning]
     assert "noise.odometry=true, noise.rays=true" in said
 
 

@@ -167,8 +167,8 @@ def test_what_cannot_be_used_is_counted(tmp_path: Path) -> None:
         "depth images without a colour image": 1,
         "depth image that cannot be decoded": 1,
         "depth image that is in colour or does not have the camera's size": 1,
-        "depth images without a depth in reach": 1,
-        "colour image that cannot be decoded or has not the camera's size": 1,
+        "depth images without a depth up to reconstruction.max_depth": 1,
+        "colour image that cannot be decoded or does not have the camera's size": 1,
     }
     for path in depth:
         path.write_bytes(b"")

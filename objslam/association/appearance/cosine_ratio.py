@@ -1,8 +1,9 @@
 """The likelihood ratio of a cosine between appearance vectors: one object against two objects of one label.
 
 Both densities are Gaussians with a random effect, learnt from the boxes of a log. The mean of the cosines between m boxes
-and n boxes has the variance between + within (1/m + 1/n). `between` is that of objects, or of pairs of objects, and `within`
-that of single boxes. With few boxes, both densities are near each other, so the ratio is near 1.
+and n boxes has the variance between + within (1/m + 1/n). `between` is the variance between objects (or pairs of objects),
+and `within` is the variance between single boxes. With few boxes, both densities are near each other, so the ratio is near
+1.
 """
 
 from dataclasses import dataclass
@@ -13,11 +14,12 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 _PRIOR = 20.0
-"""The number of pairs that weigh as much as the assumptions. It is assumed that boxes of one object are as alike as
-boxes of two, and that labels do not differ. A larger number needs a longer log to learn from."""
+"""The weight of the prior, as a number of pairs. In the prior, boxes of one object are as alike as boxes of two objects, and
+all labels are equal. A larger number needs a longer log to learn from."""
 _LEAST_APART = 0.3
-"""The least distance between the two means, in standard deviations of the cosine of a box and an object with many boxes. A
-larger distance leaves more weak vectors unused. Random vectors are 0.1 apart in a log of a few hundred boxes."""
+"""The least distance between the two mean cosines for vectors to be used, in standard deviations of the cosine of a box and
+an object with many boxes. A larger distance leaves more weak vectors unused. Random vectors are 0.1 apart in a log of a few
+hundred boxes."""
 _LEAST_SHARE = 1e-3
 """The least share of `between` in the variance, and the least variance. It only keeps the ratio finite."""
 MOST_RATIO = 3.0
@@ -106,8 +108,8 @@ def _density(pairs: Pairs, prior: tuple[float, float], labels: int) -> Density:
 
 
 def _intraclass_correlation(off: Floats, group: Ints) -> float:
-    """Return the correlation of two deviations (P,) of one group. With few pairs it is near 1, which makes many boxes worth
-    no more than one."""
+    """Return the correlation of two deviations (P,) of one group. With few pairs it is near 1. Then many boxes count no more
+    than one."""
     _, number = np.unique(group, return_inverse=True)
     size, total, squares = (np.bincount(number, weights) for weights in (None, off, off**2))
     several = size > 1

@@ -1,4 +1,4 @@
-"""Find objects that few rays show, among the rays that the global association leaves over.
+"""Find objects from few rays, among the rays to which the global association gave no object.
 
 The objects of the global association stay as they are. A new object needs no least number of rays: it has to be likelier
 than stray boxes that meet by chance.
@@ -28,9 +28,9 @@ _MOVING = 6
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
 _POWER = 0.4
-"""The power of the likelihood of strays in a probability. The boxes of near objects mix, so strays are less independent than
-they are taken to be. On simulated streets, 0.5 makes the probabilities as large as the shares of objects that are there. A
-larger power gives more certain objects. The least odds of an object stay 0 with any power."""
+"""The factor on the log odds against strays in a probability. It is below 1, because boxes of near objects mix, so strays
+are not independent. On simulated streets, the probabilities are right with 0.5. A larger factor gives more certain
+objects."""
 _SAMPLE = 512  # The most rays of one label in a search, in whole frames. A larger number costs time squared.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
@@ -48,7 +48,7 @@ def add_few_ray_objects(
     position_sigma: float,
     seed: int = 0,
 ) -> Association:
-    """Return the association with the objects that few rays without an object show. They come after the other objects.
+    """Add the objects that can be found from a few unassigned rays. They come after the other objects.
 
     rays, keyframes: all observed frames and their rays. positions: (N, 3) m of the objects, NaN where unknown.
     map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, position_sigma: m, the noise of the rays' angles and origins.
@@ -180,7 +180,7 @@ def _alike_odds(state: State) -> Floats:
         return np.zeros(state.count)
     each = state.looks.ray_odds(state.obs, state.assigned, state.owner, np.ones(len(state.owner), dtype=bool))
     number = np.maximum(state.looks.number, 1)
-    # The first ray has no other one to look like. In the sum over the rays, each is compared with all others.
+    # The first ray of a landmark has no ray to be compared with. The sum compares each ray with all others.
     return np.asarray(np.bincount(state.owner, each, state.count) * (number - 1) / number)
 
 

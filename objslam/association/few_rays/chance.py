@@ -27,19 +27,19 @@ _OUTSIDE = 1e-6
 _LOG_RANGE = 4.6
 """The width of the uniform density of ln range if no range is known. It is a factor of 100 in range."""
 _WRONG_RANGE = 0.1
-"""The share of correct boxes with a wrong range. A larger share trusts ranges less."""
+"""The assumed share of correct boxes that have a wrong range. A larger share trusts ranges less."""
 _TRIED = 25
-"""The number of shares of strays, and of densities of objects, that are tried. A larger number is more exact."""
+"""The number of tried values, for the share of strays and for the density of objects. A larger number is more exact."""
 _DENSITIES = (1e-4, 10.0)
 """The limits of the factor on the density of objects that follows from the density of boxes. Objects do not lie everywhere
 where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
 _PRIOR_STRAYS = 1.0
 """The number of strays of each label that are assumed beside those of the log. A larger number keeps fewer landmarks."""
 _LOOK = np.radians(2.0)
-"""The angle (rad) between two rays at their landmark from which on strays on them are independent. It is the least parallax
-of a position. A larger angle drops more of what moves, and of what is seen from nearly one place."""
+"""Two rays of a landmark count as independent if the angle (rad) between them is at least this. It is the least parallax of
+a position. A larger angle drops more moving objects, and more objects that were seen from nearly one place."""
 _PRIOR = 0.5
-"""The prior share of boxes that see an object. A larger share keeps more landmarks with few rays."""
+"""The prior share of boxes that show an object. A larger share keeps more landmarks with few rays."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class _Density:
     def of(cls, x: Floats, label: Ints, labels: int, noise: Floats, reach: float = 0.0) -> "_Density":
         """Estimate densities from values (R,) and their noise (L,), with a Gaussian kernel. Values can reach `reach`.
 
-        Few boxes leave gaps between their kernels. So a uniform density weighs more where fewer boxes lie in a kernel.
+        Few boxes leave gaps between their kernels. So a uniform density is added. Its weight is larger if fewer boxes lie in
+        a kernel.
         """
         pad = 2 * float(noise.max(initial=1e-6))
         low, high = (float(x.min()) - pad, float(x.max()) + pad) if len(x) else (-pad, pad)
@@ -106,8 +107,8 @@ class Strays:
         """Estimate the density from all boxes of the log.
 
         The coordinates in the image are the angle about the vertical axis of the camera and the sine of the angle to its
-        horizontal plane. Equal areas are equal solid angles. The coordinates are taken as independent, so boxes that all lie
-        in one row need no rule of their own.
+        horizontal plane. Equal areas are equal solid angles. The coordinates count as independent. So boxes that all lie in
+        one row need no special rule.
         """
         x, y, z = np.einsum("rji,rj->ir", view.map_T_camera[obs.frame, :3, :3], obs.direction)
         known = np.flatnonzero(np.isfinite(obs.range))
@@ -131,7 +132,7 @@ class Strays:
         return replace(self, image=self.image[rays])
 
     def per_frame(self, number: Floats | float) -> Floats:
-        """Return the mean number of strays in a frame. At least one stray is taken to be in the log."""
+        """Return the mean number of strays in a frame. At least one stray is assumed in the log."""
         return np.asarray(np.maximum(number, 1.0) / max(self.frames, 1))
 
     def along(self, distance: Floats, label: Ints) -> Floats:
@@ -152,7 +153,7 @@ def ray_odds(
     noise: Floats | float,
     gate: float,
 ) -> tuple[Floats, Floats]:
-    """Return the log odds (..., R) that each ray sees its point and is no stray, and the density of strays, m^-2.
+    """Return the log odds (..., R) that each ray shows its point and is no stray, and the density of strays, m^-2.
 
     number: (..., R) strays of the label in the log. off2, distance: (..., R) m^2, m, of the point from the ray and from the
     camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs no more.
@@ -253,8 +254,8 @@ def _likeliest(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: 
 def log_places(state: State, strays: Strays, rates: Rates) -> Floats:
     """Return ln of the number (N,) of places that each landmark could have been at.
 
-    It is the volume in which its rays leave its position, against the density of objects. This density is taken from the
-    boxes at its rays: each object is detected in a frame with the rate of its class.
+    It is the volume to which the rays confine the position, times the density of objects. This density follows from the
+    boxes at the rays, because each object is detected in a frame with the rate of its class.
     """
     held, owner, label = state.assigned, state.owner, state.label
     distance = np.maximum(state.distance, 1e-3)

@@ -40,8 +40,8 @@ class SparseSearch:
 def discover_sparse(obs: Observations, search: SparseSearch) -> Floats:
     """Return the points (N, 3) m on which rays of one label agree better than by chance. The surest point comes first.
 
-    A point takes the rays with positive odds, at most one in each frame. A point that loses a ray to a surer one is judged
-    again without this ray.
+    A point takes the rays with positive odds, at most one in each frame. A surer point can take one of its rays. Then the
+    point is judged again without this ray.
     """
     points, free, found = _propose(obs, search), np.ones(len(obs), dtype=bool), list[Floats]()
     while len(points):

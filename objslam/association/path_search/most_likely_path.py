@@ -1,10 +1,10 @@
 """Find the most likely path of a robot through a map of landmarks, when each ray may belong to any landmark.
 
-A path that is bent onto wrong landmarks fits them well, so no small change of it or of one ray helps. This search is global:
-it moves whole visits from landmarks to their neighbours. It is Markov localisation on a grid (Fox, Burgard and Thrun 1999).
-The states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays tell how well a state
-fits the map, and the odometry tells how well the states of two stretches fit together. Dynamic programming finds the most
-likely states of all stretches (Viterbi 1967).
+A path that is bent onto wrong landmarks fits them well, so no small change improves it. This search is global: it moves
+whole visits from landmarks to their neighbours. It is Markov localisation on a grid (Fox, Burgard and Thrun 1999). The
+states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays tell how well a state fits
+the map, and the odometry tells how well the states of two stretches fit together. Dynamic programming finds the most likely
+states of all stretches (Viterbi 1967).
 """
 
 from dataclasses import dataclass
@@ -47,8 +47,8 @@ def most_likely_path(
 ) -> LikelyPath | None:
     """Return the most likely path through a map, None if no label has two landmarks to confuse.
 
-    Corrections are planar, as the drift of wheels, and reach a few neighbouring landmarks far. A landmark that is rarely
-    detected costs more, so a second copy of a landmark loses its rays. Frames may give two rays to one landmark.
+    Corrections are planar like the drift of wheels. They reach as far as a few neighbouring landmarks. A landmark that is
+    rarely detected costs more, so a second copy of a landmark loses its rays. Frames may give two rays to one landmark.
 
     keyframes: with odometry. map_T_base: (K, 4, 4) the present path. positions, label: (N, 3) m and (N,) of the landmarks,
     NaN without a position. rate: (N,) the share of the frames in view of each landmark that detect it.

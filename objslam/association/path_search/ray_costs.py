@@ -22,7 +22,7 @@ _RAYS_AT_ONCE = 2000
 
 @dataclass(frozen=True)
 class MapLandmarks:
-    """N landmarks: position (N, 3) m, label (N,), and rarity (N,), the cost of a ray to it beside its deviation."""
+    """N landmarks: position (N, 3) m, label (N,), and rarity (N,), the cost of a match in addition to the deviation."""
 
     position: Floats
     label: Ints

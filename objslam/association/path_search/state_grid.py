@@ -1,4 +1,4 @@
-"""The states of a stretch of a path: planar corrections on a grid, and the stretches of a path."""
+"""Divide a path into stretches. The states of a stretch are planar corrections on a grid."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +15,8 @@ STRETCH = 0.5
 """The drift of the heading in a stretch, in grid steps (one standard deviation). A larger value makes longer stretches, in
 which the odometry counts as exact."""
 _STRETCH_SHIFTS = 2.0
-"""The length of a stretch, in grid steps. A larger value makes longer stretches, to which fewer states apply well."""
+"""The length of a stretch, in grid steps. A larger value makes longer stretches, for which a single correction is less
+exact."""
 
 Cells = NDArray[np.float32]
 

@@ -25,7 +25,8 @@ _LEVELS = 250
 @dataclass(frozen=True)
 class Motions:
     """The motions between G stretches. error: (G - 1, 3) of the present path against the odometry in x, y (m) and yaw (rad),
-    along the axes of map. variance: (G - 1, 3) that the odometry lets it have. way: (G - 1, 2) m, from pivot to pivot."""
+    along the axes of map. variance: (G - 1, 3) of this error, from the odometry's drift. way: (G - 1, 2) m, from pivot to
+    pivot."""
 
     error: Floats
     variance: Floats

@@ -31,7 +31,7 @@ class Problem:
         self._heights = b.position[order, 2] + b.label[order] * 4 * self.apart
 
     def nearest(self, moved: Floats, index: Ints) -> Ints:
-        """Return the nearest object (H, P) of the map b for each object of the map a. Both have the same label.
+        """Return for each object of map a the index (H, P) of the nearest object of map b with the same label.
 
         index: (H, P) the objects of a. moved: (H, P, 3) m, their positions in the frame of b.
         """
@@ -81,7 +81,7 @@ def jacobian_of(x: Floats, moved: Floats) -> Floats:
 
 
 def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Ints, Floats, Floats, Floats, Bools]:
-    """Match objects `index` (H, P) of a to the nearest objects of b, under transforms x (H, 4).
+    """Match objects `index` (H, P) of map a to the nearest objects of map b, under transforms x (H, 4).
 
     Return these partners (H, P), the offsets, covariances and Jacobians, and which match. hessian: (H, 4, 4) the information
     of the transforms, NaN before the first fit. Its inverse widens the gates.

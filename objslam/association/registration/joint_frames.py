@@ -32,11 +32,11 @@ _FEWEST_MAPS = 3
 """The least number of maps that have a noise each. With fewer, all have one noise, because the residuals of two maps do not
 tell which is worse. A larger number gives more maps one noise."""
 _POOLED = 10.0
-"""The covariances that a map comes with count as this number of coordinates of residuals. A larger number trusts them
-longer. At 10, a map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
+"""A map's given covariances weigh as much as this number of residuals. A larger number trusts them more. At 10, a map of a
+few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
 _AGAIN = 0.01
 """The standard deviation (m) that each map adds to the errors that are not shared. A larger value trusts small distances in
-maps less. Without it, one pair of nearly exact objects would decide about the shared errors."""
+maps less. Without it, one pair of nearly exact objects would fix the shared errors."""
 _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 """Squared lengths of normal residuals (chi-squared, 3 degrees of freedom) at equal steps of probability. The mean over them
 gives the expectation of a weighted squared residual. More steps give it more exactly."""
@@ -119,7 +119,7 @@ def solve_frames(measured: Measured, site_T_map: Floats, count: int, *, judged: 
 
 
 def _noise(measured: Measured, at: _State) -> Floats:
-    """Return the factor (S,) on the covariances of each map: its squared residuals over their expectation."""
+    """Return the factor (S,) on the covariances of each map: its squared residuals divided by their expectation."""
     found = at.found
     moved, _, rotation = _moved(measured, _frames(found.site_T_map), at.errors, found.positions)
     claimed = np.linalg.inv(rotation @ measured.covariance @ np.swapaxes(rotation, 1, 2))
@@ -170,7 +170,7 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
         if np.abs(step).max(initial=0.0) < _STILL:
             break
         weight = np.where(alone, 1.0, 1 / (1 + np.einsum("ri,rij,rj->r", miss, plain, miss) / HALF_RAY))
-    # Normal residuals have weights below 1 too. Without their mean, the covariances of normal errors would be too large.
+    # Normal residuals have weights below 1 too. Without a division by their mean, the covariances would be too large.
     information = information / _mean_weight(information, total, measured.object)[:, None, None]
     total = _sums(information, measured.object, count)
     system, _, half = _reduced(measured, lever, information, total, miss, errors)
@@ -198,7 +198,7 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
 def _mean_weight(information: Floats, total: Floats, object_: Ints) -> Floats:
     """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3). total: (N, 3, 3), its sums."""
     share = np.trace(information @ np.linalg.inv(total)[object_], axis1=1, axis2=2)
-    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The position of an object takes its share.
+    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The fit of an object's position takes its share.
     return np.asarray((1 / (1 + left / HALF_RAY)).mean(axis=1))
 
 

@@ -128,8 +128,8 @@ def _nothing() -> Registration:
 
 
 def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
-    """Fit the best transforms to the objects around their pair, then to more, then to all (`_STAGES`). Return those left
-    (H, 4). first: the first object of a in the pair of each transform."""
+    """Fit the best transforms to the objects around their pair, then to more, then to all (`_STAGES`). Return the remaining
+    ones (H, 4). first: the first object of a in the pair of each transform."""
     for size, entering in _STAGES:
         first, x = first[:entering], x[:entering]
         index = around(problem.a, first, size)
@@ -153,7 +153,7 @@ def _everything(problem: Problem, x: Floats) -> Ints:
 
 
 def _differ(x: Floats, other: Floats) -> Bools:
-    """Return which transforms (H, 4) are another place than the transform `other` (4,)."""
+    """Return which transforms (H, 4) are at another place than the transform `other` (4,)."""
     turn = (x[:, 3] - other[3] + np.pi) % (2 * np.pi) - np.pi
     return np.asarray((np.hypot(*(x[:, :2] - other[:2]).T) > _SAME_SHIFT) | (np.abs(turn) > _SAME_TURN))
 

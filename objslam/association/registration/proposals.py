@@ -78,7 +78,7 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
 
 
 def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
-    """Return how many neighbours of an object fall on neighbours of another object when one is laid on the other: (H,).
+    """Return the number (H,) of neighbours that coincide when an object of map a is laid on an object of map b.
 
     i: (H,) the object of the map a. k: (H,) the object of the map b. Only neighbours with the same label count.
     yaw, turn_variance: (H,) rad and rad^2, the heading of each proposal and its variance.

@@ -82,7 +82,7 @@ def live(
     if resume and not journal:
         raise ConfigError("--resume needs the journal, and --no-journal disables it", hint="leave out one of them")
     if publish_tf and source == "rclpy":
-        raise ConfigError("--publish-tf and rclpy: the session would hear its own tf", hint="use the source dds")
+        raise ConfigError("with rclpy, --publish-tf would send the session its own tf", hint="use the source dds")
     settings = settings_of("joint", config, set_, calibration, options.class_names)
     _say_what_is_not_used(source, options, speed, publish or publish_tf)
     known = None if map_ is None else prior_map(map_)

@@ -19,8 +19,8 @@ slower."""
 _SAMPLE = 20_000
 """The most vectors from which the directions of the shortened vectors are found. A larger number takes longer."""
 _ROUNDING = 1e-6
-"""A vector stays unchanged, bit by bit, if its length differs from 1 by no more. A larger value leaves more vectors inexact.
-The length of a unit vector that was rounded to 32 bits differs by a tenth of this."""
+"""A vector stays unchanged, bit by bit, if its length differs from 1 by at most this. A larger value leaves more vectors
+inexact. The length of a unit vector that was rounded to 32 bits differs by a tenth of this."""
 _UNIT = 1e-3  # How far the length of a stored vector may be from 1. A larger value accepts worse vectors.
 
 
@@ -75,7 +75,8 @@ def short_numbers(vector: Floats32) -> list[float] | None:
 
 
 def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
-    """Return the unit vector (D,) under the key `features` of a JSON object, None without one. ValueError if not."""
+    """Return the unit vector (D,) under the key `features` of a JSON object, None without one. ValueError if it is no such
+    vector."""
     value = entry.get("features")
     if value is None:
         return None

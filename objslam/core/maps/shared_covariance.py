@@ -1,9 +1,9 @@
 """The error that all objects of a map share: the map as a whole is shifted, turned, and too large or too small.
 
-The path drifts between the start and the objects, and no measurement may tell the size of the map exactly. Both move all
-objects together. So the error of an object at p is e_shift + e_turn x p + e_size p, plus an error of its own. The seven
-numbers of the shared error are a shift (m), a rotation vector (rad) and the logarithm of a size, at the origin of the frame.
-Their covariance is one matrix for the whole map. The covariance of each object contains its part.
+The path drifts between the start and the objects, and the size of the map may be uncertain. Both move all objects together.
+So the error of an object at p is e_shift + e_turn x p + e_size p, plus an error of its own. The seven numbers of the shared
+error are a shift (m), a rotation vector (rad) and the logarithm of a size, at the origin of the frame. Their covariance is
+one matrix for the whole map. The covariance of each object contains its part.
 """
 
 import numpy as np
@@ -16,10 +16,10 @@ NUMBERS = 7
 SIZE = 6
 """The place of the size in a shared error."""
 _FEWEST = 3
-"""The least number of objects with a shared error. Two objects do not tell a turn about their line."""
+"""The least number of objects with a shared error. Two objects do not determine a turn about their line."""
 _FLOOR = 1e-3
 """The least standard deviation (m) of an object's own error. A larger value keeps linear systems better conditioned, and
-takes less of exact maps as shared. This value is far below the errors of real maps."""
+counts less of the errors of exact maps as shared. This value is far below the errors of real maps."""
 _INDEFINITE = 1e-10
 """The least eigenvalue of the information about the shared error, relative to the largest one, with lengths in units of the
 map's extent. Directions below it have no shared error. A larger value leaves out more directions."""
@@ -39,11 +39,11 @@ def shared_covariance(points: Floats, covariance: Floats, factor: Floats) -> Flo
     """Return the covariance (7, 7) of the shared error of objects at points (N, 3), None for fewer than three objects.
 
     covariance: (N, 3, 3) m^2 of the objects. factor: (N, 3, m) m, the part of their errors that is correlated: the joint
-    covariance is its product with its own transpose, plus a block for each object. The result is the covariance of the best
-    linear estimate of the seven numbers from objects with this joint covariance, less that from objects with the blocks
-    alone (Gauss and Markov). It is exact if all correlated errors are shifts, turns and sizes. Other correlated errors, such
-    as bends of the path, then count as errors of the objects. The covariance of each object is never below its part of the
-    shared error.
+    covariance is its product with its own transpose, plus a block for each object. The seven numbers are estimated from the
+    objects by the best linear estimate (Gauss and Markov): once with this joint covariance, once with the blocks alone. The
+    result is the covariance of the first estimate minus that of the second. It is exact if all correlated errors are shifts,
+    turns and sizes. Other correlated errors, such as bends of the path, then count as errors of the objects. The covariance
+    of each object is never below its part of the shared error.
     """
     if len(points) < _FEWEST or not factor.shape[2]:
         return None

@@ -39,8 +39,8 @@ class Job:
     """The part that the tasks of all logs of a fleet share.
 
     store: the path or URL of the output. options: those of the sources. digest: the hash of all that decides a result
-    besides its log. files: the dotted key of each setting that names a file, an option of `OPTION_FILES`, or `detector`,
-    with the path of the file, or with its name in a remote store. report: whether to write the report of each log.
+    besides its log. files: the path of each file, or its name in a remote store, by key. The key is a dotted setting, an
+    option of `OPTION_FILES`, or `detector`. report: whether to write the report of each log.
     """
 
     store: str

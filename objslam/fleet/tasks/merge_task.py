@@ -48,8 +48,8 @@ class Placed:
     """A session in the frame of its island.
 
     key: the key of its result. covariance: (4, 4) of x, y, z (m) and yaw (rad). log_odds: the evidence for its place among
-    the earlier sessions, NaN for the first. If it is the first of a part of the site, the evidence is that of the whole
-    part. common: how many of its objects other sessions share, from the first merge with any.
+    the earlier sessions, NaN for the first. The first session of a merged part has the evidence for the whole part. common:
+    how many of its objects other sessions share, counted in the first merge that finds any.
     """
 
     key: str

@@ -15,8 +15,8 @@ from objslam.graph.calibration.variance_components import correlation_time
 def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
 
-    A factor is the standard deviation by sums over windows of `correlation_time` seconds, divided by the one for white
-    noise. system: the linear system of the graph `of`.
+    A factor is the standard deviation from sums over windows of `correlation_time` seconds, divided by the standard
+    deviation for white noise. system: the linear system of the graph `of`.
     """
     jacobian = system.jacobian
     told = np.column_stack([system.residual, system.instruments, system.sides])

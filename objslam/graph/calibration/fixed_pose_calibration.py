@@ -46,7 +46,7 @@ class PointSystem:
 
     matrix: (P, P). vector: (P,) half the gradient of the cost. cost: the sum of the weighted squared deviations. variance:
     the factor (at least 1) by which the cost exceeds its expectation. curvature: 0 to 1, the mean curvature of Cauchy's loss
-    over the mean curvature of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3, P) the
+    divided by that of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3, P) the
     derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
     """
 
@@ -158,11 +158,12 @@ def linearise_points(
 
 
 def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
-    """Return the factor (at least 1) on the variance of `system.vector` because the errors of rays are not independent.
+    """Return by which factor (at least 1) dependent errors of rays increase the variance of `system.vector`.
 
     Rays of one frame share the error of its pose. Rays of some seconds share the error of the localisation, or of the
     detector. The sums over stretches of the drive show this (cluster-robust covariance; Liang and Zeger 1986). The largest
-    factor of all shared errors is used. prior: (P, P) information. An error is ignored if its prior says more than the rays.
+    factor of all shared errors is used. prior: (P, P) information. An error is ignored if its prior has more information
+    than the rays.
     """
     told = np.diagonal(system.matrix) > np.diagonal(prior)
     if not told.any():
@@ -183,9 +184,9 @@ def _across(
 ) -> tuple[Floats, Floats]:
     """Return the angles (n, 2) between rays and points, in standard deviations, and their derivatives by the points.
 
-    angle: (n,) rad, the noise of directions. place: m, the noise of origins. If the noise is trusted, the derivatives
-    contain those of the standard deviation, which depends on the distance. Otherwise the noise would shift the errors of the
-    camera and the points in one direction, and more rays would not reduce this bias.
+    angle: (n,) rad, the noise of directions. place: m, the noise of origins. The standard deviation depends on the distance.
+    If the noise is trusted, the derivatives contain those of the standard deviation. Without them, the noise would bias the
+    errors of the camera and the points, and more rays would not reduce this bias.
     """
     to = target - origins
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)

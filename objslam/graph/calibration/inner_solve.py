@@ -26,8 +26,8 @@ _TOLERANCE = 1e-4
 class InnerSolve(Linearised):
     """A graph for given parameters, with its variables near their optimum.
 
-    stale: the factorised normal equations of a state nearby, for the steps. None means those of this state. Steps with stale
-    ones cost a fifth, because no matrix is built and factorised.
+    stale: the factorised normal equations of a state nearby, for the steps. None means that the state uses its own. A step
+    with stale equations takes a fifth of the time, because no matrix is built and factorised.
     """
 
     stale: NormalEquations | None = None
@@ -81,8 +81,8 @@ class InnerSolve(Linearised):
         """Return the state after at most `_INNER` steps, or `_damped` if a step does not lower the cost.
 
         A step takes the normal equations of the step before (chord method). Between steps, only the robust weights and the
-        directions change, and both little. The gradient is fresh, so the steps lead to the same optimum as those of
-        Gauss-Newton. If a chord step does not lower the cost, the step is taken with fresh normal equations instead.
+        directions change a little. The gradient is fresh, so the steps lead to the same optimum as those of Gauss-Newton. If
+        a chord step does not lower the cost, the step is taken with fresh normal equations instead.
         """
         state = self
         for _ in range(_INNER):

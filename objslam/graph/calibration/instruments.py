@@ -13,9 +13,10 @@ from objslam.graph.calibration.linearised_graph import Linearised
 ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
 """Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
 _ALIKE = 3.0
-"""The largest ratio of the variances that neighbours predict to the own variances of a motion, and of the reverse. With a
-larger ratio, motions that differ from their neighbours make the parameters less certain: with 10, the clock of a robot that
-often stands had a standard deviation five times as large. With a smaller ratio, the noise of a motion changes its weight."""
+"""The largest ratio between the variances that neighbours predict and the variances of the motion itself, in both
+directions. With a larger ratio, motions that differ from their neighbours make the parameters less certain: with 10, the
+clock of a robot that often stands had a standard deviation five times as large. With a smaller ratio, the noise of a motion
+changes its weight."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +24,9 @@ class Motions:
     """The measured motions in the graph: s twists of base, with the rotation first.
 
     to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. weight: (s,) robust. covariance: (s, 6, 6) of the
-    twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their standard deviations. The rest is
-    of the interpolated path. seconds: (s,) durations. rows: of the motions in the linear system. tied: the share of the
-    motions between keyframes that are below ties.
+    twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their standard deviations. The rest
+    comes from the interpolated path. seconds: (s,) durations. rows: of the motions in the linear system. tied: the share of
+    the motions between keyframes that are below ties.
     """
 
     to_twist: Floats
@@ -73,7 +74,7 @@ class Motions:
 
 
 def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Floats) -> Floats:
-    """Return instruments (M, p): the sides, but without the noise of motions in scales of the odometry, and in weights.
+    """Return instruments (M, p): the sides without the noise of motions in the scales of the odometry and in the weights.
 
     The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
     if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is independent
@@ -104,7 +105,7 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
     """Predict motions (n, D) at the rate of four motions near each: two before, two after. seconds: (n,) the durations.
 
-    The motions next to it do not count: they may share a step of the odometry with it, and so share its noise.
+    The motions directly beside a motion do not count: they may share a step of the odometry with it, and so its noise.
     """
 
     def near(values: Floats) -> Floats:

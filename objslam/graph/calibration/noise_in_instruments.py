@@ -21,18 +21,18 @@ standard deviation of the gradient."""
 def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasurements) -> Floats:
     """Return the shares (P,) of the information that come from noise of the odometry.
 
-    Only scales of the odometry and clocks have such noise. For a scale, it is the product of the noise in the instrument and
-    in the eliminated side. Neighbours have independent noise, but the poses that are eliminated spread the noise of a motion
-    over the residuals of its neighbours. For a clock, it is the square of the noise in the eliminated side. The products are
-    traces, which random probes measure (Hutchinson 1990). A probe is a random walk at the stamps of the odometry, because
-    keyframes between two stamps share a step. The noise is at most as rough as the measured motions, and leaves at most the
-    residuals of the solution. Commanded motions are smooth: their residuals come from the robot and not from the
-    measurement, so the sides have no noise.
+    Only scales of the odometry and clocks have such noise. For a scale, the share is the expected product of the noise in
+    its instrument and in its eliminated side. The noise of neighbours is independent, but the eliminated poses spread the
+    noise of a motion over the residuals of its neighbours. For a clock, the share is the expected square of the noise in its
+    eliminated side. These expectations are traces, which random probes measure (Hutchinson 1990). A probe is a random walk
+    at the stamps of the odometry, because keyframes between two stamps share a step. The noise is limited by the roughness
+    of the measured motions and by the residuals of the solution. Commanded motions are smooth: their residuals come from the
+    robot and not from the measurement, so the sides have no noise.
 
     Below ties, the solved path is the instrument of clocks. An interpolated pose has a mean of the noise of two poses of the
-    odometry, so clocks that move the ends of ties away from these poses seem better. From motion to motion this cancels,
-    because keyframes have all shares of a step, but ties end at about the same share if the rates of images and odometry
-    fit. On simulated wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
+    odometry, so clocks that move the ends of ties away from these poses seem better. For motions between keyframes this
+    cancels, because keyframes lie at all shares of a step. Ties end at about the same share if the rates of images and
+    odometry fit. On simulated wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
     """
     names, clocks = errors.names, {} if system.clocks is None else system.clocks.moved
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}

@@ -34,8 +34,9 @@ known, and 1 or 2 after. A larger number is slower."""
 _CONVERGED = 0.2
 """A parameter has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _NEARLY = 2.0
-"""The same before the noise is known. The search goes on with the new noise, so its first part may end near the optimum. A
-larger number ends it sooner, but then the residuals from which the noise is estimated contain more of the shared errors."""
+"""The limit of `_CONVERGED` before the noise is known. The search goes on with the new noise, so its first part may end near
+the optimum. A larger number ends it sooner, but then the residuals from which the noise is estimated contain more of the
+shared errors."""
 _HALVINGS = 3
 """The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
@@ -49,8 +50,8 @@ _SAME_NOISE = 0.1
 """The relative change of the noise below which it is not estimated again. A larger value ends sooner."""
 
 _SAME_SHARES = 0.5
-"""The relative change of the noise below which its shares in the information stay as they were. They change slowly with the
-noise. A larger value computes them less often."""
+"""The shares of noise in the information are computed again if the noise changes by more than this share. They change slowly
+with the noise. A larger value computes them less often."""
 
 _LEAST_GROWTH = 0.5
 """The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
@@ -169,7 +170,7 @@ class _Outer:
         return bool((np.abs(step) < share * self.deviations).all())
 
     def cost_of_signal(self, cost: float, other: Floats) -> float:
-        """Return the cost at other parameters (P,) without noise of the odometry, which pulls at them and bends the cost."""
+        """Return the cost at other parameters (P,), corrected for the noise of the odometry, which biases the cost."""
         moved = other - self.theta
         bent = self.system.information - self.information
         return float(cost - (self.gradient - self.system.descent) @ moved - moved @ bent @ moved / 2)
@@ -185,7 +186,7 @@ class _Fit:
 
     @property
     def prior_residuals(self) -> float:
-        """The weight of the nominal noise: it counts like this number of residuals."""
+        """The weight of the nominal noise, as a number of residuals."""
         return self.errors.settings.noise.prior
 
     def shared_errors(self, state: InnerSolve, theta: Floats, converged: float, noise: Floats | None = None) -> _Found:
@@ -250,9 +251,9 @@ def _likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:
     """Return the weights (P, P) of the system's gradient, and the information (P, P) that it has about the parameters.
 
     The gradient g is Gaussian: its mean is the slope C times the error of the parameters, and V is its variance. So the
-    weights are C' V^-1 and the information is C' V^-1 C (limited information likelihood; Kim 2002). They are 1 and C where
-    the sides have no noise. Where a side has only noise, V is large, C is small, and the log tells nothing: the parameters
-    stay at their prior. SolveError if the system is not finite.
+    weights are C' V^-1 and the information is C' V^-1 C (limited information likelihood; Kim 2002). If the derivatives by
+    the parameters have no noise, the weights are 1 and the information is C. If they are only noise, V is large, C is small,
+    and the parameters stay at their prior. SolveError if the system is not finite.
     """
     variance, slope = system.variance, system.slope
     if not (np.isfinite(variance).all() and np.isfinite(slope).all()):
@@ -284,8 +285,8 @@ def _without_shrinking(
 ) -> ReducedSystem:
     """Return the system without the force that makes a solution too small, because this force would move the parameters.
 
-    The force acts on a parameter as far as the size of the map depends on the parameter. If all lengths have an unknown
-    scale, everything can grow in proportion at no cost. In this case, only the force seems to determine the common scale. So
+    The more the size of the map depends on a parameter, the more the force acts on the parameter. If all lengths have an
+    unknown scale, everything can grow in proportion at no cost. Then nothing but the force determines the common scale. So
     the common scale is projected out (the gauge of a free network; Meissl 1969). If some length is known, the force is
     computed and subtracted.
     """
@@ -293,7 +294,7 @@ def _without_shrinking(
     if not len(landmarks):
         return system
     away = np.linalg.norm(landmarks - np.median(landmarks, axis=0), axis=1)
-    near = away <= _FAR * np.median(away)  # A poorly determined landmark is far off, and does not grow with the map.
+    near = away <= _FAR * np.median(away)  # A far landmark is poorly determined, and does not grow with the map.
     around = landmarks[near] - landmarks[near].mean(axis=0)  # Without the mean, a shift of the map would count as growth.
     moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
     size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)

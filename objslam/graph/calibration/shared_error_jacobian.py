@@ -37,8 +37,8 @@ class LinearSystem:
     correlate with the instruments. The instruments equal the sides, except for clocks and the scales of the odometry: these
     sides contain the noise of the odometry, and so do the residuals. motions: None if neither the odometry nor a clock is a
     parameter. clocks: None without a clock. by_path: (M, C) instruments of the C clocks by the solved path. noise: (P,) the
-    shares of noise in the information, from `noise_shares`. longer: (P,) by how much a parameter makes the noise in the
-    residuals longer than in its side.
+    shares of noise in the information, from `noise_shares`. longer: (P,) the ratio of the odometry's noise in the residuals
+    to that in the side of a scale, 0 for other parameters.
     """
 
     jacobian: sparse.csr_matrix
@@ -55,14 +55,14 @@ class LinearSystem:
     longer: Floats
 
     def with_noise(self, noise: Floats) -> Self:
-        """Return the system whose sides contain the shares (P,) of noise. They change the instruments of clocks."""
+        """Return the system for these shares (P,) of noise in its sides. They change the instruments of clocks."""
         instruments, columns = self.instruments.copy(), [] if self.clocks is None else list(self.clocks.moved)
         sides = self.sides[:, columns]
         instruments[:, columns] = sides + noise[columns] * (self.by_path - sides)
         return replace(self, instruments=instruments, noise=noise)
 
     def left(self, columns: Floats) -> Floats:
-        """Return what poses and landmarks leave of columns (M, n), by least squares."""
+        """Return the residuals of columns (M, n) after a least-squares fit by poses and landmarks."""
         return columns - self.jacobian @ self.normal.solve(self.jacobian.T @ columns)
 
     def reduce(self) -> "ReducedSystem":
@@ -83,8 +83,7 @@ class LinearSystem:
             velocity = self.clocks.changes(changes[-6 * poses :, :count].reshape(poses, 6, count))
             for k in self.clocks.moved:
                 share = self.noise[k]
-                # The side of a clock can be mostly noise. In products with other instruments, its instrument stands in for
-                # it.
+                # The side of a clock can be mostly noise. In products with other instruments, its instrument replaces it.
                 slope[others, k] = variance[others, k]
                 # The path, and with it the instrument, depends on the parameters too. Without this part, the noise that the
                 # path and the side have in common would be in the slope.

@@ -13,14 +13,15 @@ motions. A larger share uses it more rarely."""
 
 
 def shrinking_force(of: Linearised) -> tuple[float, float]:
-    """Return the force that makes a joint solution too small, and the curvature against it, both per logarithm of the size.
+    """Return the force that makes a joint solution too small, and the curvature of the cost. Both are derivatives by the
+    logarithm of the size.
 
     Noise in the rays makes the path jitter. This makes its steps longer than the steps of the odometry. A smaller map makes
-    them shorter again, at the least cost (errors in variables; Neyman and Scott 1948). The motion
-    residuals pull on the size. Part of the pull is real, and part comes from the noise of the measured motions. Motions that
-    are predicted from their neighbours do not have this noise, and show the real part. The force is the total pull less the
-    real part, at least 0. If the prediction is poor (`_LEAST_TOLD`), the total pull counts. Without odometry, or with a
-    localisation, there is no force. The curvature is the information of all measured lengths about the size.
+    the steps shorter again at the least cost (errors in variables; Neyman and Scott 1948). The motion residuals pull on the
+    size. Part of the pull is real, and part comes from the noise of the measured motions. Motions that are predicted from
+    their neighbours do not have this noise, and show the real part. The force is the total pull less the real part, at least
+    0. If the prediction is poor (`_LEAST_TOLD`), the total pull counts. Without odometry, or with a localisation, there is
+    no force. The curvature is the information of all measured lengths about the size.
     """
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     before, after = of.graph.moves

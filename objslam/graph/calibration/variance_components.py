@@ -27,8 +27,8 @@ _PROBES, _FEWEST_PROBES = 12, 4
 """The most and the fewest random probes. With n independent residuals, the relative error of the redundancy is
 sqrt(2 / (n * probes)). More probes are slower."""
 _PRODUCTS = 3000
-"""Enough independent residuals times probes: the redundancy is then wrong by 3 % (a standard deviation), and a factor by
-half of that. So a long log needs fewer probes than `_PROBES`. A larger number is more exact, and slower."""
+"""The sufficient product of independent residuals and probes. With it, the redundancy has a standard deviation of 3 %, and a
+factor has half of that. So a long log needs fewer probes than `_PROBES`. A larger number is more exact, and slower."""
 _ITERATIONS = 20
 """The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 5 to 12."""
 _CONVERGED = 0.01
@@ -46,7 +46,7 @@ larger number shortens the windows of short logs."""
 _MOST_SHRINKAGE = 0.3
 """The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger limit hides."""
 _PRIOR_OBJECTS = 4
-"""The range bias in the settings counts like this number of objects at the most. With a larger number, the bias changes
+"""The largest weight of the range bias in the settings, as a number of objects. With a larger number, the bias changes
 less."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
 """The factor from the mean absolute value of Gaussian numbers to their standard deviation."""
@@ -87,8 +87,8 @@ def estimate_noise(
 ) -> NoiseFactors:
     """Return the noise that agrees best with the residuals of a solved graph, as factors on the nominal noise.
 
-    system: of the graph, with the noise `errors.noise`, at the shared errors theta (P,). prior_residuals: in each kind, the
-    nominal noise counts like this number of residuals. Kinds of noise that are known keep their factor.
+    system: of the graph, with the noise `errors.noise`, at the shared errors theta (P,). prior_residuals: the weight of the
+    nominal noise in each kind, as a number of residuals. Kinds of noise that are known keep their factor.
     """
     kinds, rows = errors.unknown_noise, _rows(of, errors, theta)
     root = np.linalg.cholesky(np.linalg.inv(errors.prior)).T
@@ -206,7 +206,7 @@ def _updated(
     """Return the noise after one step of the iteration.
 
     kinds: the kinds of noise to estimate. left: (M, probes + 1) the probes and residuals after the solution. prior: the
-    nominal noise counts like this number of residuals.
+    weight of the nominal noise, as a number of residuals.
     """
     found = noise.to_dict(None)
     residual, kept, count = left[:, -1], left[:, :-1], probes.shape[1]

@@ -49,13 +49,13 @@ def motions(
 
 
 def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) -> Floats:
-    """Return the covariances (M, 6, 6) of motions by the interpolation between two poses of the odometry.
+    """Return the covariances (M, 6, 6) that the interpolation between poses of the odometry adds to motions.
 
     Like `Keyframes.drift`, they are in the frame of odom_T_base. Half of the noise of a motion inside a step is at each end.
 
     Args:
         before, after: (M,), (M,) the keyframes, with odometry.
-        walk: whether the path inside a step is a random walk that the poses of the odometry do not hold. Otherwise it is a
+        walk: whether the path inside a step is a free random walk, not fixed at the poses of the odometry. Otherwise it is a
             bridge (`frontend.odometry_bridge`).
     """
     if keyframes.step is None or keyframes.wander is None or keyframes.odom_T_base is None:

@@ -1,10 +1,10 @@
 """The motions by odometry that a graph gets: from keyframe to keyframe, and across the steps of a slow odometry.
 
-Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent: a robot that turned
-late in one motion turned more in the next, because the poses of the odometry hold the whole step. So the motions inside a
-step are loose, as those of a random walk, and a tie across the step says how far they go together. For a linear system this
-is exact: let motions with the shares d of a step have the noise D d of the odometry and the bridge W (diag(d) - d d'). Then
-their information is that of independent motions with the noise (D + W) d, and that of a tie: 1 / D - 1 / (D + W).
+Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent, because the odometry
+knows the whole step: a robot that turned late in one motion turned more in the next. So the motions inside a step get the
+loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact: let motions
+with the shares d of a step have the noise D d of the odometry and the bridge W (diag(d) - d d'). Then their information is
+the sum of two: that of independent motions with the noise (D + W) d, and that of a tie, 1 / D - 1 / (D + W).
 """
 
 from dataclasses import dataclass, replace
@@ -24,8 +24,9 @@ _LEAST_TOLD = 0.1
 fewer ties are used, and the motions below them count as independent. With a smaller one, faster odometry has ties too, which
 hardly change the solution but take time."""
 _NOTHING = 1e-6
-"""The least share of the information about a motion that a tie gives. A tie says nothing about directions in which the
-motions inside a step are not loose, and a matrix without information has no inverse. A larger share says more there."""
+"""A tie gives at least this share of the information about a motion in each direction, so that its information matrix has an
+inverse. A tie has no information in directions in which the motions inside a step are not loose. A larger share adds more
+false information there."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class OdometryMotions:
     """M camera motions: first those between consecutive keyframes, then the ties.
 
     before, after: (M,) the keyframes. motion: (M, 4, 4). noise: (M, 6, 6) of the odometry. wander: (M, 6, 6) of the
-    interpolated path, which adds to the noise. loose: (T, 6, 6) for each of the T ties, the same of the independent motions
-    below it.
+    interpolated path, which adds to the noise. loose: (T, 6, 6) for each of the T ties, the noise and wander of the
+    independent motions below it.
     """
 
     before: Ints
@@ -80,7 +81,7 @@ class OdometryMotions:
 
     @cached_property
     def covariance(self) -> Floats:
-        """(M, 6, 6), of a tie what it adds to the motions below it."""
+        """(M, 6, 6). The covariance of a tie is that of the information it adds to the motions below it."""
         covariance = self.noise + self.wander
         ties = slice(len(self) - len(self.loose), len(self))
         if len(self.loose):
@@ -89,7 +90,7 @@ class OdometryMotions:
 
 
 def _in_camera(keyframes: Keyframes, last: Ints, covariance: Floats) -> Floats:
-    """Return covariances (M, 6, 6), in the frame of odom_T_base, in the frames of the keyframes `last` (M,)."""
+    """Move covariances (M, 6, 6) from the frame of odom_T_base into the frames of the keyframes `last` (M,)."""
     if not covariance.any():
         return covariance
     assert keyframes.odom_T_base is not None
@@ -130,7 +131,7 @@ def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
 
 
 def _told(whole: Floats, loose: Floats) -> tuple[Floats, Floats]:
-    """Return the shares (T, 6) of the information 1 / `whole` that is not in 1 / `loose`, (T, 6, 6) both, and the axes."""
+    """Return the shares (T, 6) of the information 1 / `whole` that is not in 1 / `loose`, and the axes (T, 6, 6)."""
     root = np.linalg.cholesky(whole)
     back = np.linalg.inv(root)
     size, axes = np.linalg.eigh(back @ loose @ np.swapaxes(back, 1, 2))
@@ -138,6 +139,6 @@ def _told(whole: Floats, loose: Floats) -> tuple[Floats, Floats]:
 
 
 def _remaining(whole: Floats, loose: Floats) -> Floats:
-    """Return the covariance (T, 6, 6) that `loose` needs beside it to give the information of `whole`."""
+    """Return the covariance (T, 6, 6) whose information, added to that of `loose`, gives the information of `whole`."""
     told, axes = _told(whole, loose)
     return (axes / np.maximum(told, _NOTHING)[:, None]) @ np.swapaxes(axes, 1, 2)

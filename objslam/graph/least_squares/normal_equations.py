@@ -25,7 +25,8 @@ class NormalEquations:
 
     @property
     def least_pivot(self) -> float:
-        """The least pivot. The larger the entries of J^T J are beside it, the more digits the elimination has lost."""
+        """The least pivot. The smaller it is compared with the entries of J^T J, the more digits the elimination has
+        lost."""
         return float(self.factored.U.diagonal().min())
 
     @property
@@ -42,9 +43,9 @@ class NormalEquations:
     def last_block(self, columns: Ints, most: int) -> Floats | None:
         """Return the block (n, n) of the inverse at some columns (n,), if they are eliminated among the `most` last ones.
 
-        With J^T J = L U, the last block of the inverse is that of the last block of L times that of U. Landmarks are
-        eliminated late, because many poses see them. So their covariances come from a small dense matrix, where `solve`
-        would go through all poses for each column. None if a column is eliminated earlier.
+        With J^T J = L U, the last block of the inverse is the inverse of the last block of L times the last block of U.
+        Landmarks are eliminated late, because many poses see them. So their covariances come from a small dense matrix,
+        where `solve` would go through all poses for each column. None if a column is eliminated earlier.
         """
         rank = np.empty_like(self.order)
         rank[self.order] = np.arange(len(self.order))
@@ -60,7 +61,7 @@ class NormalEquations:
 
 
 def elimination_order(jacobian: sparse.csr_matrix, blocks: Ints) -> Ints:
-    """Return the columns (D,) of a Jacobian (M, D) in an order in which their elimination fills in little (minimum degree).
+    """Return the columns (D,) of a Jacobian (M, D) in an order whose elimination gives little fill-in (minimum degree).
 
     blocks: (D,) the variable of each column, from 0. The columns of a variable stay together. So the order stays good if
     some entries of the Jacobian are zero at one set of values only.

@@ -53,7 +53,7 @@ def _of_ranges(measured: Measurements, association: Association, used: Bools, di
     """Return the log density of all ranges, plus their cost in the graph. used, distance: as in `log_evidence`.
 
     In the graph, each range has more noise instead of the bias that it shares with the other ranges of its landmark. So the
-    cost of the graph is taken back. A stray range is spread as all ranges of the log are.
+    cost in the graph is subtracted. A stray range has the distribution of all ranges of the log.
     """
     rays, ranged = measured.rays, np.isfinite(measured.rays.range)
     spread = float(np.log(12 * np.var(rays.range[ranged]) + 2 * np.pi * np.median(rays.range_sigma[ranged]) ** 2)) / 2

@@ -25,23 +25,23 @@ the landmarks less. With too large a value, the system stays indeterminate."""
 
 _LEAST_PIVOT = 1e-11
 """The least pivot of the information matrix, scaled to 1 on its diagonal, of a system with one solution. Rounding leaves
-about 1e-15 if a system has none. A larger value refuses more systems of variables that are tied tightly and placed badly."""
+about 1e-15 if a system has none. A larger value refuses more systems that have a solution, but are badly conditioned."""
 
 _DIRECTIONS = 20
 """The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven.
 With a larger number, the bends of a long path count too, and the search takes longer."""
 _ITERATIONS = 3
-"""The number of steps of this search. More steps find the directions more exactly, and take longer."""
+"""The number of steps of the search for these directions. More steps are more exact, and take longer."""
 _COLUMNS = 48
 """The number of columns of the inverse that are computed at once. A larger number takes more memory."""
 _DENSE, _EACH = 2000, 8
-"""A dense block of the inverse has at most this many columns, and at most the second number for each column that is asked
-for. Beyond these, single columns take less time. Larger numbers take dense blocks more often."""
+"""The most columns of a dense block of the inverse: in all, and for each requested column. Beyond these limits, single
+columns take less time. With larger numbers, dense blocks are used more often."""
 
 
 @dataclass(frozen=True)
 class SolvedGraph:
-    """A graph at its solution. Its normal equations are factored once, whatever is asked about them."""
+    """A graph at its solution. Its normal equations are factored only once."""
 
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
@@ -131,8 +131,8 @@ def joint_covariances(solved: SolvedGraph, groups: Sequence[Sequence[int]]) -> l
     """Return the covariance (d, d) of each group of variables, given by their keys, in the order of the keys.
 
     The normal equations are factored once for all groups. GTSAM eliminates the system again for each group, which takes 20
-    times as long for 150 landmarks that were seen together. It is asked where the normal equations lose too many digits, and
-    names the variable that is not determined. RuntimeError if both find the system indeterminate.
+    times as long for 150 landmarks that were seen together. GTSAM is used only if the normal equations lose too many digits.
+    It names the variable that is not determined. RuntimeError if both find the system indeterminate.
     """
     if solved.inverse is not None:
         return solved.inverse.blocks(groups)

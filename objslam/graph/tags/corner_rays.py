@@ -1,4 +1,4 @@
-"""The rays of a log with four rays, one to each corner, in place of the one ray of a fiducial."""
+"""The rays of a log, in which four rays to the corners replace the one ray of a fiducial."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -14,8 +14,8 @@ from objslam.graph.tags.placement import place
 from objslam.graph.tags.square_fit import fit, scatter, with_pose_noise
 
 _NOMINAL = 30.0
-"""The number of views at which half of the scatter beyond the nominal noise counts. The scatter of n views tells a variance
-of seven parameters within a share of about sqrt(7 / n), which is a half at 30. A larger number leaves more to the nominal
+"""With this many views, half of the scatter beyond the nominal noise counts. From the scatter of n views, a variance of
+seven parameters is known within a share of about sqrt(7 / n), a half at 30. A larger number leaves more to the nominal
 noise."""
 _STEPS = 5
 """The iterations of a fit to all views. It starts at a pose that fits some of the views. More iterations are slower."""
@@ -25,7 +25,7 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
     """Return the rotation and size of each fiducial by the index of its object, from all its views at fixed poses.
 
     The error of a pose is common to the four corners of a view (`square_fit.with_pose_noise`). The covariance is that of the
-    nominal noise, and larger where the views scatter more. A fiducial whose views do not tell its size has no entry.
+    nominal noise. It is larger if the views scatter more. A fiducial has no entry if its views do not determine its size.
     """
     tags = TagCorners.of(rays, association, settings)
     if tags is None:

@@ -139,7 +139,7 @@ def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
 def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Floats:
     """Return the side (H,) m at which squares of side 1, scaled about `origins` (H, 3) m, fit the views best.
 
-    Least squares of the distances from the rays. NaN where the views do not tell it.
+    Least squares of the distances from the rays. NaN if the views do not determine it.
     """
     by_side = (squares.corners - origins[:, None])[seen.square]
     away = (seen.origin - origins[seen.square])[:, None]

@@ -20,8 +20,8 @@ _DAMPING = 1e-3
 """The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
 
 _MOST_LEVERAGE = 0.9
-"""The part of a view's influence on its own residuals that is corrected. It is below 1, because nothing is left of the
-residuals if a view alone decides. A larger part widens the covariances of squares that few views show."""
+"""The part of a view's influence on its own residuals that is corrected. It is below 1, because the residuals of a view that
+decides alone are 0. A larger part widens the covariances of squares that few views show."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def with_pose_noise(seen: Corners, squares: Squares, angle: Floats, place: Float
     """
     _, by_point, _ = _residuals(seen, squares.corners)
     by_place = by_point.reshape(len(seen), 8, 3) * place[:, None, None]
-    # A turn of the camera moves its whole image. By how much the image turns about the line of sight is left out.
+    # A turn of the camera moves its whole image. The turn of the image about the line of sight is neglected.
     by_turn = np.tile(np.eye(2), (4, 1)) * (angle / seen.sigma)[:, None, None]
     shared = np.concatenate([by_place, by_turn], axis=2)
     root = np.linalg.cholesky(np.eye(8) + shared @ np.swapaxes(shared, 1, 2))
@@ -161,7 +161,7 @@ def scatter(seen: Corners, squares: Squares, free: Bools, covariance: Floats) ->
     """Return the sums (H, 7, 7) of the squared gradients of each square's views. The corners of a view may share errors.
 
     covariance: (H, 7, 7) the inverse C of the information. The covariance of a fit is C S C, where S is the returned sum
-    (cluster-robust; Liang and Zeger 1986). A fit leaves smaller residuals than the errors are, most of all in the views that
+    (cluster-robust; Liang and Zeger 1986). The residuals of a fit are smaller than the errors, most of all in the views that
     decide it. So the residuals of each view are those of a fit without this view (Mancl and DeRouen 2001).
     """
     flat, weighted, residual, _ = _jacobians(seen, squares, free)

@@ -22,7 +22,7 @@ _MAX_READERS = 256  # The most open readers. A larger number costs memory.
 _MAX_PUBLICATIONS = 1000
 """The most publishers of types that objslam reads. With a larger number, it takes longer to choose topics among made-up
 ones."""
-_MIN_BUFFER = 2 << 20  # With a smaller socket buffer, bytes, raw images bring a warning. A larger value warns more often.
+_MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images cause a warning. A larger value warns more often.
 _Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
 
@@ -96,7 +96,7 @@ class DdsAdapter:
     def _look_around(self, found: Any) -> None:
         from cyclonedds.core import InstanceState
 
-        for _ in range(QUEUE // _TAKE):  # Messages of the readers do not wait longer, even if publishers come without end.
+        for _ in range(QUEUE // _TAKE):  # The readers get their turn even if publishers come without end.
             samples = found.take(_TAKE)
             for sample in samples:
                 handle = sample.sample_info.instance_handle

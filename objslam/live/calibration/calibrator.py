@@ -71,7 +71,8 @@ class Calibrator:
         """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
-        # The keyframes when a calibration began, and the request if the worker does not have it yet, for it takes memory.
+        # The number of keyframes when a calibration began, and its request. Once the worker has it, it is dropped to save
+        # memory.
         self._asked: tuple[int, CalibrationRequest | None] | None = None
         self._worker: Worker[Calibration | None] = Worker()
         self._known: deque[CalibrationMessage] = deque()

@@ -99,8 +99,8 @@ def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
 def _carried(m: MapState, drifted: Floats) -> Floats:
     """Return the drift (N + T, 6, 6) of landmarks and tracks on the corrected course.
 
-    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object gets the new drift of the keyframe at
-    which the old heading drift reached the object's.
+    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object gets the new drift of the first keyframe
+    whose old heading drift was at least that of the object.
     """
     order = m.time_order()
     passed = np.maximum.accumulate(drifted[order][:, 2, 2])

@@ -101,7 +101,8 @@ def _join(domain: int, interface: str | None) -> Network:
 
 @contextmanager
 def _without_stderr() -> Iterator[None]:
-    """Hide C's `stderr` while the DDS library is imported and opens a domain. It keeps the file, and writes warnings to it.
+    """Hide C's `stderr` while the DDS library is imported and opens a domain. The library goes on to write to the hidden
+    file.
 
     Otherwise each malformed packet from the network would write a line to the terminal, besides the one that `_listen`
     counts. The library has no setting for this. Python itself does not write to C's `stderr`, but to its descriptor. Where

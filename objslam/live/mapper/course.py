@@ -55,7 +55,7 @@ class Course:
     """The paths of odometry and localisation, and the course that they form.
 
     driven, localized: the whole odometry and localisation, as received. In a long session, not every pose stays. odometry,
-    localization: their poses of the last seconds, this odometry corrected for its shared errors.
+    localization: the poses of the last seconds. This odometry is corrected for its shared errors.
     """
 
     def __init__(self, settings: Settings, correction: OdometryCorrection | None = None) -> None:

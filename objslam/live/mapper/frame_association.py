@@ -17,12 +17,12 @@ from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
-_BEYOND = 1.5  # Candidates are at most this factor times the largest observed distance away. A larger factor costs time.
+_BEYOND = 1.5  # Candidates are within this multiple of the largest observed distance. A larger factor costs time.
 _NEAR = 10.0  # Landmarks in view and nearer than this (m) are always candidates. A larger distance costs time.
 _ROUGH = 3.0
 """A candidate is rough if its uncertainty fills more than this many times the image area of a ray's noise. With a larger
 value, fewer candidates are rough."""
-_CLEAR = 6.0  # The least difference in cost of the two best candidates, if both are rough. More matches fewer rays.
+_CLEAR = 6.0  # The least cost difference of the two best candidates, if both are rough. A larger value matches fewer rays.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value matches more boxes.
 _BY_LABEL = 4.0  # The gate is this factor wider if every label is one object. A larger factor keeps more rays after a drift.
 

@@ -7,7 +7,7 @@ import numpy as np
 from objslam.config import Live
 from objslam.core.arrays import Floats
 
-_STANDING = 10  # The most keyframes of one stop, without new labels. More average the detector's noise, and cost time.
+_STANDING = 10  # The most keyframes of one stop, without new labels. More of them average the noise, and cost time.
 
 
 class KeyframeSelector:

@@ -19,7 +19,7 @@ _TRACKS = 4096  # The detector tracks whose landmark is stored. A larger number 
 
 @dataclass(frozen=True)
 class LandmarkUpdate:
-    """The observations of the newest keyframe, when they are in the graph.
+    """The observations of the newest keyframe, which are in the graph already.
 
     rays: all rays of its frame. matched: (m,) the indices of rays with a landmark. rows: (m,) the rows of their landmarks
     in the table. tracks: all tracks with a ray of the frame.

@@ -22,20 +22,20 @@ from objslam.mapping.labels import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
 _GROWING = 3  # The keyframe of each period after which tracks and keyframes are dropped and all rays are tested.
-_CLOSING = 6  # The keyframe of each period after which landmarks are merged and removed. Not _GROWING, to spread delay.
+_CLOSING = 6  # The keyframe of each period for merging and removing landmarks. It differs from _GROWING to spread delay.
 _BREATH = 2  # The period of relinearisations after a large change, in keyframes. A larger period settles the map later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
 _GROWTH = 1.5  # A full solve follows when keyframes have grown by this factor. A larger one keeps early errors longer.
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
 _LARGE = 400  # With more keyframes, a rebuild in slices replaces the full solve. A larger number delays the next frame more.
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
-_HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share does this more often.
+_HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share redoes more landmarks.
 _VISITS = 6
 """The least number of changes between inliers and outliers, in time order, that shows two objects of a label. Drift makes
-one run of outliers, so two changes. A larger number needs more visits to both objects."""
+one run of outliers, which has two changes. A larger number needs more visits to both objects."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The camera may soon see this share of the image beyond its edge. A larger share prepares more landmarks.
-_USUAL = 0.75  # Any landmark may be seen from this quantile of all landmarks' `far`. A larger value prepares more landmarks.
+_USUAL = 0.75  # Every landmark may be seen up to this quantile of all `far`. A larger value prepares more landmarks.
 
 
 def maintain(m: MapState) -> None:

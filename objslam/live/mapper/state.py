@@ -49,8 +49,9 @@ class LocalizationState:
 class PairEvidence:
     """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
 
-    together: the number of frames that showed both landmarks. apart: only for pairs that were tested and not merged: a fifth
-    of the frames that had shown the less seen landmark. Once this number has grown, the pair is tested again.
+    together: the number of frames that showed both landmarks. apart: for each pair that was tested and not merged, the
+    number of frames that had shown the less seen landmark, divided by 5. Once this number has grown, the pair is tested
+    again.
     """
 
     together: Counter[tuple[int, int]] = field(default_factory=Counter)

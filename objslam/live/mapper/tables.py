@@ -14,9 +14,10 @@ _MOST_POSES = 65_536
 """The number of poses of a path above which some are dropped: 5 minutes at 200 Hz, 2 hours at 10 Hz. A larger number keeps
 long paths finer, for 160 bytes per pose."""
 _FULL = 0.75
-"""The share of the most poses that may stay when some are dropped. A larger share keeps more, and drops some more often."""
+"""The share of `_MOST_POSES` that may stay when some are dropped. With a larger share, more poses stay, and some are dropped
+more often."""
 _LEAST = 0.25
-"""The share of the most poses that is left to poses that no solve asks for. A larger share keeps the path between old
+"""The share of `_MOST_POSES` that is reserved for poses that no solve asks for. A larger share keeps the path between old
 keyframes finer, and costs memory if there are many keyframes."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
@@ -81,8 +82,9 @@ class PathTable(GrowingTable):
     that a later solve asks for, no new gap arises. Elsewhere, the poses may be any time apart. What the robot travelled
     between the kept poses is not lost, because the drift of the odometry grows with it.
 
-    max_gap: s, the shortest time between two poses that is a gap. reach: s, a solve takes poses so far from the stamps that
-    it asks for. newest: s, it may yet ask for stamps so far from the end of the path.
+    max_gap: s, the shortest time between two poses that is a gap. reach: s, the longest time between a stamp that a solve
+    asks for and the poses that it takes. newest: s, the time before the end of the path in which a solve may still ask for
+    any stamp.
     """
 
     stamp: Floats = column(np.float64)
@@ -112,8 +114,8 @@ class PathTable(GrowingTable):
     def _thin(self, asked: Floats) -> None:
         """Keep one pose per period, and the poses at gaps. The period doubles until few enough poses stay.
 
-        A period above max_gap / 4 does not apply to poses near `asked` or near the end of the path. If such poses leave room
-        for fewer than _LEAST others, the limit doubles instead.
+        A period above max_gap / 4 does not apply to poses near `asked` or near the end of the path. If such poses leave too
+        little room for others (_LEAST), the most poses of the table double instead.
         """
         near = self._near(asked)
         self._spacing = self._spacing or min(2 * float(self.stamp[-1] - self.stamp[0]) / len(self), self._widest)

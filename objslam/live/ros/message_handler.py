@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from objslam.live.ros.detector_worker import DetectorWorker
 
 _GRACE = 2.0  # The wait for an odometry topic before tf is used, s. A larger value delays the start of a robot without one.
-_LONGEST = 160  # The most characters that the ledger keeps of where a message was dropped. More make longer lines.
+_LONGEST = 160  # The most characters of a place in the ledger. A larger number makes longer lines.
 _MAX_TRACKS = 100_000  # The track names above which all are forgotten. A larger number costs memory.
 
 

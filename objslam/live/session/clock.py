@@ -26,8 +26,8 @@ class Clock:
     def step(self, stamp: float) -> tuple[float | None, bool]:
         """Return a new pose's stamp in session time, None if the pose is refused, and whether the clock was set back.
 
-        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too. No single
-        wrong stamp ahead comes here (`stamp_leaps`).
+        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too.
+        `stamp_leaps` keeps out single wrong stamps that are ahead.
         """
         time = stamp + self.shift
         if time > self.newest:

@@ -30,8 +30,8 @@ from objslam.sources.journal.records import (
     PoseMessage,
 )
 
-_JUMP = 0.1  # A step longer by this, m, than live.max_speed allows is a restart. A larger value misses more restarts.
-_TURN = 0.3  # A turn larger by this, rad, than _TURNS_PER_M allows is a restart. A larger value misses more restarts.
+_JUMP = 0.1  # A step is a restart if it exceeds live.max_speed by this, m. A larger value misses more restarts.
+_TURN = 0.3  # A turn is a restart if it exceeds _TURNS_PER_M by this, rad. A larger value misses more restarts.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
 _ZERO = 0.05  # After a gap, odometry nearer to 0 than this, m and rad, is a restart. A larger value finds more restarts.
 _FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or rad. A larger value finds fewer restarts.
@@ -41,7 +41,7 @@ _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A lar
 _POSES = 10_000
 """The number of newest poses of each path that are kept. They show when a program starts again and repeats its messages. A
 larger number recognises a longer repetition and costs memory, 0.3 kB a pose."""
-_SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. A larger value only costs care.
+_SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. It only allows for rounding.
 _WAIT = 2.0
 """A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
 larger value misses more such stamps."""
@@ -78,7 +78,7 @@ class Intake:
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
-        self._start_T_odom = np.eye(4)  # From the odometry's frame since its last restart to its first frame.
+        self._start_T_odom = np.eye(4)  # Moves poses from the odometry's present frame into its first one.
         self._last: dict[PathKind, PoseMessage] = {}
         self._heard: dict[PathKind, dict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
         self._lead = Lead(self._clock, settings.poses.max_gap)
@@ -232,7 +232,7 @@ class Intake:
         if path == "odometry":
             pose = self._continuous(at, pose)
             if not valid_positions(pose[:3, 3]):
-                return self._refuse("odometry that leads too far away", where)
+                return self._refuse("odometry with a position out of range", where)
         message = PoseMessage(path, at, pose)
         if not self._hand_on(message):
             return False

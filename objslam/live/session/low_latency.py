@@ -8,7 +8,8 @@ _SWITCH_INTERVAL = 5e-4  # The time until Python switches threads, s. A larger v
 
 _LARGE = 2**20
 """Blocks of memory from this size on, bytes, go back to the system when they are freed. glibc itself raises the limit, up to
-32 MB, when it frees a larger block, and then keeps what a calibration took. A larger value keeps more, and saves time."""
+32 MB, when it frees a larger block, and then keeps the memory of a calibration. A larger value keeps more, and saves
+time."""
 _M_MMAP_THRESHOLD = -3  # The name of this limit in glibc's malloc.h.
 
 

@@ -34,7 +34,7 @@ _IDLE = 0.05
 """The longest sleep of the thread, s. If no frame came for this time, a requested snapshot is made. A larger value makes
 snapshots later."""
 _SHORT = 0.015  # If the last messages took less than this, s, a snapshot follows at once. A larger value delays more frames.
-_LONG = 0.5  # If a caller waits longer, s, a snapshot follows even slow frames. A larger value makes snapshots later.
+_LONG = 0.5  # If a caller waits longer than this, s, a snapshot may delay frames. A larger value makes snapshots later.
 _PATIENCE = 5.0  # The longest wait for a new snapshot, s. A larger value keeps the caller waiting longer.
 
 

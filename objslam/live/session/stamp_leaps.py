@@ -15,11 +15,13 @@ _LAG = 0.3
 """A stamp is no leap if it is ahead by less, s. This covers the usual lags between topics. With a larger value, a wrong
 stamp can move the clock further, and fewer messages wait after short pauses."""
 _STEPS = 3.0
-"""A stamp is no leap within this many usual steps of its stream. A larger value acts on slow streams as `_LAG` does."""
+"""A stamp is no leap within this many usual steps of its stream. A larger value acts on slow streams like a larger
+`_LAG`."""
 _KEPT = 8  # The last steps whose median is the usual one. A larger number adapts later to another rate.
 _APART = 60.0
-"""The longest step, s, between messages that confirm each other, and in a stream whose steps are not known yet. Frames that
-are further ahead wait for the path. With a larger value, more wrong stamps confirm each other."""
+"""The longest step, s, between messages that confirm each other. It is also the longest step that is no leap in a stream
+whose usual step is not known yet. Frames that are further ahead wait for the path. With a larger value, more wrong stamps
+confirm each other."""
 _MOST = 16  # The most messages of a stream that wait. A larger number costs memory if somebody makes up stamps.
 
 T = TypeVar("T")
@@ -51,7 +53,7 @@ class _Stream(Generic[T]):
         return stamp > clock + _LAG and (self.last is None or stamp > self.reach(self.last))
 
     def chain(self) -> list[float]:
-        """Return the stamps that wait and lead to the newest of them, in order."""
+        """Return the waiting stamps that form a chain to the newest one, in order."""
         found = [self.waiting[-1][0]]
         for stamp, _ in reversed(self.waiting):
             if found[-1] - _APART <= stamp < found[-1]:
@@ -85,8 +87,9 @@ class StampLeaps(Generic[T]):
     def take(self, stream: str, stamp: float, clock: float, message: T, alone: bool) -> tuple[list[T], list[T]]:
         """Take the next message of a stream. Return the messages that pass, in order, and those that are refuted.
 
-        clock: the newest stamp, s, of another stream, which confirms what is not far ahead of it. -inf if there is none.
-        alone: whether the stream may confirm a leap beyond `_APART` itself, as a path may, or waits for the clock.
+        clock: the newest stamp, s, of another stream, which confirms stamps that are not far ahead of it. -inf if there is
+        none. alone: whether the stream may confirm a leap beyond `_APART` itself, as a path may. If not, such a leap waits
+        for the clock.
         """
         s = self._streams.setdefault(stream, _Stream())
         before = s.last

@@ -41,7 +41,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     """
     if not state.settings.bodies.use:
         return estimate, None
-    # An object that the boxes' centres brought into the graph may have a little less parallax by the centres of bodies.
+    # With bearings to the centre of its body, an object of the graph may have a little less parallax.
     joint = state.settings.joint
     joint = joint.model_copy(update={"min_parallax_deg": _KEPT * joint.min_parallax_deg})
     settings = state.settings.model_copy(update={"joint": joint})

@@ -32,8 +32,8 @@ _FEWEST = 2
 """The least number of edges that are no bounds. With a larger number, fewer boxes are used. One edge alone agrees with too
 many bodies. In simulated drives, boxes with fewer such edges made centres a little worse."""
 _WITHIN = 0.1
-"""The share of the box, from where it is cut off, in which an edge may touch a body that it touches outside the image. A
-larger share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simulated drives."""
+"""An edge is a bound if the body touches it outside the image, or inside within this share of the box from the cut. A larger
+share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simulated drives."""
 
 
 def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution) -> BoxEdges | None:
@@ -58,7 +58,7 @@ def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solut
     near = near[(~edges.bound[near]).sum(axis=1) >= _FEWEST]
     if not len(near):
         return None
-    # A detector may know less about cut off things than about whole ones.
+    # A detector may be less exact for cut off things than for whole ones.
     noisier = max(1.0, float(np.median(np.abs(deviation[near])[use[near] > 0]) / NORMAL_MEDIAN))
     found = edges.take(near)
     return replace(found, **{name: noisier * getattr(found, name) for name in ("sigma", "shift", "size")})

@@ -92,7 +92,7 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     ray = np.flatnonzero((association.object >= 0) & sees_size & box)
     ray = ray[fit[association.object[ray]]]
     origin = map_T_camera[rays.keyframe[ray], :3, 3]
-    # Rays that place nothing can have their point at the camera. Such a point has no direction.
+    # A point that its rays do not determine may lie at the camera. Such a point has no direction.
     ray = ray[np.linalg.norm(estimate.positions[association.object[ray]] - origin, axis=1) > MIN_DEPTH]
     number = np.bincount(association.object[ray], minlength=association.count)
     objects = np.flatnonzero(fit & (number >= FEWEST))

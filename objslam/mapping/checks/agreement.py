@@ -72,7 +72,7 @@ class Part:
 
     @property
     def crowd(self) -> float:
-        """The mean number of boxes in a box's frame with its label, itself included. In a crowd, rays meet by chance."""
+        """The mean over the boxes of how many boxes of the same label are in the frame. In a crowd, rays meet by chance."""
         counts = [np.zeros(0)]
         for one in self.log.cameras:
             if one.detections is not None and len(one.detections):

@@ -22,7 +22,7 @@ _OUTSIDE = 0.1
 _LEAST_SPAN = 0.55
 """The least share of the image's width and height that the boxes of a long log cover. A larger share warns more often."""
 _LONG = 200
-"""The number of boxes from which on a log is long, so that its boxes should cover most of the image."""
+"""A log with at least this many boxes is long, so that its boxes should cover most of the image."""
 
 
 def check_boxes(log: Log, ledger: Ledger) -> list[Finding]:

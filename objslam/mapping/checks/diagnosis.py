@@ -28,11 +28,11 @@ from objslam.mapping.progress import Progress
 _ALARM = 0.6
 """A run tries hypotheses if the score (`Agreement.score`) at poses of a localisation is below this. With wrong input, most
 boxes may still fit, but only with several points for each thing, and each point costs a part of the score. Poses by odometry
-need a point for each thing in each window, so their share of fitting boxes is compared instead. A larger value costs more
-runs a few seconds."""
+need a point for each thing in each window, so their share of fitting boxes is compared instead. With a larger value, more
+runs take a few seconds longer."""
 _FITTING = 0.82
-"""If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9. A
-larger value costs more runs a few seconds."""
+"""If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9.
+With a larger value, more runs take a few seconds longer."""
 _ALARM_CLOCKS = (-1.0, -0.5, 0.5, 1.0)
 """The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of the offsets."""
 _CROWD = 5.0
@@ -190,7 +190,7 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
     errors = replace(errors, estimated=_estimated(part, settings))
     if not errors.harmful:
         return None
-    # What the run corrects itself is no reason for a warning. Only what the harmful errors explain beyond it counts.
+    # An error that the run corrects itself is no reason for a warning. So only the gain by the harmful errors counts.
     corrected = errors.corrected(part.log, errors.estimated), errors.corrected(part.log)
     before, after = agreements(part, corrected, settings)
     least = found.score if before is None else max(found.score, before.score)

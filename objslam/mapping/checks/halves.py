@@ -30,7 +30,8 @@ def check_halves(late: Bools, fits: Bools) -> Finding | None:
 
 
 def seen_in_both(late: Bools, fits: Bools, owner: Ints) -> float:
-    """Return the share of a half's fitting rays whose objects the other half sees too: the larger share of both halves.
+    """Return the share of a half's fitting rays whose objects the other half sees too. The half with the larger share
+    counts.
 
     A robot that drives on to new places no longer sees most of the old objects, so the smaller share tells less.
     late, fits: as in `check_halves`. owner: (R,) the object of each ray, -1 for none.

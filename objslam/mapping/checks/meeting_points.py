@@ -1,6 +1,7 @@
 """Fit points to the rays of each label, for all labels at once: how many boxes can a few things in the world explain?
 
-The rays of a label stand in one row of a table. Labels with about as many rays share a table, so a row has few empty places.
+The rays of a label stand in one row of a table. Labels with similar numbers of rays share a table, so a row has few empty
+places.
 """
 
 from collections.abc import Iterator

@@ -26,7 +26,8 @@ def check_mixture(found: Agreement, part: Part) -> Finding | None:
 
 
 def find_mixture(frame: Ints, fits: Bools) -> Finding | None:
-    """Return a finding if rays fit by whole frames. frame: (R,) the frame of each ray. fits: (R,) whether a ray fits."""
+    """Return a finding if nearly all rays fit in some frames, and hardly any in others. frame: (R,) the frame of each ray.
+    fits: (R,) whether a ray fits."""
     frames = int(frame.max(initial=-1)) + 1
     number, fitting = np.bincount(frame, minlength=frames), np.bincount(frame[fits], minlength=frames)
     judged = number >= _RAYS

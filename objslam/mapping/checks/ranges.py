@@ -14,8 +14,8 @@ _POINTS = 4
 _PARALLAX = np.radians(20.0)
 """The least angle (rad) between the rays of a point for a reliable distance. A larger angle leaves fewer points."""
 _SPREAD = 0.1
-"""The most by which half of the points' ratios may differ from their median, as a share. A wrong unit or scale is equal for
-all points. The ratios of points at wrong positions differ."""
+"""The largest median deviation of the points' ratios from their median, as a share. A wrong unit or scale is equal for all
+points. The ratios of points at wrong positions differ."""
 _SPREAD_OF_UNITS = 0.3
 """`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`)."""
 _LEAST = 0.04
@@ -23,7 +23,8 @@ _LEAST = 0.04
 turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share warns less
 often."""
 _SPOILING = 0.06
-"""The error from which on a wrong scale makes positions unreliable. A larger share gives up fewer maps."""
+"""The error of the scale, as a share, above which positions are unreliable. With a larger share, fewer maps are
+unreliable."""
 _SIGMAS = 5.0
 """The least error in standard deviations. A larger number warns less often."""
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
@@ -58,7 +59,7 @@ def check_ranges(found: Agreement, part: Part) -> Finding | None:
 
 
 def _by_spread(found: Agreement, part: Part) -> Finding | None:
-    """Judge ranges by odometry: ranges of the right length end at one place for each label in a window.
+    """Judge ranges with the motion by odometry: right ranges end at one place for each label in a window.
 
     Bearings alone give poor positions in a short window.
     """
@@ -141,8 +142,8 @@ def _by_bearings(found: Agreement) -> Finding | None:
 def _in_words(ratio: float, than: str, *, spoils: bool = True) -> Finding:
     """Return the finding for ranges that are `ratio` times too long, or too short if the ratio is below 1.
 
-    than: what they are compared with, in words. spoils: whether a ratio that is not that of a unit makes positions
-    unreliable.
+    than: what they are compared with, in words. spoils: whether the ratio makes positions unreliable, if it is not the ratio
+    of two units.
     """
     for factor, unit in _UNITS.items():
         if abs(np.log(ratio / factor)) < _CLOSE:

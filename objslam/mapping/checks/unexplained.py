@@ -23,4 +23,4 @@ def warn_of_unexplained(rays: Rays, association: Association, ledger: Ledger) ->
     why = "" if association.count else "; an object needs at least three boxes from three places that agree"
     if left.mean() > _IMPLAUSIBLE:
         why += f"; unless most things move, the input may be wrong: check {_INPUT}"
-    ledger.warn(f"{left.sum()} of {len(left)} boxes are explained by no object at rest ({worst}){why}")
+    ledger.warn(f"no object at rest explains {left.sum()} of {len(left)} boxes ({worst}){why}")

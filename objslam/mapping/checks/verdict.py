@@ -21,7 +21,7 @@ def say(diagnosis: Diagnosis, ledger: Ledger) -> None:
     for finding in diagnosis.findings:
         ledger.warn(finding.message)
     if diagnosis.spoilt:
-        ledger.warn("no object is called ok, because the input is wrong (--set checks.use=false maps it all the same)")
+        ledger.warn("no object is called ok, because the input is wrong (--set checks.use=false maps it anyway)")
 
 
 def widened(

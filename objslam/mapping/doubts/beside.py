@@ -1,4 +1,4 @@
-"""Find boxes without an object that lie on an object, as with another label."""
+"""Find boxes without an object that lie on an object, for example with another label."""
 
 from __future__ import annotations
 

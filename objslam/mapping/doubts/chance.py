@@ -5,18 +5,18 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 
 LEAST_LOG_ODDS = np.log(1e3)
-"""The least log odds that a group is not there by chance, after all places that were tried. One log in a thousand then shows
-a group by chance. A larger value finds fewer groups."""
+"""The least log odds that a group is not there by chance, corrected for the number of tried places. So one log in a thousand
+shows a group by chance. A larger value finds fewer groups."""
 
 
 def crowded(inside: Floats | Ints, around: Floats | Ints, share: float, tried: int) -> Floats:
     """Return the log odds that a region holds more boxes than it would by chance.
 
-    Without a group, those around it lie evenly, so the number inside is binomial (scan statistic with the surroundings as
-    the estimate of the density).
+    Without a group, the boxes lie evenly, so the number inside is binomial (scan statistic with the surroundings as the
+    estimate of the density).
 
     inside: how many lie inside, any shape. around: how many lie inside or in the surroundings. share: the share of the whole
-    region that is inside. tried: how many places were tried, which makes a crowd somewhere more likely.
+    region that is inside. tried: how many places were tried. With more places, a crowd by chance is more likely.
     """
     from scipy.special import betainc
 

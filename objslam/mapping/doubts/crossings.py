@@ -1,4 +1,4 @@
-"""Find places where boxes without an object lie: points that more of their rays pass closely than by chance."""
+"""Find places of boxes without an object: points that more rays pass closely than by chance."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from objslam.mapping.doubts.evidence import Evidence
 _FEWEST = 3
 """The fewest rays of a group. Two rays nearly always pass closely somewhere. A larger number finds fewer groups."""
 _SCALES = (1.0, 3.0)
-"""How far rays may pass their place, in gates. The first finds rays that meet, the second rays that pass each other. Larger
-numbers find looser groups, and take them for one more often."""
+"""The largest distance of a ray from its place, in gates. The first finds rays that meet, the second also rays that only
+pass nearby. Larger numbers find looser groups, and join different groups more often."""
 _LOOSE = 2.0
-"""A place whose rays are more than this many times as many at the second scale has rays that pass it, and do not meet. A
-larger number takes more loose groups for narrow ones."""
+"""If the second scale finds more than this many times the rays of the first, the rays only pass nearby, and do not meet.
+With a larger number, more loose groups count as narrow ones."""
 _AROUND = 4.0
 """The surroundings of a place end at this multiple of the distance up to which a ray passes it. A larger multiple gives a
 surer estimate of how many rays pass by chance, from a larger area."""
@@ -35,7 +35,7 @@ _PLACES, _SAMPLE = 600, 3000
 """The most places that are tried for a label, and the most rays that count there. More find smaller groups, and take
 longer."""
 _MOST = 12
-"""The most groups of one label. A report with more is not read."""
+"""The most groups of one label. Nobody reads a report with more."""
 _PARALLAX = np.radians(1.0) ** 2
 """The least squared sine of the angle between two rays whose crossing is tried. With a smaller one, more places are far
 off."""

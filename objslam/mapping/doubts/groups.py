@@ -42,8 +42,8 @@ the thing, its size is wrong, it moves a little, as many strays meet by chance, 
 place."""
 _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
-"""The median deviation of the ranges from the place, in standard deviations, that says there is no object. A larger number
-says so less often."""
+"""The median deviation of the ranges from the place, in standard deviations, above which the ranges disagree. With a larger
+number, fewer groups have this reason."""
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from objslam.mapping.doubts.points import MISSED, fit_points
 _FEWEST = 8
 """The fewest boxes of a group. A larger number finds fewer groups."""
 _SAME_BOX, _LIKE_BOX = 0.7, 0.3
-"""Boxes at one place of the image have at least the first intersection over union with one of them. Those above the second
-show how many there would be by chance. A larger first value finds steadier boxes only."""
+"""Boxes are at one place of the image if their intersection over union with one box is above the first value. The number of
+boxes above the second value shows how many are there by chance. With a larger first value, only steadier boxes are found."""
 _BY_CHANCE = 0.1
 """The share of random boxes above the second overlap that are above the first. It follows from the four coordinates of a
 box: ((1 - 0.7) / (1 - 0.3))^4 is 0.03, and boxes of one detector have similar sizes. A larger share finds fewer groups."""

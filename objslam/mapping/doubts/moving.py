@@ -27,9 +27,8 @@ another by chance."""
 _ALIKE = 1.5
 """The largest ratio between the sizes of two boxes that follow one another. A larger ratio joins more boxes by chance."""
 _SMOOTH = 0.25
-"""The largest share of the squared offsets between rays and the best point at rest that is not common to consecutive rays.
-Noise has 1, and a smooth motion nearly 0. A larger share finds more things that move, and boxes that jump about one
-place."""
+"""The largest `_jitter` of a thing that moves. Noise has 1, and a smooth motion nearly 0. A larger value finds more things
+that move, and also boxes that jump about one place."""
 _SIGMAS = 3.0
 """The noise that two boxes may have beside the motion, in standard deviations. A larger number joins more by chance."""
 
@@ -104,7 +103,7 @@ def _links(evidence: Evidence, left: Ints, frame: Ints, lags: tuple[int, ...], d
         first = np.repeat(np.arange(len(left)), number)
         second = order[np.repeat(begin, number) + np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)]
         angle = _angle(direction[left[first]], direction[left[second]])
-        # Far lags show chance, so they get the angle of a near one.
+        # Far lags measure chance, so they get the angle of a near lag.
         seconds = (stamp[second] - stamp[first]) / lag * (lags.index(lag) + 1)
         noise = _SIGMAS * np.hypot(obs.sigma[left[first]], obs.sigma[left[second]])
         ratio = size[second] / np.maximum(size[first], 1e-9)

@@ -26,8 +26,8 @@ _LEAST = 0.1
 """The least probability that a reported pair is one object. A larger value reports fewer pairs."""
 _BOTH = 0.5
 """The share of the frames with two independent objects that really show both. One thing hides another, and a detector
-suppresses boxes that overlap. It is chosen, not measured. With a larger share, frames without both say more for one
-object."""
+suppresses boxes that overlap. It is chosen, not measured. With a larger share, a frame without both is stronger evidence for
+one object."""
 _BESIDES = 0.2
 """The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
 number, few frames tell less."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _ROUNDS = 12
 """The most rounds of association and calibration. Two or three are usual. A clock that is off by a second moves by 0.03 s in
-a round, so it needs ten to reach its bound. More rounds are slower where they do not settle."""
+a round, so it needs ten to reach its bound. More rounds are slower if they do not settle."""
 _SAME = 0.05
 """An association is repeated only if ray directions, or their noise, differ from those of each earlier round by more than
 this share of the noise. Such a small change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A
@@ -78,7 +78,7 @@ class FixedPoses:
         )
 
     def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
-        """Add the objects that few rays show, if the poses are localised and the settings allow it.
+        """Add the objects that can be found from few rays, if the poses are localised and the settings allow it.
 
         estimate: of the objects, None if there are none. more: as in `associate`."""
         from objslam.association.few_rays.additional_objects import add_few_ray_objects

@@ -21,16 +21,16 @@ _MOST_CELLS = 48
 """The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
 slower."""
 _TIMES = (1.0, 4.0, 16.0, 64.0)
-"""The times (s) after which the correlation of an error has fallen to 1/e, from a jump of a scan matcher to an error of the
-map around a place. More times are finer and slower."""
+"""The correlation times (s) of errors, after which the correlation is 1/e. The shortest fits a jump of a scan matcher, the
+longest an error of the map around a place. More times are finer and slower."""
 _FACTORS = np.append(0.0, np.geomspace(0.1, 20.0, 40))
 """The tried standard deviations of lasting errors, as multiples of the noise in `localization`. More factors are finer and
 slower."""
 _LOOSE = 1.0
 """The prior standard deviation (m) of the error of a solved position. With a larger value, the rays decide more."""
 _POOLED = 20.0
-"""The number of rays at which the scatter inside cells weighs as much as the noise in the settings. A larger number trusts
-the settings more."""
+"""With this many rays, the scatter inside cells weighs as much as the noise in the settings. A larger number trusts the
+settings more."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
 
 
 def lasting_variances(seen: list[Cells]) -> Floats:
-    """Return the expected squared factor of the errors of each of the times `_TIMES`. The sum is that of all lasting errors.
+    """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum is the factor of all errors.
 
     seen: the cells of each object.
     """

@@ -19,7 +19,8 @@ UNPROVEN = 0.9
 none for the object. A larger value trusts single sessions more."""
 _DAY = 86_400.0  # The seconds of a day.
 _ALIKE = 2.0
-"""The largest ratio of the sizes of an object before and after it moved. A larger value takes more pairs for one object."""
+"""The largest ratio of the sizes of an object before and after it moved. With a larger value, more pairs count as one
+object."""
 
 
 @dataclass

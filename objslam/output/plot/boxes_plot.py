@@ -7,7 +7,7 @@ import numpy as np
 from objslam.core.arrays import Array, Floats
 from objslam.output.plot.style import colours_of
 
-_LINE = 300  # The longer side of the image over the width of a line. A larger number draws thinner lines.
+_LINE = 300  # The longer side of the image, divided by the width of a line. A larger number draws thinner lines.
 
 
 Plate = tuple[int, int, int, int]

@@ -169,7 +169,7 @@ def draw_text(
 
 
 def encode_png(image: Image) -> bytes:
-    """Return an image as the content of a PNG file with 256 colours. It looks alike, and has a fifth of the size."""
+    """Return an image as the content of a PNG file with 256 colours. It looks the same, and has a fifth of the size."""
     from PIL import Image as Picture
 
     few = Picture.fromarray(np.ascontiguousarray(image[..., ::-1])).quantize(

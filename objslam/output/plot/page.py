@@ -19,7 +19,7 @@ from objslam.output.plot.canvas import (
 from objslam.output.plot.figure import Area, Figure, Line, Marks, Segments, Shape
 
 FONT = 17.0  # Labels and the legend have this font size, px.
-LINE = 1.25  # The height of a line of text over its font size. A larger number has more room between lines.
+LINE = 1.25  # The height of a line of text, divided by its font size. A larger number has more room between lines.
 _TITLE = 21.0  # The title has this font size, px.
 _NOTE = 15.0  # The remark has this font size, px.
 _MARGIN = 16  # The white, px, around the picture and between its parts.

@@ -40,7 +40,7 @@ from objslam.results.read import (
 
 _BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
 _LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
-_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # A yaw with a smaller standard deviation (rad) is shown. Nothing is known of others.
+_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # A yaw is shown if its standard deviation (rad) is below this. Others are unknown.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",

@@ -70,7 +70,7 @@ def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
         stamps, velocities = table.values[:, 0], table.values[:, 1:]
         driven = integrate(stamps, velocities)
         if not valid_positions(driven[:, :2]).all():
-            raise LogError("the odometry leads too far away", where=str(path), hint="are stamps in s and speeds in m/s?")
+            raise LogError("the odometry leads out of range", where=str(path), hint="are stamps in s and speeds in m/s?")
         camera = Camera("camera", _WIDTH, _HEIGHT, _MATRIX, base_T_camera=_FORWARD, sees_size=False)
         return Log(
             name=f"{folder.resolve().name}_robot{robot}",

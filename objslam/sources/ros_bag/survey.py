@@ -36,7 +36,7 @@ class Topic:
     logged: the times of recording, ns. stamps: the header stamps, ns, if objslam uses messages of this type (not for tf).
     frames: how many messages have each frame_id. refused: the count of unusable messages by reason. poses: the poses by
     (frame, child frame). tracks: the track id of each track whose name is no number. points: centre and corners (5, 3), m,
-    of each tag without a box, by the index of the tag in `boxes`. infos: up to two distinct CameraInfo messages, by their
+    of each tag without a box, by the index of the tag in `boxes`. infos: up to two different CameraInfo messages, by their
     bytes without the stamp. image: the first image, decoded.
     """
 

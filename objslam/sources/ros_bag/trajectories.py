@@ -63,7 +63,7 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     moved = odometry.child if odometry else next((_main_pair(topic)[1] for topic in _pose_topics(pool.survey)), "")
     base = find_base(tree.frames, base_frame, moved)
     if base_frame is None and moved not in ("", base):
-        ledger.warn(f"the poses are of the frame {moved!r}, which is not in tf; it is taken for the frame {base!r}")
+        ledger.warn(f"the poses are of the frame {moved!r}, which is not in tf; {base!r} is used instead")
     if odometry is not None:
         odometry = _moved_to(base, odometry, tree, ledger)
     elif pool.choices.of("odometry") != [NONE]:
@@ -107,7 +107,7 @@ def _moved_to(base: str, odometry: _Odometry, tree: TfTree, ledger: Ledger) -> _
     if child in ("", base):
         return odometry
     if child not in tree.frames or base not in tree.frames:
-        ledger.warn(f"tf does not connect the path's frame {child!r} to {base!r}: both are taken as the same frame")
+        ledger.warn(f"tf does not connect the path's frame {child!r} to {base!r}: both count as the same frame")
         return odometry
     child_T_base, known = tree.at(child, base, odometry.stamps)
     ledger.drop(f"odometry message with a stamp at which tf {child} -> {base} is not known", int((~known).sum()))

@@ -184,7 +184,7 @@ def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Fl
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
     """Return half the weighted sum of squares (N,) of each body, with its prior. The weights are fixed, also robust ones.
 
-    A bound that a step leaves begins to count at once, so that no step jumps back and forth across it.
+    A bound that a step crosses counts at once, so that no step jumps back and forth across it.
     """
     off = values - prior.mean
     own = np.bincount(body, (weight * now.use * now.value**2).sum(axis=1), len(values))

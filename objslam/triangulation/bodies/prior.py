@@ -20,7 +20,7 @@ _ASPECT = 0.35
 """The standard deviation of the two aspect parameters q and s. The median ratio of the horizontal half axes is then 2.3. A
 larger value allows longer objects."""
 _DOT = 1e-4
-"""The half axes (m) of an ellipsoid that stands for a point."""
+"""The half axes (m) of an ellipsoid that represents a point."""
 _LIKE = 2.0
 """With this many bodies of a label, the spread of their sizes weighs as much as _SIZE and _ASPECT. A larger number trusts
 the label less."""

@@ -28,7 +28,7 @@ from objslam.triangulation.bodies.shared import (
 Measure = Callable[[Floats | None], BoxEdges]
 """The edges of the boxes, given the points (B, 4, 3) in map at which the bodies touch them. None means unknown points."""
 More = Callable[["Bodies"], "BoxEdges | None"]
-"""More edges, which are only found by the bodies, such as those of cut off boxes. None if there are none."""
+"""More edges that can only be found with the bodies, such as those of cut off boxes. None if there are none."""
 
 _POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
 _ROUNDS = 2
@@ -41,7 +41,7 @@ _RARE = 20.0
 _STEPS = 12
 """The most steps of a fit that chooses a shape. A fit of the right shape needs fewer. More steps are slower."""
 _ENOUGH = 1e-3
-"""`STILL` for these fits: they end when a step would lower the cost by less. A larger value ends sooner."""
+"""`STILL` for a fit that chooses a shape: it ends when a step would lower the cost by less. A larger value ends sooner."""
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
     """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
     weights = _weights(edges, sides, now)
     rounds = fit(edges, now.rounds, now.prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
-    if now.best is None:  # The ellipsoid tells the cuboid where to begin.
+    if now.best is None:  # The fit of the cuboid begins at the ellipsoid.
         now = replace(now, cuboids=_cuboid_starts(rounds.values))
     square, square_prior = _best_cuboids(edges, now.cuboids, now.prior, weights)
     ball_prior = sphere_prior(now.prior)
@@ -197,7 +197,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
 
 
 def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> Bodies:
-    """Return the bodies from some edges, given those that `others` are of once more, from all edges."""
+    """Return the bodies of `edges`. Fit those that also have edges in `others` once more, to all edges."""
     mine = np.unique(others.body)
     at = np.flatnonzero(np.isin(edges.body, mine))
     both = edges.take(at).joined(others)

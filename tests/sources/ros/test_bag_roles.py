@@ -120,7 +120,7 @@ def test_the_odometry_moves_a_frame_that_tf_does_not_know(makers, tmp_path):
     bag = Bag(makers["4"]).odometry(child="vio_body").tf("base_link", _FRAME, _OPTICAL, static=True).camera().boxes()
     ledger = Ledger()
     log = _read(bag, tmp_path, ledger)
-    assert "'vio_body', which is not in tf; it is taken for the frame 'base_link'" in ledger.warnings[0]
+    assert "'vio_body', which is not in tf; 'base_link' is used instead" in ledger.warnings[0]
     np.testing.assert_allclose(log.cameras[0].camera.base_T_camera, _OPTICAL, atol=1e-12)
 
 

@@ -4,8 +4,8 @@ If a viewer hangs, rerun's connection blocks, and the process with this connecti
 a process of its own, which the session can kill.
 
 Start: `python -m objslam.output.viewer.live.live_process [--file FILE] [--address URL]`. The process reads messages from
-stdin. It answers each message with a line: "ok" if the viewer or the file has received the message, "lost" if it may not
-have.
+stdin. It answers each message with a line: "ok" if the viewer or the file has received the message, "lost" if this is not
+certain.
 """
 
 import argparse
