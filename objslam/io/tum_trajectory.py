@@ -27,8 +27,8 @@ _WORDS = {
     "theta": "yaw",
     "heading": "yaw",
 }
-"""Other names of columns that people write, with the name of `_COLUMNS` or `_PLANAR` for each. With more names, more files with
-another order of columns are refused."""
+"""Other names of columns that people write, with the name of `_COLUMNS` or `_PLANAR` for each. With more names, more files
+with another order of columns are refused."""
 
 
 def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 class NoCamera(LogError):
     """A recording without images and boxes.
 
-    cameras: the cameras that are known all the same, by a CameraInfo or from a file. mounts: base_T_camera (4, 4) from tf, by
-    the name of the optical frame.
+    cameras: the cameras that are known all the same, by a CameraInfo or from a file. mounts: base_T_camera (4, 4) from tf,
+    by the name of the optical frame.
     """
 
     def __init__(
