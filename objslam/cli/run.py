@@ -160,11 +160,12 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         if any(of["observable"] for of in calibration["parameters"].values()):
             console().print(calibration_table(calibration))
         else:
-            say("errors that all measurements share: this log determines none of them, so their priors are used")
+            none = "this log does not show any of them; their assumed sizes widen the sigmas"
+            say(f"errors that all measurements share: {none}")
     noise = result.summary.get("noise") or {}
     factors = {words: f"{noise.get(name, 1.0):.2g}" for name, words in _NOISE.items()}
     if found := [f"{words} {factor}" for words, factor in factors.items() if factor != "1"]:
-        say(f"noise found in the log, as a multiple of the settings: {', '.join(found)}")
+        say(f"noise found in the log (1 = as set): {', '.join(found)}")
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     lost = f" and {counts['unresolved']} unresolved" if counts["unresolved"] else ""
