@@ -74,7 +74,8 @@ def merge_results(
         for told in summarise_site(island, names)["sessions"]:
             say(f"{told['name']}: " + _session_line(told))
         objects = island.objects
-        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {len(island.sessions)} sessions")
+        count = f"{len(island.sessions)} session{'' if len(island.sessions) == 1 else 's'}"
+        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {count}")
         say(f"wrote {folder}")
 
 

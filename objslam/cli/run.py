@@ -130,7 +130,7 @@ def run_log(
         removed = write_result(result, out, log.truth, detected=log.cameras if made else ())
         seconds = {**result.summary["seconds"], "write": time.perf_counter() - begin}
     report(ledger)
-    times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
+    times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items() if value >= 0.005)
     (tell or say_result)(result, f", {result.settings.mode} mode; {times}", out, removed)
     return result
 

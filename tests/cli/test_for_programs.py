@@ -111,7 +111,7 @@ def test_doctor_shows_an_unusual_calibration_if_there_are_too_few_boxes_to_judge
 
 def test_info_tells_in_words_and_in_json(objslam: Objslam, log: Path) -> None:
     words = objslam("info", log).out
-    assert "The robot drives 16.3 m in 15.8 s, by odometry and localization." in words
+    assert "The robot drives 15.5 m in 15.8 s, by odometry and localization." in words
     assert "The camera left has 284 boxes of 4 labels in 80 frames." in words
     told = json.loads(objslam("info", log, "--json").out)
     assert told["kind"] == "log"

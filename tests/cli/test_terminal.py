@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from objslam.cli import console as terminal
+from objslam.cli.info import _table
 from objslam.cli.live_command.status import status_line
 from objslam.cli.run import advice_on_tags, objects_table
 from objslam.config.tags import Tags
@@ -174,3 +175,23 @@ def test_at_80_columns_the_status_line_shows_rates_lag_and_keyframes(monkeypatch
         terminal.console.cache_clear()
     shown = "0 objects, 0 unresolved | odometry 20/s frames 5/s | lag 30 ms | 378 keyframes"
     assert shown in screen.getvalue()
+
+
+def test_at_80_columns_the_topics_of_a_bag_lose_columns_and_nothing_wraps(monkeypatch):
+    """A pipe, which has no width, gets all columns."""
+    names = ("topic", "role", "type", "messages", "Hz", "gap s", "from s", "to s", "frame", "what")
+    rows = [("/camera/color/camera_info", "camera_info", "sensor_msgs/CameraInfo", "445", "5.0", "0.20", "0.50", "89.30")]
+    rows = [(*rows[0], "camera_color_optical_frame", "640x480 plumb_bob")]
+    monkeypatch.setenv("COLUMNS", "80")
+    for screen, most in ((Tty(), 80), (io.StringIO(), 200)):
+        monkeypatch.setattr(sys, "stdout", screen)
+        terminal.console.cache_clear()
+        try:
+            _table(names, rows)
+        finally:
+            terminal.console.cache_clear()
+        lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue()).splitlines()
+        assert len(lines) == 2
+        assert max(map(len, lines)) <= most
+        assert "/camera/color/camera_info" in lines[1]
+        assert ("plumb_bob" in lines[1]) == (most > 80)

@@ -101,7 +101,7 @@ def build_camera(
         if mount is not None:
             return replace(camera, base_T_camera=mount.base_T_camera), None
     else:
-        hint = "give --topic camera_info=/name, or --camera-info FILE"
+        hint = f"give --topic {topics.name}.camera_info=/name, or --camera-info FILE"
         what = f"no CameraInfo belongs to this camera (frame {topics.frame!r})"
         raise LogError(what, where=f"camera {topics.name}", hint=hint)
     base_T_frame = tree.still(base, topics.frame)
