@@ -20,6 +20,7 @@ from objslam.core.result import RunResult
 from objslam.errors import ConfigError
 from objslam.mapping.progress import Progress
 from objslam.results.object_map import ObjectMap
+from objslam.results.read import load_up
 from objslam.sources import SourceOptions
 from objslam.sources import read as read_recording
 
@@ -94,7 +95,7 @@ def prior_map(given: ObjectMap | str | PathLike[str]) -> PriorMap:
 
     if isinstance(given, object_map.ObjectMap):
         return PriorMap("the given map", given)
-    return PriorMap(str(given), ObjectMap.load(given))
+    return PriorMap(str(given), ObjectMap.load(given), load_up(Path(given)))
 
 
 def map_log(

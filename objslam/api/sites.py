@@ -9,6 +9,7 @@ from pathlib import Path
 
 from objslam.api.result import Result
 from objslam.core import object_map
+from objslam.frontend.up import on_its_side
 from objslam.mapping.sites.compare import Comparison, compare
 from objslam.mapping.sites.merge import Island, merge_sessions
 from objslam.mapping.sites.session import Session
@@ -54,6 +55,8 @@ def warnings_of(sessions: Sequence[Session], islands: Sequence[Island]) -> list[
         apart = "; ".join(", ".join(sessions[s].name for s in one.sessions) for one in islands)
         found.append(f"the sessions are {len(islands)} islands without objects in common: {apart}")
     for session in sessions:
+        if lies := on_its_side({session.name: session.up}):
+            found.append(lies)
         folder = Path(session.name)
         told = load_summary(folder).get("localisation") if (folder / SUMMARY).is_file() else None
         if told and told["localised"]:
@@ -69,4 +72,4 @@ def _session(given: Given, name: str) -> Session:
         return Session.load(given)
     if given.folder is not None:
         return Session.load(given.folder)
-    return Session(name, given.objects, given.views, given.rays)
+    return Session(name, given.objects, given.views, given.rays, up=given.summary.get("up", "z"))

@@ -14,7 +14,7 @@ from objslam.cli.options import ClassNames, Config, EncoderModel, Json, Set, set
 def detect(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="An ONNX detector.")],
     image: Annotated[Path, typer.Argument(metavar="IMAGE", help="A photo: PNG, JPEG, ...")],
-    out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG file for the photo with the boxes drawn.")] = None,
+    out: Annotated[Path | None, typer.Option("-o", "--out", help="PNG or JPEG file for the boxes on the photo.")] = None,
     embed: EncoderModel = None,
     config: Config = None,
     set_: Set = None,
@@ -23,13 +23,17 @@ def detect(
 ) -> None:
     """Try a detector on one photo: say how the model is read, and which boxes it finds. No log is needed."""
     from objslam.detection import load_detector, load_encoder
-    from objslam.errors import LogError
+    from objslam.errors import ConfigError, LogError
     from objslam.io.atomic_files import write_file
     from objslam.io.images import decode_colour
     from objslam.io.text import read_bytes
-    from objslam.output.plot.boxes_plot import draw_boxes
+    from objslam.output.plot.boxes_plot import PICTURES, draw_boxes
     from objslam.results.files import dump_json
 
+    if out is not None and out.suffix.lower() not in PICTURES:
+        raise ConfigError(
+            "the photo with the boxes is a PNG or JPEG file", where=str(out), hint=f"end it with {PICTURES[0]}"
+        )
     settings = settings_of(None, config, set_, names=names)
     pixels = decode_colour(read_bytes(image))
     if pixels is None:
@@ -40,7 +44,7 @@ def detect(
     for warning in detector.warnings:
         say(f"warning: {warning}", stderr=True)
     if out is not None:
-        write_file(out, draw_boxes(pixels, found.boxes, found.labels, found.scores))
+        write_file(out, draw_boxes(pixels, found.boxes, found.labels, found.scores, out.suffix.lower()))
     recipe, (height, width) = detector.recipe, pixels.shape[:2]
     rows = [
         {"box": box, "label": label, "score": score}

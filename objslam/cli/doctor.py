@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from objslam.mapping.checks.diagnosis import Diagnosis
     from objslam.mapping.progress import Progress
 
+SPOILT = 1
+"""The exit code if the input has an error that makes the positions of a map unreliable."""
 _ROWS = 8  # The most hypotheses in the table, besides the log as it is. The ones left out explain less.
 
 
@@ -29,7 +31,10 @@ def doctor(
     *,
     options: SourceOptions,
 ) -> None:
-    """Look for wrong input: units, axes, stamps, boxes, calibration. Nothing is changed and nothing is written."""
+    """Look for wrong input: units, axes, stamps, boxes, calibration. Nothing is changed and nothing is written.
+
+    The exit code is 1 if something is wrong that spoils the map.
+    """
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.diagnosis import diagnose
@@ -47,20 +52,22 @@ def doctor(
         solved = _solved(given, settings, show) if found.refutable and settings.mode == "joint" else None
     report(ledger)
     _show_trials(found)
-    messages = [finding.message for finding in found.findings] if solved is None else solved
-    for message in messages:
-        say(f"wrong: {message}")
+    wrong = [finding.to_dict() for finding in found.findings] if solved is None else solved
+    for finding in wrong:
+        say(f"wrong: {finding['message']}")
     # The boxes show whether a calibration is right. Without enough boxes, its unusual properties are all there is to show.
     doubts = [] if found.trials else [doubt for c in given.cameras for doubt in doubts_of(c.camera)]
     for doubt in doubts:
         say(f"check: {doubt}")
-    if not messages and not doubts:
+    if not wrong and not doubts:
         refuted = ": the boxes that fit poorly above agree after the joint solve" if found.findings else ""
         say(f"nothing wrong was found{refuted}")
+    if any(finding["spoils_positions"] for finding in wrong):
+        raise typer.Exit(SPOILT)
 
 
-def _solved(log: Log, settings: Settings, show: Progress) -> list[str] | None:
-    """Return the messages of the findings that a run still has after its solve. None if the solve fails."""
+def _solved(log: Log, settings: Settings, show: Progress) -> list[dict[str, Any]] | None:
+    """Return the findings that a run still has after its solve, as summary.json has them. None if the solve fails."""
     from objslam.core.diagnostics import Ledger
     from objslam.errors import SolveError
     from objslam.mapping.pipeline import run
@@ -71,7 +78,8 @@ def _solved(log: Log, settings: Settings, show: Progress) -> list[str] | None:
         result = run(log, settings.model_copy(update=quiet), Ledger(), show)
     except SolveError:
         return None
-    return [finding["message"] for finding in result.summary["wrong_input"]]
+    found: list[dict[str, Any]] = result.summary["wrong_input"]
+    return found
 
 
 def _show_trials(found: Diagnosis) -> None:

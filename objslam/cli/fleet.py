@@ -205,7 +205,8 @@ def _say(found: FleetResult, summary: dict[str, Any]) -> None:
     for one in found.sites:
         more = f", {one.islands} islands" if one.islands > 1 else ""
         state = "" if one.changed else ", as before"
-        say(f"{one.site}: {one.objects} objects ({one.gone} gone) from {one.sessions} sessions{more}{state}")
+        sessions = f"{one.sessions} session{'' if one.sessions == 1 else 's'}"
+        say(f"{one.site}: {one.objects} objects ({one.gone} gone) from {sessions}{more}{state}")
     for failure in found.failures[:20]:
         say(f"failed ({failure.kind}): {failure.name}: {failure.error.removeprefix(f'{failure.name}: ')}", stderr=True)
     say(f"{len(found.mapped)} logs mapped, {found.new} of them now, in {summary['seconds']:.0f} s")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from objslam.cli.console import report, say
+from objslam.cli.console import console, report, say
 from objslam.cli.options import Json, with_options
 from objslam.sources import Source, SourceOptions, choose, read
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from objslam.sources.summary import Contents, Timing
 
 _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
+_SPARE = ("from s", "to s", "frame", "what", "gap s")
+"""The columns that a narrow terminal has no room for, in the order in which they are left out. `--json` has them all."""
 
 
 @with_options
@@ -128,8 +130,15 @@ def _span(start: float, end: float) -> str:
 
 
 def _table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows of text in aligned columns. Long texts are not cut."""
-    widths = [max(len(row[i]) for row in (names, *rows)) for i in range(len(names))]
+    """Print rows of text in aligned columns. On a narrow terminal, `_SPARE` columns are left out. No text is cut."""
+    screen = console()
+    for spare in (None, *_SPARE):
+        if spare in names:
+            at = names.index(spare)
+            names, *rows = ([*row[:at], *row[at + 1 :]] for row in (names, *rows))
+        widths = [max(len(row[i]) for row in (names, *rows)) for i in range(len(names))]
+        if not screen.is_terminal or sum(widths) + 2 * (len(widths) - 1) <= screen.width:
+            break
     for row in (names, *rows):
         cells = (c.rjust(w) if name in _NUMERIC else c.ljust(w) for c, w, name in zip(row, widths, names, strict=True))
         say("  ".join(cells).rstrip())

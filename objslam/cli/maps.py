@@ -23,7 +23,9 @@ def register_results(
     import numpy as np
 
     from objslam.association.registration.object_maps import reason, register
+    from objslam.frontend.up import on_its_side
     from objslam.results.object_map import ObjectMap
+    from objslam.results.read import load_up
 
     one, other = ObjectMap.load(a), ObjectMap.load(b)
     found = register(one, other)
@@ -36,6 +38,8 @@ def register_results(
     for i, k in found.matches.tolist():
         say(f"  {one[i].label} #{one[i].id} is #{other[k].id}")
     why = reason(found, one, other, (str(a), str(b)))
+    if not found.accepted:
+        why = on_its_side({str(a): load_up(a), str(b): load_up(b)}) or why
     say(f"registered: {why}" if found.accepted else f"not registered: {why}")
     if not found.accepted:
         raise typer.Exit(NOT_REGISTERED)
@@ -71,7 +75,8 @@ def merge_results(
         for told in summarise_site(island, names)["sessions"]:
             say(f"{told['name']}: " + _session_line(told))
         objects = island.objects
-        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {len(island.sessions)} sessions")
+        count = f"{len(island.sessions)} session{'' if len(island.sessions) == 1 else 's'}"
+        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {count}")
         say(f"wrote {folder}")
 
 

@@ -130,7 +130,7 @@ def run_log(
         removed = write_result(result, out, log.truth, detected=log.cameras if made else ())
         seconds = {**result.summary["seconds"], "write": time.perf_counter() - begin}
     report(ledger)
-    times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items())
+    times = ", ".join(f"{name} {value:.2f} s" for name, value in seconds.items() if value >= 0.005)
     (tell or say_result)(result, f", {result.settings.mode} mode; {times}", out, removed)
     return result
 
@@ -160,11 +160,12 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         if any(of["observable"] for of in calibration["parameters"].values()):
             console().print(calibration_table(calibration))
         else:
-            say("errors that all measurements share: this log determines none of them, so their priors are used")
+            none = "this log does not show any of them; their assumed sizes widen the sigmas"
+            say(f"errors that all measurements share: {none}")
     noise = result.summary.get("noise") or {}
     factors = {words: f"{noise.get(name, 1.0):.2g}" for name, words in _NOISE.items()}
     if found := [f"{words} {factor}" for words, factor in factors.items() if factor != "1"]:
-        say(f"noise found in the log, as a multiple of the settings: {', '.join(found)}")
+        say(f"noise found in the log (1 = as set): {', '.join(found)}")
     counts = result.summary["counts"]
     resolved = counts["objects"] - counts["unresolved"]
     lost = f" and {counts['unresolved']} unresolved" if counts["unresolved"] else ""

@@ -24,6 +24,7 @@ _KINDS: dict[str, type[np.generic]] = {
 _PIXELS = ("float", "float16", "double", "uint8")
 _MASK, _SIZES = "pixel_mask", "orig_target_sizes"
 _FED = {_MASK: 3, _SIZES: 2}  # The numbers of axes of the inputs that exported DETR models need besides the image.
+_NOT_A_MODEL = "INVALID_PROTOBUF"  # What onnxruntime calls a file of another kind. Its text says no more.
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
@@ -97,8 +98,8 @@ def open_network(path: Path, settings: config.Detector) -> Network:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:
-        message = f"not an ONNX model that onnxruntime loads: {first_line(error)}"
-        raise DetectorError(message, where=str(path)) from error
+        why = "" if _NOT_A_MODEL in str(error) else f": {first_line(error)}"
+        raise DetectorError(f"not an ONNX model that onnxruntime loads{why}", where=str(path)) from error
     if settings.device == "cuda" and _CUDA not in session.get_providers():
         raise ConfigError("detector.device is cuda, but onnxruntime cannot start CUDA", hint="check its CUDA libraries")
     try:

@@ -1,5 +1,6 @@
 """Find the axis of a map that points up, from the poses of its cameras, and the axes of a view from above."""
 
+from collections.abc import Mapping
 from typing import get_args
 
 import numpy as np
@@ -32,6 +33,14 @@ def up_axis(keyframes: Keyframes) -> Up:
         return "z"
     axis = int(np.argmax(np.abs(up)))
     return get_args(Up)[axis + 3 * bool(up[axis] < 0)]
+
+
+def on_its_side(ups: Mapping[str, Up]) -> str | None:
+    """Return why maps cannot be matched, if one of them lies on its side. ups: the axis that points up, by name of map."""
+    for name, up in ups.items():
+        if up != "z":
+            return f"{name} lies on its side (up is {up}); maps are matched only with z up"
+    return None
 
 
 def from_above(up: Up) -> list[int]:

@@ -20,6 +20,7 @@ _IN_ORDER = 0.5
 """The least share of the rows of a file that are in the order of time. A larger share also rejects files of a robot whose
 clock was set back. A file in another order has far fewer."""
 _PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason.
+_SHOWN = 80  # The most characters of a line that a message shows. A larger number makes the message longer.
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
 
@@ -114,6 +115,7 @@ def to_table(
     table = select(table, finite, f"{what} line with a value that is not finite", path, ledger)
     if not len(table.lines):
         state = f"none of its {len(numbered)} lines is usable" if numbered else "nothing in it"
+        state += f", the first is {numbered[0][1].strip()[:_SHOWN]!r}" if numbered else ""
         raise LogError(f"{state}; a {what} line is {form or f'{columns} numbers'}", where=str(path))
     return table
 

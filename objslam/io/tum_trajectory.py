@@ -17,6 +17,18 @@ from objslam.io.text import Table, in_order, parse_numbers, read_lines, require_
 
 _COLUMNS, _PLANAR = "stamp tx ty tz qx qy qz qw", "stamp x y yaw"
 _HEADER = f"# {_COLUMNS}\n"
+_WORDS = {
+    "timestamp": "stamp",
+    "time": "stamp",
+    "t": "stamp",
+    "x": "tx",
+    "y": "ty",
+    "z": "tz",
+    "theta": "yaw",
+    "heading": "yaw",
+}
+"""Other names of columns that people write, with the name of `_COLUMNS` or `_PLANAR` for each. With more names, more files
+with another order of columns are refused."""
 
 
 def read_trajectory(path: Path, ledger: Ledger) -> Trajectory:
@@ -57,8 +69,9 @@ def _read_numbers(path: Path, ledger: Ledger) -> Table:
     lines = [(number, text.replace(",", " ")) for number, text in read_lines(path, ledger)]
     names = lines[0][1].split() if lines else []
     if len(names) in (4, 8) and not any(parse_numbers([name]) for name in names):
-        if len(names) == 8 and not names[7].lower().endswith("w"):
-            raise LogError(f"its columns are {' '.join(names)}; they must be {_COLUMNS}", where=f"{path}:{lines[0][0]}")
+        if _in_other_order(names):
+            form = _COLUMNS if len(names) == 8 else _PLANAR
+            raise LogError(f"its columns are {' '.join(names)}; they must be {form}", where=f"{path}:{lines[0][0]}")
         lines = lines[1:]
     counts = (len(text.split()) for _, text in lines if parse_numbers(text.split()) is not None)
     columns = next((count for count in counts if count in (4, 8)), 8)
@@ -68,6 +81,18 @@ def _read_numbers(path: Path, ledger: Ledger) -> Table:
     stamp, x, y, yaw = table.values.T
     zero = np.zeros(len(stamp))
     return replace(table, values=np.column_stack([stamp, x, y, zero, zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)]))
+
+
+def _in_other_order(names: list[str]) -> bool:
+    """Return whether a known name among the 4 or 8 names of columns stands in another place than its own.
+
+    Names that are not known, such as "east", may stand anywhere, but the last of 8 ends with w.
+    """
+    order = (_COLUMNS if len(names) == 8 else "stamp tx ty yaw").split()
+    known = {*_COLUMNS.split(), *_PLANAR.split(), *_WORDS}
+    plain = [name.lower() for name in names]
+    moved = any(name in known and _WORDS.get(name, name) != place for name, place in zip(plain, order, strict=True))
+    return moved or (len(names) == 8 and not plain[7].endswith("w"))
 
 
 def to_trajectory(table: Table) -> Trajectory:

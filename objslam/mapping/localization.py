@@ -15,9 +15,10 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import split_se2
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.trace import Round
-from objslam.core.types import Log, Trajectory
+from objslam.core.types import Log, Trajectory, Up
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.frontend.up import on_its_side, up_axis
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.describe import describe
 from objslam.mapping.solution import Solution
@@ -29,10 +30,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PriorMap:
-    """The map of another day. name: as shown in messages. objects: in the frame of this map."""
+    """The map of another day. name: as shown in messages. objects: in the frame of this map. up: its axis that points up."""
 
     name: str
     objects: ObjectMap
+    up: Up = "z"
 
     @property
     def first_free_id(self) -> int:
@@ -79,7 +81,8 @@ def localize(
         "lead": _number(found.lead),
     }
     if not found.accepted:
-        return _refused(found, told, why, ledger)
+        why = on_its_side({"the drive": up_axis(solution.keyframes), "the map": known.up}) or why
+        return _refused(found, {**told, "reason": why}, why, ledger)
     try:
         solved = _solve(
             _with_covariances(solution, objects), objects, placed(objects), known.objects, found, errors, settings

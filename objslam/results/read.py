@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import Doubt
-from objslam.core.types import Trajectory, Truth
+from objslam.core.types import Trajectory, Truth, Up
 from objslam.errors import LogError, OutputError
 from objslam.io.atomic_files import has_staging
 from objslam.io.objects_json import read_objects, read_truth_objects
@@ -29,6 +29,14 @@ def load_map(out: Path) -> ObjectMap:
 def load_summary(out: Path) -> dict[str, Any]:
     """Read summary.json of the result folder `out`. OutputError if it is missing or not what a run writes."""
     return _load_json(_existing(out, files.SUMMARY), Summary)
+
+
+def load_up(path: Path) -> Up:
+    """Read the axis that points up, of a result folder or of the objects.json in it. It is z for a map without a summary."""
+    out = path.parent if path.is_file() else path
+    known = (out / files.SUMMARY).is_file() and (not path.is_file() or path.name == files.OBJECTS)
+    up: Up = load_summary(out).get("up", "z") if known else "z"
+    return up
 
 
 def load_evaluation(out: Path) -> dict[str, Any] | None:

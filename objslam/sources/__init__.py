@@ -122,8 +122,8 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
     """Read a recording of any kind and write it as a log folder, including colour and depth images.
 
     Images inside a bag are extracted into a temporary folder beside the log folder, unless `options.extract` names another
-    folder. They are then linked into the log folder, so that their bytes are written only once. If the recording has no
-    camera, only the robot's path and the poses of cameras in tf are written, with a warning.
+    folder. They are then linked into the log folder, so that their bytes are written only once. If the recording has
+    neither images nor boxes, the rest is written with a warning: the robot's path, and the cameras, or their poses in tf.
     Raises the errors of `read` and `log_folder.write_log_folder`.
     """
     from objslam.sources import log_folder
@@ -137,7 +137,8 @@ def convert(source: Path, log: Path, ledger: Ledger, options: SourceOptions, *, 
             log_folder.write_log_folder(read(source, ledger, options), log, overwrite=overwrite)
         except NoCamera as found:
             written = log_folder.write_path(found, log, overwrite=overwrite)
-            ledger.warn(f"{found.where}: {found.message}; add a camera.yaml and a detections.jsonl to {', '.join(written)}")
+            lacks = "a detections.jsonl" if found.cameras else "a camera.yaml and a detections.jsonl"
+            ledger.warn(f"{found.where}: the recording has no images and no detections; add {lacks} to {', '.join(written)}")
 
 
 def choose(path: Path, name: str | None = None) -> Source:

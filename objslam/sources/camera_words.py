@@ -14,7 +14,7 @@ def view_of(camera: Camera) -> str:
     """Describe a camera's direction, tilt, height and angle of view: "looks ahead, 0.30 m above base, 70 degrees wide"."""
     right, down, forward = camera.base_T_camera[:3, :3].T
     height = float(camera.base_T_camera[2, 3])
-    parts = [f"looks {_direction(forward)}"]
+    parts = [] if _has_no_rotation(camera) else [f"looks {_direction(forward)}"]
     tilt = float(np.degrees(np.arcsin(np.clip(right[2], -1, 1))))
     if abs(forward[2]) < np.sin(np.radians(_STEEP)):
         if down[2] > np.sin(np.radians(45)):
@@ -28,7 +28,7 @@ def view_of(camera: Camera) -> str:
 def doubts_of(camera: Camera) -> list[str]:
     """Return a line for each unusual property of a camera's calibration."""
     doubts = []
-    if np.allclose(camera.base_T_camera[:3, :3], np.eye(3), atol=1e-6):
+    if _has_no_rotation(camera):
         doubts.append(
             f"{spoken_name(camera.name)}: base_T_camera has no rotation. That is right if the poses are those of the "
             "camera's optical frame (z forward). On a robot, a camera that looks ahead has "
@@ -38,6 +38,11 @@ def doubts_of(camera: Camera) -> list[str]:
     if max(fx, fy) > _ASPECT * min(fx, fy):
         doubts.append(f"{spoken_name(camera.name)}: fx {fx:g} px and fy {fy:g} px differ, although pixels are nearly square")
     return doubts
+
+
+def _has_no_rotation(camera: Camera) -> bool:
+    """Return whether base_T_camera has no rotation. On a robot, it is then not set, and says nothing of the direction."""
+    return np.allclose(camera.base_T_camera[:3, :3], np.eye(3), atol=1e-6)
 
 
 def _direction(forward: np.ndarray) -> str:

@@ -24,7 +24,7 @@ from objslam.sources.no_camera import NoCamera
 
 CAMERA, CAMERAS, MOUNT = "camera.yaml", "cameras", "camera_poses.txt"
 ODOMETRY, LOCALIZATION = "odometry.txt", "localization.txt"
-MOUNTS = "mounts.yaml"  # The file of base_T_camera from tf, for a recording without cameras.
+MOUNTS = "mounts.yaml"  # The file of base_T_camera from tf, for a recording whose cameras have no calibration.
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 
@@ -84,22 +84,25 @@ def write_log_folder(log: Log, path: Path, *, overwrite: bool = False) -> None:
 
 
 def write_path(found: NoCamera, path: Path, *, overwrite: bool = False) -> tuple[str, ...]:
-    """Write the path and the mounts of a recording without a camera, and return the names of the files.
+    """Write the path and the cameras of a recording without images and boxes, and return the names of the files.
 
-    A camera.yaml and a detections.jsonl beside these files make the folder a log. Raises OutputError if a file cannot be
-    written, or if `check_target` refuses the path.
+    A detections.jsonl beside each camera.yaml makes the folder a log. If no camera is known, the mounts are written instead.
+    Raises OutputError if a file cannot be written, or if `check_target` refuses the path.
     """
     paths = {ODOMETRY: found.odometry, LOCALIZATION: found.localization}
     known = {name: trajectory for name, trajectory in paths.items() if trajectory is not None}
+    mounts = [MOUNTS] if found.mounts and not found.cameras else []
 
     def write(folder: Path) -> None:
         for name, trajectory in known.items():
             write_trajectory(trajectory, folder / name)
-        if found.mounts:
+        _write_cameras(found.cameras, folder, path)
+        if mounts:
             write_mounts(found.mounts, folder / MOUNTS)
 
     _write_whole(Path(os.path.realpath(path)), overwrite, write)
-    return (*known, *([MOUNTS] if found.mounts else []))
+    places = (_place(camera_log, found.cameras) for camera_log in found.cameras)
+    return (*known, *(str(place / CAMERA) for place in places), *mounts)
 
 
 def _write_whole(path: Path, overwrite: bool, write: Callable[[Path], None]) -> None:
@@ -195,7 +198,11 @@ def _read_paths(path: Path, ledger: Ledger) -> tuple[Trajectory | None, Trajecto
         except LogError as error:
             refused.append(error)
     if not paths and not refused:
-        raise LogError(f"the log has neither {ODOMETRY} nor {LOCALIZATION}", where=str(path), hint="add one of the two")
+        other = [
+            (file.name, name) for name in (ODOMETRY, LOCALIZATION) for file in sorted(path.glob(f"{Path(name).stem}.*"))
+        ]
+        hint = "; ".join(f"found {found}: rename it to {name}" for found, name in other) or "add one of the two"
+        raise LogError(f"the log has neither {ODOMETRY} nor {LOCALIZATION}", where=str(path), hint=hint)
     if not paths:
         raise refused[0]
     for reason in refused:
@@ -211,10 +218,14 @@ def _optional(read: Callable[[Path], _T], file: Path, ledger: Ledger) -> _T | No
         return None
 
 
-def _write_content(log: Log, folder: Path, final: Path) -> None:
-    single = len(log.cameras) == 1
-    for camera_log in log.cameras:
-        place = Path() if single else Path(CAMERAS, camera_log.camera.name)
+def _place(camera_log: CameraLog, cameras: tuple[CameraLog, ...]) -> Path:
+    """Return the folder of one of the cameras of a log, in the folder of the log."""
+    return Path() if len(cameras) == 1 else Path(CAMERAS, camera_log.camera.name)
+
+
+def _write_cameras(cameras: tuple[CameraLog, ...], folder: Path, final: Path) -> None:
+    for camera_log in cameras:
+        place = _place(camera_log, cameras)
         own = folder / place
         own.mkdir(parents=True, exist_ok=True)
         write_camera(camera_log.camera, own / CAMERA)
@@ -225,6 +236,10 @@ def _write_content(log: Log, folder: Path, final: Path) -> None:
         for images, kind in ((camera_log.rgb, RGB), (camera_log.depth, DEPTH)):
             if images is not None and images.paths:
                 write_images(_link_images(images, kind, own, final / place), own / f"{kind}.txt")
+
+
+def _write_content(log: Log, folder: Path, final: Path) -> None:
+    _write_cameras(log.cameras, folder, final)
     truth = log.truth or Truth()
     paths = {ODOMETRY: log.odometry, LOCALIZATION: log.localization, f"{TRUTH}/{TRUTH_TRAJECTORY}": truth.trajectory}
     for name, trajectory in paths.items():

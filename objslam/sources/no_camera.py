@@ -1,4 +1,4 @@
-"""The error for a recording that has a path of the robot, but no camera. It carries the path, and poses of cameras in tf."""
+"""The error for a recording that has a path of the robot, but neither images nor boxes. It carries the rest of a log."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from objslam.errors import LogError
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
-    from objslam.core.types import Trajectory
+    from objslam.core.types import CameraLog, Trajectory
 
 
 class NoCamera(LogError):
-    """A recording without a camera. mounts: base_T_camera (4, 4) from tf, by the name of the optical frame."""
+    """A recording without images and boxes.
+
+    cameras: the cameras that are known all the same, by a CameraInfo or from a file. mounts: base_T_camera (4, 4) from tf,
+    by the name of the optical frame.
+    """
 
     def __init__(
         self,
@@ -22,10 +26,12 @@ class NoCamera(LogError):
         odometry: Trajectory | None,
         localization: Trajectory | None,
         mounts: dict[str, Floats],
+        cameras: tuple[CameraLog, ...] = (),
     ) -> None:
         super().__init__(message, where=where, hint=hint)
-        self.odometry, self.localization, self.mounts = odometry, localization, mounts
+        self.odometry, self.localization, self.mounts, self.cameras = odometry, localization, mounts, cameras
 
     def with_hint(self, hint: str) -> NoCamera:
         """Return the same error with another hint."""
-        return NoCamera(self.message, self.where or "", hint, self.odometry, self.localization, self.mounts)
+        paths = self.odometry, self.localization
+        return NoCamera(self.message, self.where or "", hint, *paths, self.mounts, self.cameras)

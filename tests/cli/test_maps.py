@@ -3,7 +3,9 @@
 import csv
 import json
 import re
+import shutil
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,3 +144,27 @@ def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, monkeypatch,
     assert f"{tmp_path / 'site' / 'island_2'} is of an earlier merge" in warned
     with pytest.raises(ValueError, match="at least one"):
         objslam.merge([])
+
+
+def test_a_map_that_lies_on_its_side_is_named(days, tmp_path, monkeypatch, capsys):
+    """The second day as visual SLAM gives it, in the frame of the first camera."""
+    a, lying = days[0] / "a", tmp_path / "lying"
+    shutil.copytree(days[0] / "b", lying)
+    y_down = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    objects = objslam.ObjectMap.load(lying)
+    turned = (
+        o if o.status != "ok" else replace(o, position=y_down @ o.position, covariance=y_down @ o.covariance @ y_down.T)
+        for o in objects
+    )
+    replace(objects, objects=tuple(turned), shared_covariance=None).save(lying / "objects.json")
+    summary = json.loads((lying / "summary.json").read_text())
+    (lying / "summary.json").write_text(json.dumps({**summary, "up": "-y"}))
+    why = f"{lying} lies on its side (up is -y); maps are matched only with z up"
+    for command in (["register", lying, a], ["diff", a, lying]):
+        code, said, _ = call(monkeypatch, capsys, *command)
+        assert code == 1
+        assert f"not registered: {why}" in said
+    code, said, _ = call(monkeypatch, capsys, "register", a, lying / "objects.json")
+    assert f"not registered: {lying / 'objects.json'} lies on its side" in said
+    code, _, warned = call(monkeypatch, capsys, "merge", a, lying, "-o", tmp_path / "site")
+    assert why in warned

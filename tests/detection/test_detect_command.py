@@ -44,6 +44,15 @@ def test_the_boxes_are_told_and_drawn(files: tuple[Path, Path], tmp_path: Path) 
         assert not (np.abs(changed - ((x1 + x2) // 2, (y1 + y2) // 2)).max(axis=1) <= 3).any()
 
 
+def test_only_a_picture_is_written(files: tuple[Path, Path], tmp_path: Path) -> None:
+    refused = detect(*files, "-o", tmp_path / "boxes.txt")
+    assert refused.returncode == 2
+    assert "PNG or JPEG" in refused.stderr
+    assert not (tmp_path / "boxes.txt").exists()
+    assert detect(*files, "-o", tmp_path / "boxes.jpg").returncode == 0
+    assert (tmp_path / "boxes.jpg").read_bytes()[:2] == b"\xff\xd8"
+
+
 def test_json_has_every_box(files: tuple[Path, Path]) -> None:
     told = json.loads(detect(*files, "--json").stdout)
     assert told["image"] == [640, 480]

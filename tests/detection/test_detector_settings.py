@@ -286,6 +286,7 @@ class TestModels:
             with pytest.raises(DetectorError, match="not an ONNX model") as caught:
                 load_detector(tmp_path / "photo.jpg", Settings())
             assert "\n" not in str(caught.value)
+            assert "PROTOBUF" not in str(caught.value)
 
     def test_a_model_cut_off(self, tmp_path):
         whole = tiny_model(tmp_path / "m.onnx", "ssd").read_bytes()

@@ -74,6 +74,31 @@ def test_columns_that_their_header_names_otherwise_are_refused(tmp_path):
     assert caught.value.where == f"{file}:1"
 
 
+@pytest.mark.parametrize("names", ["x,y,yaw,stamp", "stamp,yaw,x,y", "Time,Y,X,Theta", "stamp x y z"])
+def test_planar_columns_whose_names_are_in_another_order_are_refused(tmp_path, names):
+    file = tmp_path / "localization.txt"
+    file.write_text(f"{names}\n1,0,0,0\n2,3,4,0.5\n")
+    with pytest.raises(LogError, match="they must be stamp x y yaw"):
+        read_trajectory(file, Ledger())
+
+
+def test_columns_with_names_of_their_own_are_read_in_the_usual_order(tmp_path):
+    file = tmp_path / "localization.txt"
+    file.write_text("time,east,north,heading\n1,0,0,0\n2,3,4,1.5707963267948966\n")
+    np.testing.assert_allclose(read_trajectory(file, Ledger()).poses, [np.eye(4), TURNED], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [("1 2 3 4 5\n2 2 3 4 5\n", "the first is '1 2 3 4 5'"), ("1;0;0;0\n2;0;0;0\n", "the first is '1;0;0;0'")],
+)
+def test_a_file_without_a_pose_shows_its_first_line(tmp_path, text, shown):
+    file = tmp_path / "odometry.txt"
+    file.write_text(text)
+    with pytest.raises(LogError, match=shown):
+        read_trajectory(file, Ledger())
+
+
 def test_a_planar_file_drops_what_is_not_planar(tmp_path):
     file, ledger = tmp_path / "odometry.txt", Ledger()
     file.write_text("1 0 0 0\n2 1 0\n3 2 0 0 0 0 0 1\n4 3 0 0.5\n")

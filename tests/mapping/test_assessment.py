@@ -32,6 +32,12 @@ def test_a_usual_result_is_good() -> None:
         ({"findings": ("rays miss",)}, "check", "The input has an error that the warnings explain (rays miss)."),
         ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
         ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),
+        (
+            {"frames": 445, "late": 78, "journal": "map/journal.objslam"},
+            "check",
+            "18 % of the camera frames were dropped, because they came too late: `objslam run map` uses them all.",
+        ),
+        ({"frames": 445, "late": 78}, "check", "18 % of the camera frames were dropped, because they came too late."),
         ({"unexplained": 450}, "check", "50 % of the used boxes belong to no object."),
         ({"rejected": 180}, "check", "20 % of the used boxes miss their object. An object may be two."),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),

@@ -100,3 +100,14 @@ def test_an_empty_map_says_why(days):
     ledger = Ledger()
     result = run(days[1], settings(), ledger, known=PriorMap("empty", ObjectMap(())))
     assert "the map has 0 resolved objects" in result.summary["localisation"]["line"]
+
+
+Y_DOWN = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+
+
+@pytest.mark.parametrize(("drive", "up", "who"), [(Y_DOWN, "z", "the drive"), (np.eye(4), "-y", "the map")])
+def test_a_drive_or_a_map_on_its_side_is_the_reason(days, drive, up, who):
+    known = PriorMap("lying", ObjectMap(()), up)
+    told = run(moved_log(days[1], drive), settings(), Ledger(), known=known).summary["localisation"]
+    assert not told["localised"]
+    assert told["reason"] == f"{who} lies on its side (up is -y); maps are matched only with z up"

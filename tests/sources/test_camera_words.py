@@ -43,9 +43,9 @@ def test_how_high_and_how_wide():
     assert view_of(fisheye).endswith(f"{np.degrees(640 / 400):.0f} degrees wide")
 
 
-def test_a_camera_without_rotation_looks_up_and_is_doubted():
+def test_a_camera_without_rotation_looks_nowhere_and_is_doubted():
     plain = Camera("front", 640, 480, camera().matrix, base_T_camera=np.eye(4))
-    assert view_of(plain).startswith("looks up")
+    assert view_of(plain).startswith("0.00 m above base")
     (doubt,) = doubts_of(plain)
     assert "[-0.5, 0.5, -0.5, 0.5]" in doubt
     np.testing.assert_allclose(Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]).as_matrix(), AHEAD, atol=1e-12)

@@ -204,6 +204,13 @@ def written(log, tmp_path):
     return tmp_path / "log"
 
 
+def test_a_path_under_another_name_is_named(written):
+    (written / "odometry.txt").unlink()
+    (written / "localization.txt").rename(written / "localization.csv")
+    with pytest.raises(LogError, match=r"found localization\.csv: rename it to localization\.txt"):
+        read_log_folder(written, Ledger())
+
+
 def test_neither_path(written):
     (written / "odometry.txt").unlink()
     (written / "localization.txt").unlink()

@@ -118,7 +118,7 @@ def live(
         session.start()
         if resume:
             taken = session.counters.accepted()
-            say(f"continued {out / NAME}: {', '.join(f'{n} {kind}' for kind, n in taken.items())}", stderr=True)
+            say(f"continued {out / NAME}: {', '.join(f'{kind} {n}' for kind, n in taken.items())}", stderr=True)
         latest = LatestObjects(out)
         broken = drive(session, feed, latest, interval, quiet)
         result = finish(session, feed, out, latest, truth, broken, quiet)

@@ -127,6 +127,7 @@ def finish(
     returned, if any. If there is no result, the last snapshot is written to objects.json.
     """
     from objslam.cli.run import say_result
+    from objslam.core.snapshot import CAME_BEFORE
     from objslam.output.result_folder import write_result
 
     session.counters.ledger.add(feed.adapter.ledger)
@@ -141,6 +142,8 @@ def finish(
     removed = write_result(result, out, truth)
     last = session.snapshot()
     report(session.counters.ledger)
+    if again := sum(n for kind, n in last.counters.items() if kind.endswith(CAME_BEFORE)):
+        say(f"{again} poses had come before and are in the map already, so nothing is lost", stderr=True)
     thinned = last.counters.get("keyframes left out", 0)
     more = f" ({thinned} more left out: live.max_keyframes)" if thinned else ""
     if not quiet:

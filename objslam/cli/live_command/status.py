@@ -48,7 +48,10 @@ def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], No
 
 
 class _Rates:
-    """The formatter of the status line. Message rates are averages since the previous status line."""
+    """The formatter of the status line. Message rates are averages since the previous status line.
+
+    A narrow terminal cuts the end of the line. So what changes comes first, and long reasons come after it.
+    """
 
     def __init__(self) -> None:
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
@@ -70,16 +73,18 @@ class _Rates:
         )
         calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
         return (
-            f"{found if snapshot.keyframes else ''}{_lost(snapshot, ledger)} | {shown} | lag {1e3 * snapshot.lag:.0f} ms | "
-            f"{snapshot.keyframes} keyframes | {mapped}{calibrated}{times(snapshot, '')}"
+            f"{found if snapshot.keyframes else ''}{shown} | lag {1e3 * snapshot.lag:.0f} ms | "
+            f"{snapshot.keyframes} keyframes | {mapped}{_lost(snapshot, ledger)} | {calibrated}{times(snapshot, '')}"
         ).rstrip(" |")
 
 
 def _lost(snapshot: Snapshot, ledger: Ledger) -> str:
     """Return a text with the number of dropped data, the most frequent reason, and the numbers of unused data by kind."""
     from objslam.core.snapshot import NOT_USED
+    from objslam.frontend.bearings import CUT_OFF
 
     dropped = Counter(snapshot.dropped) + Counter(ledger.dropped)
+    del dropped[CUT_OFF]  # Every camera has such boxes. The report at the end counts them.
     reason = f" ({dropped.most_common(1)[0][0]})" if dropped else ""
     unused = "".join(f", {n} {kind}" for kind, n in snapshot.counters.items() if kind.endswith(NOT_USED))
     return f"dropped {dropped.total()}{reason}{unused}"

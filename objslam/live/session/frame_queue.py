@@ -6,14 +6,13 @@ import time
 import numpy as np
 
 from objslam.config import Settings
+from objslam.core.snapshot import RARE_POSES, TOO_SLOW
 from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.live.session.map_locator import MapLocator
 from objslam.sources.journal.records import FrameMessage, Message
 
-TOO_SLOW = "frames that waited too long (live.max_lag)"  # The reason to drop a frame for which the session had no time.
-_RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or live.max_lag is too short"
 _NEVER_COVERED = "frames that the path never covered"
 
 
@@ -63,7 +62,7 @@ class FrameQueue:
             # If a camera's clock is behind, its frames have to wait longer for their poses, so their limit is longer.
             limit = self._limit + max(0.0, stamp - frame.stamp)
             if measured and not self._patient and time.perf_counter() - came > limit:
-                self._counters.drop_frame(frame, _RARE_POSES if self._newest - came > limit else TOO_SLOW)
+                self._counters.drop_frame(frame, RARE_POSES if self._newest - came > limit else TOO_SLOW)
                 continue
             update = self._mapper.take(frame)
             if update is not None:

@@ -14,7 +14,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse
-from objslam.core.snapshot import NOT_USED
+from objslam.core.snapshot import CAME_BEFORE, NOT_USED
 from objslam.core.validity import valid_positions
 from objslam.live.counters import Counters
 from objslam.live.session import checks
@@ -211,7 +211,8 @@ class Intake:
         where, last = f"stamp {given:.3f}", self._last.get(path)
         self._lead.choose(path, given + self._clock.shift)
         if self._is_known(path, given + self._clock.shift, pose):
-            return self._refuse(f"{path} that came before", where)
+            self.counters.accept(f"{path}{CAME_BEFORE}")
+            return False
         if path == self._lead.path:
             before = self.newest - self._clock.shift
             at, back = self._clock.step(given)

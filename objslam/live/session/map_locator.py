@@ -14,6 +14,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import InPriorMap, Snapshot
 from objslam.core.types import Trajectory
+from objslam.frontend.up import on_its_side
 from objslam.graph.maps.live_prior_map import map_T_graph, tie_frame, tie_objects, untie
 from objslam.graph.maps.prior_map import beyond
 from objslam.live.counters import Counters
@@ -74,7 +75,9 @@ class MapLocator:
         found = register(objects, self._known.objects)
         if not found.accepted:
             if map_T_graph(m.graph) is None:
-                why = reason(found, objects, self._known.objects, ("the drive", "the map"))
+                why = on_its_side({"the map": self._known.up}) or reason(
+                    found, objects, self._known.objects, ("the drive", "the map")
+                )
                 self.told = InPriorMap(0, f"not localised in {self._known.name} yet: {why}")
             return False
         return self._tie(found, objects, in_graph)

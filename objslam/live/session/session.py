@@ -12,7 +12,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
-from objslam.core.snapshot import Snapshot
+from objslam.core.snapshot import TOO_SLOW, Snapshot
 from objslam.core.types import Trajectory
 from objslam.errors import OutputError, one_line
 from objslam.live.calibration.calibrator import Calibrator
@@ -20,7 +20,7 @@ from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.live.session.body_estimation import BodyEstimator
 from objslam.live.session.finalize import finish
-from objslam.live.session.frame_queue import TOO_SLOW, FrameQueue
+from objslam.live.session.frame_queue import FrameQueue
 from objslam.live.session.intake import Intake
 from objslam.live.session.map_locator import MapLocator
 from objslam.live.session.snapshots import Describer, take_snapshot

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
+from objslam.core.snapshot import RARE_POSES, TOO_SLOW
 from objslam.frontend.bearings import CUT_OFF
 
 Level = Literal["good", "check", "bad"]
@@ -23,6 +25,11 @@ _FEW = 60
 gives more warnings."""
 
 
+_LATE = 0.1
+"""A live result needs a look if more than this share of its camera frames came too late for the map. With fewer, nine of ten
+views of each object remain. A larger value gives fewer warnings."""
+
+
 @dataclass(frozen=True)
 class Evidence:
     """The numbers that a judgement depends on.
@@ -32,6 +39,8 @@ class Evidence:
     boxes that miss their object so far that they do not count. misses: the median residual as a multiple of its expected
     noise, NaN without objects. odometry_frame: whether the map has the frame of the odometry. fixed: whether the run kept
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
+    frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
+    journal: the file with all messages of a live session, "" without one.
     """
 
     resolved: int
@@ -46,6 +55,9 @@ class Evidence:
     fixed: bool = False
     findings: tuple[str, ...] = ()
     spoilt: bool = False
+    frames: int = 0
+    late: int = 0
+    journal: str = ""
 
 
 @dataclass(frozen=True)
@@ -82,6 +94,9 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         fixed=summary["mode"] == "fixed",
         findings=tuple(finding["name"] for finding in findings),
         spoilt=any(finding["spoils_positions"] for finding in findings),
+        frames=counts["detection_frames"],
+        late=sum(summary["dropped"].get(reason, 0) for reason in (TOO_SLOW, RARE_POSES)),
+        journal=summary["log_path"] or "",
     )
 
 
@@ -121,6 +136,9 @@ def _check(e: Evidence) -> list[str]:
         )
     if e.cut > _CUT * e.boxes:
         found.append(f"{100 * e.cut / e.boxes:.0f} % of the boxes were dropped, because the image's edge cuts them off.")
+    if e.late > _LATE * e.frames:
+        more = f": `objslam run {Path(e.journal).parent}` uses them all" if e.journal else ""
+        found.append(f"{100 * e.late / e.frames:.0f} % of the camera frames were dropped, because they came too late{more}.")
     if e.unexplained > _UNEXPLAINED * e.rays:
         found.append(f"{100 * e.unexplained / e.rays:.0f} % of the used boxes belong to no object.")
     elif e.unexplained + e.rejected > _UNEXPLAINED * e.rays:

@@ -12,6 +12,7 @@ from objslam.association.registration.map_registration import Registration
 from objslam.association.registration.object_maps import reason, register
 from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject
+from objslam.frontend.up import on_its_side
 from objslam.mapping.sites.lives import GONE, UNPROVEN
 from objslam.mapping.sites.merge import merge_sessions
 from objslam.mapping.sites.session import Session
@@ -55,6 +56,7 @@ def compare(a: Session, b: Session) -> Comparison:
     found = register(b.objects, a.objects)
     why = reason(found, b.objects, a.objects, (b.name, a.name))
     if not found.accepted:
+        why = on_its_side({a.name: a.up, b.name: b.up}) or why
         return Comparison(found, why, (), found.b_T_a)
     island = merge_sessions((a, b))[0]
     items = (*island.objects, *island.objects.gone)

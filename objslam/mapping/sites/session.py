@@ -14,10 +14,11 @@ from objslam.association.observations import Observations
 from objslam.association.visibility import CameraFrames, count_looks
 from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.types import Up
 from objslam.io.objects_json import read_objects
 from objslam.io.rays_parquet import RaysTable
 from objslam.io.views_parquet import Views
-from objslam.results.read import load_map, load_rays, load_views
+from objslam.results.read import load_map, load_rays, load_up, load_views
 
 _SAME_FRAME = 0.005
 """The longest time (s) between the stamps of a ray and of its camera frame. A larger value also matches inexact stamps, and
@@ -30,7 +31,7 @@ class Session:
 
     name: as shown in messages. views, rays: the camera frames and the rays of the drive. They are None for a map without a
     result folder, which cannot say what was in view. visits: a function that returns the sessions of a site, in the order of
-    time. If it returns none, no session of the site counts as a miss.
+    time. If it returns none, no session of the site counts as a miss. up: the axis of the map that points up.
     """
 
     name: str
@@ -38,15 +39,16 @@ class Session:
     views: Views | None = None
     rays: RaysTable | None = None
     visits: Callable[[], tuple[Visit, ...]] = tuple
+    up: Up = "z"
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
         """Load a result folder, a site, or an objects.json. OutputError names what is missing or damaged."""
         at = Path(path)
         if at.is_file():
-            return cls(str(path), read_objects(at))
+            return cls(str(path), read_objects(at), up=load_up(at))
         views = load_views(at) if at.is_dir() else None
-        return cls(str(path), load_map(at), views, None if views is None else load_rays(at))
+        return cls(str(path), load_map(at), views, None if views is None else load_rays(at), up=load_up(at))
 
     @property
     def when(self) -> float:

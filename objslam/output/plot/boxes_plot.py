@@ -8,16 +8,16 @@ from objslam.core.arrays import Array, Floats
 from objslam.output.plot.style import colours_of
 
 _LINE = 300  # The longer side of the image, divided by the width of a line. A larger number draws thinner lines.
-
+PICTURES = (".png", ".jpg", ".jpeg")  # The endings of the files that may hold the picture.
 
 Plate = tuple[int, int, int, int]
 """The filled rectangle behind a label: x1, y1, x2, y2, px."""
 
 
-def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Floats) -> bytes:
-    """Return a PNG of an image (H, W, 3), BGR, with boxes (N, 4) x1, y1, x2, y2, px, in the colours of their labels.
+def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Floats, ending: str = ".png") -> bytes:
+    """Return a picture of an image (H, W, 3), BGR, with boxes (N, 4) x1, y1, x2, y2, px, in the colours of their labels.
 
-    labels, scores: (N,) the text beside each box.
+    labels, scores: (N,) the text beside each box. ending: the format of the picture, one of `PICTURES`.
     """
     import cv2
 
@@ -35,7 +35,7 @@ def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Float
         cv2.rectangle(drawn, (left, top), (right, bottom), (blue, green, red), cv2.FILLED)
         place = (left + 2 * line, bottom - 3 * line)
         cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4 * line, (255, 255, 255), line, cv2.LINE_AA)
-    return cv2.imencode(".png", drawn)[1].tobytes()
+    return cv2.imencode(ending, drawn)[1].tobytes()
 
 
 def free_plate(wanted: Plate, taken: Sequence[Plate], width: int, height: int) -> Plate:

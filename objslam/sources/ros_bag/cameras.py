@@ -44,17 +44,18 @@ def find_cameras(
     name as a part. A single calibration without such topics takes all topics. One of several calibrations without such
     topics is left out with a warning. Without calibrations, each frame_id of detections is a camera. Without detections too,
     each frame_id that colour images share with a CameraInfo is a camera, and so is a single topic of colour images. The
-    other topics of a camera have its frame_id. If several topics fit a role, the one with the most similar name is taken
+    other topics of a camera have its frame_id. In a recording without detections and images, each frame_id of a CameraInfo
+    is a camera, and so is each calibration. If several topics fit a role, the one with the most similar name is taken
     with a warning. rectified: whether boxes and images are rectified. None lets the topic names decide.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
-    seeds = detections or images
+    seeds = detections or images or pool.fitting("camera_info")
     if calibrations:
         alone = len(calibrations) == 1
         named = {c.camera.name: [t for t in seeds if is_named(c.camera.name, t.frame, t.name)] for c in calibrations}
         if alone and not any(named.values()):
             named = {name: list(seeds) for name in named}
-        for name in (name for name, topics in named.items() if not topics):
+        for name in (name for name, topics in named.items() if not topics and (detections or images)):
             pool.ledger.warn(f"camera {name!r}: no topics, left out (--topic {name}.detections=/name or {name}.image=/name)")
         taken = {topic.name for topics in named.values() for topic in topics}
         for topic in (topic for topic in detections if topic.name not in taken):
@@ -62,11 +63,12 @@ def find_cameras(
         cameras = []
         for calibration in calibrations:
             name = calibration.camera.name
-            if named[name] or any((name, role) in pool.choices.names for role in ("detections", "image")):
+            chosen = any((name, role) in pool.choices.names for role in ("detections", "image"))
+            if named[name] or chosen or not (detections or images):
                 frame = named[name][0].frame if named[name] else name
                 cameras.append(_gather(pool, tree, name, frame, named[name], calibration, rectified, alone))
         return tuple(cameras)
-    if not detections:
+    if images and not detections:
         infos = pool.fitting("camera_info")
         seeds = [topic for topic in images if len(images) == 1 or any(info.frame == topic.frame for info in infos)]
     frames = list(dict.fromkeys(topic.frame for topic in seeds))
@@ -99,7 +101,7 @@ def build_camera(
         if mount is not None:
             return replace(camera, base_T_camera=mount.base_T_camera), None
     else:
-        hint = "give --topic camera_info=/name, or --camera-info FILE"
+        hint = f"give --topic {topics.name}.camera_info=/name, or --camera-info FILE"
         what = f"no CameraInfo belongs to this camera (frame {topics.frame!r})"
         raise LogError(what, where=f"camera {topics.name}", hint=hint)
     base_T_frame = tree.still(base, topics.frame)

@@ -99,7 +99,7 @@ def _missing(assembly: Assembly) -> tuple[str, ...]:
     path = next((one for one in paths if one is not None), None)
     for topics, camera, _ in assembly.cameras:
         where, frames = spoken_name(camera.name), topics.detections or topics.image
-        if topics.detections is None:
+        if frames is topics.image is not None:
             missing.append(f"{where}: no detections; {FIND_BOXES}")
         if frames is not None:
             missing += off_path(where, frames.times() / 1e9, path)

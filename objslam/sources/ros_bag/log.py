@@ -23,7 +23,7 @@ from objslam.ros.bag.records import Connection, FileReport
 from objslam.ros.messages.decode import DecodeError, make_decoder, read_head
 from objslam.ros.messages.detections import boxes_of_points
 from objslam.ros.messages.images import DEPTH_SCALE, image_file
-from objslam.ros.messages.topic_types import is_tags
+from objslam.ros.messages.topic_types import IMAGES, is_tags
 from objslam.ros.tf.tree import TfTree
 from objslam.ros.topics import parse_topics
 from objslam.sources.no_camera import NoCamera
@@ -36,6 +36,11 @@ from objslam.sources.ros_bag.trajectories import Paths, read_paths
 
 _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 """The temporary folders for the images of bags that are read without `extract`. They are removed when the program ends."""
+
+
+_NO_INFO = "record CameraInfo too, or give --camera-info FILE"  # The advice for images without a CameraInfo.
+_NO_BOXES = """boxes from a file: `objslam convert` makes a log of this bag, put detections.jsonl into it; or record \
+Detection2DArray, AprilTag detections, or images with CameraInfo"""  # The advice for a bag without images and boxes.
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,8 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
         first = assembly.problems[0]
         hint = "; ".join(filter(None, [first.hint, *assembly.survey.damage()]))
         if isinstance(first, NoCamera):
+            for error in assembly.problems[1:]:
+                ledger.warn(f"{error}: left out")
             raise first.with_hint(hint)
         raise LogError(first.message, where=first.where, hint=hint)
     for error in assembly.left_out:
@@ -118,17 +125,17 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
             cameras.append((topics, *build_camera(topics, tree, base, ledger, mounts)))
         except LogError as error:
             refused.append(error)
-    if not cameras and not refused:
-        images = any(topic.type.endswith(("/Image", "/CompressedImage")) for topic in survey.topics.values())
+    if not any(topics.detections or topics.image for topics in cast):
+        images = not cast and any(topic.type in IMAGES for topic in survey.topics.values())
         what = "images, but none with a CameraInfo" if images else "no images and no detections"
-        hint = "record Detection2DArray or AprilTag detections, or images with CameraInfo (or give --camera-info FILE)"
         message, where = f"no camera: the recording has {what}", survey.recording.name
         if found is None or images:
-            problems.append(LogError(message, where=where, hint=hint))
+            problems.append(LogError(message, where=where, hint=_NO_INFO if images else _NO_BOXES))
         else:
             places = camera_places(tree, base)
             known = {place.frame: place.base_T_frame for place in places if place.base_T_frame is not None}
-            problems.append(NoCamera(message, where, hint, found.odometry, found.localization, known))
+            logs = tuple(_camera_log(*camera, {}, options, ledger) for camera in cameras)
+            problems.append(NoCamera(message, where, _NO_BOXES, found.odometry, found.localization, known, logs))
     if not cameras:
         problems += refused
     return Assembly(survey, tree, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ()))

@@ -132,10 +132,10 @@ def test_the_table_is_the_map(tmp_path: Path) -> None:
     assert len(rows) == 15
     for row, o in zip(rows, result.map.objects, strict=True):
         assert row[:2] == [str(o.id), o.label]
-        assert row[2:5] == [f"{x:.3f}" for x in o.position]
+        assert row[3:6] == [f"{x:.3f}" for x in o.position]
         sigma = "" if o.covariance is None else f"{np.sqrt(np.linalg.eigvalsh(o.covariance)[-1]):.3f}"
-        assert row[5:7] == [sigma, str(o.rays)]
-        assert row[-1] == o.status
+        assert row[6:8] == [sigma, str(o.rays)]
+        assert row[2] == o.status
     links = {a["href"] for a in page.of("a")} - {"#map"}
     cards = {f"#{c['id']}" for c in page.of("article")}
     assert links == cards == {f"#object-{o.id}" for o in result.map.objects}
@@ -154,7 +154,7 @@ def test_bodies_have_a_size_and_an_unknown_heading_is_no_number(tmp_path: Path) 
     write_result(replace(result, map=ObjectMap(bodies)), tmp_path)
     page = Page(write_report(tmp_path))
     rows = [row for row in page.rows if row]
-    assert [row[6] for row in rows[:3]] == ["0.60 × 0.40 × 0.90", "0.60 × 0.40 × 0.90", ""]
+    assert [row[7] for row in rows[:3]] == ["0.60 × 0.40 × 0.90", "0.60 × 0.40 × 0.90", ""]
     assert page.all_text.count("0.60 × 0.40 × 0.90 m (length, width, height)") == 2
     assert page.all_text.count("30°, sigma 5°") == 1
     assert page.all_text.count("unknown") == 1
@@ -170,7 +170,7 @@ def test_errors_come_from_the_evaluation_or_the_truth(tmp_path: Path, evaluated:
     page = Page(write_report(tmp_path))
     assert evaluation.objects is not None
     errors = {str(m.object.id): f"{m.error:.3f}" for m in evaluation.objects.matches}
-    assert {row[0]: row[9] for row in page.rows if row} == errors
+    assert {row[0]: row[10] for row in page.rows if row} == errors
     assert f"{evaluation.to_dict()['position_rmse']:.3f} m" in page.text["td"]
 
 
@@ -212,7 +212,7 @@ def test_existence_has_a_column_where_it_was_judged(tmp_path: Path) -> None:
     write_result(dataclasses.replace(result, map=ObjectMap(objects)), tmp_path)
     page = Page(write_report(tmp_path))
     rows = [row for row in page.rows if row]
-    assert [row[9] for row in rows] == ["0.750"] + [""] * 14
+    assert [row[10] for row in rows] == ["0.750"] + [""] * 14
 
 
 def test_without_a_truth_there_is_no_error(tmp_path: Path) -> None:

@@ -7,9 +7,11 @@ from drive_bag import rows_of, simulated
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.errors import LogError
 from objslam.io.camera_yaml import read_mounts, write_camera
 from objslam.io.detections_jsonl import write_detections
 from objslam.mapping import pipeline
+from objslam.simulation import make_camera
 from objslam.sources import SourceOptions, convert, read
 from objslam.sources.log_folder import read_log_folder, write_log_folder
 
@@ -101,3 +103,36 @@ def test_a_bag_without_a_camera_gives_its_path_and_the_mounts_and_with_boxes_bes
     _same_path(found.odometry, log.odometry)
     _same_path(found.localization, log.localization)
     _close(found.cameras[0].detections.boxes, log.cameras[0].detections.boxes)
+
+
+@pytest.mark.parametrize("given", ["CameraInfo", "file"])
+def test_a_bag_without_boxes_and_images_gives_the_camera_and_with_boxes_beside_it_a_log(tmp_path, makers, log, given):
+    maker, camera = makers["4"], log.cameras[0].camera
+    rows = [row for row in rows_of(log, maker) if row[0] != "/front/detections"]
+    options = SourceOptions()
+    if given == "file":
+        rows = [row for row in rows if row[0] not in ("/front/camera_info", "/tf_static")]
+        write_camera(camera, tmp_path / "given.yaml")
+        options = SourceOptions(camera_info=tmp_path / "given.yaml", base_frame="base_footprint")
+    path, ledger = write_bag(tmp_path / "drive", "mcap-none", maker, rows), Ledger()
+    with pytest.raises(LogError, match="`objslam convert` makes a log of this bag"):
+        read(path, Ledger(), options)
+    convert(path, tmp_path / "log", ledger, options)
+    (warning,) = ledger.warnings
+    assert warning.endswith("add a detections.jsonl to odometry.txt, localization.txt, camera.yaml")
+    write_detections(log.cameras[0].detections, tmp_path / "log" / "detections.jsonl")
+    (found,) = read(tmp_path / "log", Ledger()).cameras
+    for name in ("matrix", "distortion", "base_T_camera"):
+        _close(getattr(found.camera, name), getattr(camera, name))
+
+
+def test_a_bag_with_the_calibrations_of_two_cameras_gives_both_and_topic_takes_one(tmp_path, makers):
+    log = simulated(cameras=(make_camera("front"), make_camera("left", yaw=1.0)))
+    maker = makers["4"]
+    rows = [row for row in rows_of(log, maker) if not row[0].endswith("/detections")]
+    path = write_bag(tmp_path / "drive", "mcap-none", maker, rows)
+    names = sorted(camera_log.camera.name for camera_log in log.cameras)
+    convert(path, tmp_path / "both", Ledger(), SourceOptions())
+    assert sorted(file.parent.name for file in (tmp_path / "both" / "cameras").glob("*/camera.yaml")) == names
+    convert(path, tmp_path / "one", Ledger(), SourceOptions(topics=(f"camera_info=/{names[1]}/camera_info",)))
+    assert f"camera_name: {names[1]}" in (tmp_path / "one" / "camera.yaml").read_text()
