@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from log_parts import part
 from mrclam import mapped
 
 from objslam.config import load_settings
@@ -44,15 +45,17 @@ def test_the_start_was_far_off(data_dir, robot):
 
 @pytest.mark.long
 def test_landmarks_without_names(data_dir):
-    """Fifteen posts, in clusters 17 cm apart, all called the same: loops are closed by how they stand to each other."""
-    log = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=1, anonymous=True))
+    """Fifteen posts, in clusters 17 cm apart, all called the same: loops are closed by how they stand to each other. The robot
+    sees all of them in the first 500 s. `tools/bench_recordings.py --parts unnamed` maps whole drives."""
+    whole = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=1, anonymous=True))
+    log = part(whole, 0.0, 500.0)
     result = pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false")), Ledger())
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     path = Trajectory(stamps, result.map_T_base[first])
     found = evaluate(result.map, log.truth, path, align="se2", radius=0.3).to_dict()
-    assert found["matched"] >= 12
-    assert found["false"] <= 2
-    assert found["ate"] <= 0.35
+    assert found["matched"] >= 14
+    assert found["false"] <= 1
+    assert found["ate"] <= 0.2
 
 
 def of_truth(objects, truth):
