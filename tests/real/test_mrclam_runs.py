@@ -45,8 +45,10 @@ def test_the_start_was_far_off(data_dir, robot):
 
 @pytest.mark.long
 def test_landmarks_without_names(data_dir):
-    """Fifteen posts, in clusters 17 cm apart, all called the same: loops are closed by how they stand to each other. The robot
-    sees all of them in the first 500 s. `tools/bench_recordings.py --parts unnamed` maps whole drives."""
+    """Fifteen posts, in clusters 17 cm apart, all called the same: loops are closed by how they stand to each other.
+
+    The robot sees all of them in the first 500 s. `tools/bench_recordings.py --parts unnamed` maps whole drives.
+    """
     whole = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=1, anonymous=True))
     log = part(whole, 0.0, 500.0)
     result = pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false")), Ledger())
