@@ -1,6 +1,7 @@
 """What holds for all tests."""
 
 import os
+import signal
 import sys
 from collections.abc import Callable
 
@@ -15,6 +16,9 @@ settings.register_profile(
     derandomize="OBJSLAM_FUZZ_SEED" not in os.environ,  # The same examples in every run. tools/fuzz.sh looks for new ones.
 )
 settings.load_profile("objslam")
+
+# A suite in the background of a shell has SIGINT ignored. Commands that its tests start and interrupt would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -701,8 +701,6 @@ def exhausted():
 
 
 ENDLESS = """
-import signal
-
 from objslam.mapping import pipeline
 from objslam.cli import main
 
@@ -714,7 +712,6 @@ def again_and_again(*work):
         run(*work)
 
 pipeline.run = again_and_again
-signal.signal(signal.SIGINT, signal.default_int_handler)  # A suite in the background of a shell inherits "ignore".
 main()
 """
 
