@@ -17,12 +17,12 @@ from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses import later
 from objslam.mapping.checks.parts.halves import check_halves
 from objslam.mapping.checks.parts.mixture import check_mixture
-from objslam.mapping.checks.parts.moved_camera import MOVED, check_moved_camera
+from objslam.mapping.checks.parts.moved_camera import check_moved_camera
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.ranges import check_ranges
 from objslam.mapping.checks.small_errors import SmallErrors, find_small_errors, with_clock
 from objslam.mapping.checks.stamps import check_stamps
-from objslam.mapping.checks.trials import Trial, crooked, disagree, try_hypotheses, verdict
+from objslam.mapping.checks.trials import Trial, crooked, try_hypotheses, verdict
 from objslam.mapping.checks.usual_errors import without_usual_errors
 from objslam.mapping.progress import Progress
 
@@ -121,7 +121,7 @@ def diagnose(
     if impossible:  # Boxes at such poses agree with anything by chance.
         return Diagnosis(tuple(findings), tuple(trials))
     if found is not None and part.boxes >= _FEWEST:
-        findings += _disagreements(part, found, settings, bool(trials) and not any(one.spoils for one in findings))
+        findings += _parts_differ(part, found, settings)
         if not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
             if errors is not None:
@@ -131,21 +131,6 @@ def diagnose(
         ranges = check_ranges(found, part)
         findings += [ranges] if ranges else []
     return Diagnosis(tuple(findings), tuple(trials), errors)
-
-
-def _disagreements(part: Part, found: Agreement, settings: Settings, doubted: bool) -> list[Finding]:
-    """Return the findings about parts of the log that do not agree, or about boxes that all disagree with the poses.
-
-    doubted: whether the boxes fit badly, and no hypothesis explains it.
-    """
-    differ = _parts_differ(part, found, settings)
-    none_fits = None
-    if doubted and not part.drifts:
-        none_fits = disagree(without_usual_errors(part, found, settings)[0], part)
-    if none_fits is None:
-        return differ
-    # Where hardly any box fits, no box shows how the camera is turned in either half.
-    return [one for one in differ if one.name != MOVED] or [none_fits]
 
 
 def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:

@@ -3,8 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from objslam.config import Settings
 from objslam.core.types import Log
 from objslam.mapping.checks.agreement import Agreement, Part, agreements
@@ -29,15 +27,6 @@ _NOT_WORSE = 0.8
 _EQUAL = 0.95
 """Another hypothesis is as good as the best if it has this share of the best score. A larger share names fewer
 alternatives."""
-
-_NO_LABEL, _OF_A_LABEL = 0.9, 20
-"""Boxes disagree if, of each label with at least `_OF_A_LABEL` boxes and half as many as the mean label, at most the share
-`_NO_LABEL` fits. Fewer boxes agree by chance, and so do the boxes of a thing that is far away. At right poses, a share of at
-least 0.97 fits of some label in each of six recorded logs. At wrong mounts it was at most 0.88. A larger share suspects logs
-in which each label is often detected falsely."""
-_HALF = 0.5
-"""Boxes disagree only if less than this share of them fits, and a hypothesis must let this share fit. With a larger share,
-more logs in which most things move are suspected, and fewer causes are named."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +73,7 @@ def verdict(trials: list[Trial], part: Part, corrected: float) -> Finding | None
 
     def holds(trial: Trial) -> bool:
         more = trial.score > max(times * before, before + least)
-        more &= (trial.score - before) * part.boxes > _MORE_BOXES and trial.share >= _HALF
+        more &= (trial.score - before) * part.boxes > _MORE_BOXES
         # Better boxes are no reason to make a straight path crooked.
         return bool(more and not (_is_straight(first) and trial.straight is not None and trial.straight < _CROOKED))
 
@@ -103,25 +92,6 @@ def verdict(trials: list[Trial], part: Part, corrected: float) -> Finding | None
         fit += ", and the robot drives where it heads"
     message = f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}"
     return Finding(best.hypothesis.name, message, basis="log" if _is_crooked(first) else "boxes")
-
-
-def disagree(found: Agreement, part: Part) -> Finding | None:
-    """Return a finding if the boxes of no label agree with the poses.
-
-    found: after the usual errors of the cameras are corrected, as far as the boxes show them.
-    """
-    number = np.bincount(found.rays.label)
-    many = number >= max(_OF_A_LABEL, number[number > 0].mean() / 2)
-    share = np.bincount(found.rays.label, found.point >= 0)[many] / number[many]
-    if found.share >= _HALF or not len(share) or share.max() > _NO_LABEL:
-        return None
-    message = (
-        f"only {100 * found.share:.0f} % of the boxes agree with the poses, hardly more than by chance, and no usual "
-        "mistake explains that: look at base_T_camera, at the frame of the poses, and at the stamps"
-    )
-    if all(np.allclose(one.camera.base_T_camera[:3, :3], np.eye(3), atol=1e-3) for one in part.log.cameras):
-        message += ". base_T_camera has no rotation, so the camera looks where z of the poses points"
-    return Finding("boxes disagree", message, basis="boxes")
 
 
 def crooked(log: Log) -> bool:

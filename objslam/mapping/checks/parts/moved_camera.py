@@ -19,7 +19,6 @@ from objslam.mapping.checks.agreement import Part, agreement, take_frames
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.usual_errors import without_usual_errors
 
-MOVED = "camera moved"  # The name of the finding.
 _AXES = ("yaw", "tilt", "roll")
 _LATER = ", second half"  # What the name of a camera of the second half ends with.
 _TURN = 0.2
@@ -64,7 +63,7 @@ def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Fi
         return []
     return [
         Finding(
-            MOVED,
+            "camera moved",
             f"{name} changes by {np.degrees(change):.1f} deg between the halves of the log: "
             "somebody moved the camera on the robot",
             basis="halves",
