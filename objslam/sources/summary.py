@@ -7,6 +7,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera, spoken_name
+from objslam.core.statistics import RAYLEIGH_MEDIAN
 from objslam.core.types import Detections, Images, Log, Trajectory
 
 FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a camera with images but without detections.
@@ -15,7 +16,6 @@ FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a cam
 _STEP = 10.0
 """The least length of a chord of a path, in sigmas of the noise of its positions. At 10, noise makes a path 1 % longer. A
 larger value cuts more corners."""
-_MEDIAN = 1.1774  # The median length of a vector in the plane whose coordinates have a sigma of 1.
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def path_length(positions: Floats) -> float:
     positions: (N, 3), m. White noise changes their second differences most, motion hardly.
     """
     bends = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=1)
-    sigma = float(np.median(bends)) / (_MEDIAN * np.sqrt(6.0)) if len(bends) else 0.0
+    sigma = float(np.median(bends)) / (RAYLEIGH_MEDIAN * np.sqrt(6.0)) if len(bends) else 0.0
     length, points = 0.0, positions.tolist()
     last = points[0]
     for point in points[1:]:  # Plain floats: a day of poses at 20 Hz takes a second.
