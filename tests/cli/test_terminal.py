@@ -57,21 +57,28 @@ class Tty(io.StringIO):
         return True
 
 
-def test_the_status_line_is_one_line_and_gives_way_to_others(monkeypatch):
-    """The screen is what is left after each carriage return, erased line and line up."""
+@contextmanager
+def terminal_in_place_of_stderr(columns):
+    """A terminal of that width; no fixture, because pytest sets stderr anew between a fixture and its test."""
     screen = Tty()
-    monkeypatch.setattr(sys, "stderr", screen)
-    monkeypatch.setenv("COLUMNS", "60")
-    monkeypatch.setenv("TERM", "xterm")
-    terminal.console.cache_clear()
-    snapshot = Snapshot(1.0, ObjectMap(()), EMPTY, 7, counters={"odometry": 5, "frames": 3}, dropped={"frame too late": 2})
-    try:
-        with status_line() as show:
-            show(snapshot, Ledger())
-            terminal.say("warning: no publisher of boxes", stderr=True)
-            show(snapshot, Ledger())
-    finally:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stderr", screen)
+        patch.setenv("COLUMNS", str(columns))
+        patch.setenv("TERM", "xterm")
         terminal.console.cache_clear()
+        try:
+            yield screen
+        finally:
+            terminal.console.cache_clear()
+
+
+def test_the_status_line_is_one_line_and_gives_way_to_others():
+    """The screen is what is left after each carriage return, erased line and line up."""
+    snapshot = Snapshot(1.0, ObjectMap(()), EMPTY, 7, counters={"odometry": 5, "frames": 3}, dropped={"frame too late": 2})
+    with terminal_in_place_of_stderr(60) as screen, status_line() as show:
+        show(snapshot, Ledger())
+        terminal.say("warning: no publisher of boxes", stderr=True)
+        show(snapshot, Ledger())
     assert re.search(r"0 objects, 0 unresolved \| odometry \d+/s frames \d+/s \| ", screen.getvalue())
     lines = [""]
     for part in re.split(r"(\x1b\[[0-9?]*[A-Za-z]|\r|\n)", screen.getvalue()):
@@ -104,23 +111,8 @@ def test_tags_of_unknown_size_say_how_a_size_helps(given, told):
     assert advice_on_tags(objects[:1], given) == ""
 
 
-@contextmanager
-def terminal_in_place_of_stderr():
-    """A terminal of 100 columns; no fixture, because pytest sets stderr anew between a fixture and its test."""
-    screen = Tty()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stderr", screen)
-        patch.setenv("COLUMNS", "100")
-        patch.setenv("TERM", "xterm")
-        terminal.console.cache_clear()
-        try:
-            yield screen
-        finally:
-            terminal.console.cache_clear()
-
-
 def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before():
-    with terminal_in_place_of_stderr() as tty, terminal.progress_bar() as show:
+    with terminal_in_place_of_stderr(100) as tty, terminal.progress_bar() as show:
         show("detecting", 220, 220)
         show("solving", 0, 0)
         mark = len(tty.getvalue())
@@ -130,7 +122,7 @@ def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before():
 
 
 def test_the_bar_of_a_stage_shows_its_count_from_the_start_and_its_rate():
-    with terminal_in_place_of_stderr() as tty, terminal.progress_bar() as show:
+    with terminal_in_place_of_stderr(100) as tty, terminal.progress_bar() as show:
         mark = len(tty.getvalue())
         for done in range(221):
             show("detecting", done, 220)
