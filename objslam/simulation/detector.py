@@ -153,7 +153,9 @@ def with_features(cameras: list[Detections], objects: list[Ints], noise: Appeara
 
 
 def _scale(prototype: Floats, kind: Ints, standing: Bools, whose: Ints, error: Floats, confusion: float) -> float:
-    """Return the factor on the errors (M, D) with which a share of the boxes is nearer to another object of its label.
+    """Return the factor on the errors (M, D) that makes a share of the boxes look like a wrong object.
+
+    With this factor, the vectors of a share `confusion` of the boxes are nearer to another object of the same label.
 
     prototype: (N, D) the vectors of objects. kind, standing: (N,) their labels, and which have more than one box. whose:
     (M,) the object of each box.

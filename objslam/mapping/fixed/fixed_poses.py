@@ -32,8 +32,9 @@ this share of the noise. Such a small change moves hardly any ray across a gate,
 larger share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the
 association can swing between two states for ever."""
 _EXPLAINED = 0.5
-"""An association that explains at most this share of the rays is compared with another one. The other one is taken if the
-first explains less than this share of what the other explains. A larger share takes the other one more often."""
+"""If an association with wide gates explains at most this share of the rays, one with narrow gates is tried as well. The
+narrow one is taken if the wide one explains less than this share of its number of rays. With a larger share, the narrow one
+is tried and taken more often."""
 
 
 @dataclass(frozen=True)
