@@ -37,8 +37,8 @@ _UNIT = 0.7
 _GROUP = 8
 """The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
 _ALONE = 1.1
-"""The crowd (`Part.crowd`) up to which all boxes of a label in a window count as boxes of one thing. A larger value tests the
-ranges of more labels by whether they end at one point."""
+"""The crowd (`Part.crowd`) up to which all boxes of a label in a window count as boxes of one thing. A larger value tests
+the ranges of more labels by whether they end at one point."""
 _LEAST_BY_ODOMETRY = 0.18
 """The least error of the ranges for poses by odometry. The joint mode itself corrects several percent."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
