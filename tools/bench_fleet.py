@@ -16,6 +16,7 @@ runs once more with nothing to do. Each size is a process of its own, which tell
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import resource
 import subprocess
@@ -49,6 +50,7 @@ from objslam.fleet.tasks.map_task import MapTask
 from objslam.fleet.tasks.merge_task import MergeTask
 from objslam.fleet.tasks.site_task import SiteResult, SiteTask
 from objslam.mapping.localization import moved_log
+from objslam.results.files import SUMMARY, dump_json
 from objslam.simulation import preset, simulate
 from objslam.sources import SourceOptions
 from objslam.sources.log_folder import write_log_folder
@@ -164,8 +166,14 @@ def _row(name: str, slots: int, done: list[Timed], own: float) -> str:
 
 
 def _hashes(folder: Path) -> dict[str, str]:
+    """Return the hash of each file. The seconds in a summary do not count."""
+
+    def content(file: Path) -> bytes:
+        data = file.read_bytes()
+        return dump_json({**json.loads(data), "seconds": None}).encode() if file.name == SUMMARY else data
+
     files = (file for file in sorted(folder.rglob("*")) if file.is_file())
-    return {str(file.relative_to(folder)): sha256(file.read_bytes()).hexdigest() for file in files}
+    return {str(file.relative_to(folder)): sha256(content(file)).hexdigest() for file in files}
 
 
 def simulated(store_url: str) -> Engine:
