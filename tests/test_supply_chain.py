@@ -50,3 +50,15 @@ def test_each_set_has_what_its_extras_need():
     assert needed("open3d", "torch") <= found["run"]
     assert needed("dev", "fleet", "dds", "open3d", "torch") <= found["run"] | found["dev"]
     assert needed("docs") <= set(names)
+
+
+def test_an_installed_package_has_every_file():
+    """setuptools leaves out each file that is not Python, unless a pattern of pyproject.toml names it."""
+    package = ROOT / "objslam"
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]["package-data"]
+    named = {file for pattern in patterns["objslam"] for file in package.glob(pattern)}
+    folders = [package, *(link for link in package.rglob("*") if link.is_symlink())]
+    found = (file for folder in folders for file in folder.rglob("*") if file.is_file())
+    files = {file for file in found if file.suffix not in (".py", ".pyc")}
+    assert len(files) > 10
+    assert files - named == set()

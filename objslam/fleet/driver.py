@@ -100,7 +100,7 @@ def run_fleet(
         tell: is called at the start of the mapping, and when a task ends.
         merge_engine: the engine of the merges, if they need other resources than the mapping. The default is `engine`.
     Raises:
-        StoreError, OutputError: the output cannot be read or written.
+        StoreError: the output cannot be read or written.
     """
     store = open_store(job.store)
     found = FleetResult()

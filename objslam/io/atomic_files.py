@@ -71,12 +71,13 @@ def has_staging(folder: Path) -> bool:
     return (folder / _STAGING).exists()
 
 
-def write_file(file: Path, data: bytes) -> None:
+def write_file(file: Path, data: bytes, *, tidy: bool = True) -> None:
     """Write one file under a temporary name and rename it. Temporary files that killed processes left are deleted first.
 
+    tidy: whether to look for such files. This lists the folder, so it takes the longer, the more files are there.
     Raises OutputError with the final file name for a disk error.
     """
-    with _replaced(file) as stream:
+    with _replaced(file, tidy=tidy) as stream:
         stream.write(data)
 
 
@@ -87,13 +88,33 @@ def write_lines(file: Path, lines: Iterable[str]) -> None:
             stream.write(encode(f"{line}\n"))
 
 
+def copy_files(files: Iterable[Path], folder: Path) -> None:
+    """Copy files into a folder, which exists. Each appears whole, and at the end all of them are on the disk.
+
+    So a file that is written later never survives a power cut without them. Raises OutputError for a disk error.
+    """
+    with disk_errors(folder):
+        for file in files:
+            final = folder / file.name
+            remove_leftovers(final)
+            temporary = final.with_name(temporary_name(final))
+            try:
+                shutil.copyfile(file, temporary)
+                _sync(temporary)
+                temporary.replace(final)
+            finally:
+                temporary.unlink(missing_ok=True)
+        _sync(folder)
+
+
 @contextmanager
-def _replaced(file: Path) -> Iterator[BinaryIO]:
+def _replaced(file: Path, *, tidy: bool = True) -> Iterator[BinaryIO]:
     """Yield a stream to a temporary file, which is renamed to `file` at the end. After an error, the temporary file is
-    deleted."""
+    deleted. tidy: as for `write_file`."""
     temporary = file.with_name(temporary_name(file))
     with disk_errors(file, only=True):
-        remove_leftovers(file)
+        if tidy:
+            remove_leftovers(file)
         try:
             with temporary.open("wb") as stream:
                 yield stream

@@ -34,5 +34,14 @@ def test_the_services_and_the_job_are_what_the_page_says():
     assert (FOLDER / "../.." / compose["head"]["build"]["dockerfile"]).is_file()
     job = yaml.safe_load((FOLDER / "rayjob.yaml").read_text(encoding="utf-8"))
     assert (job["kind"], job["spec"]["entrypoint"].split()[:2]) == ("RayJob", ["objslam", "fleet"])
+
+
+def test_the_image_has_all_that_the_package_is_built_of():
+    """A link that is copied without its target leads nowhere in the image."""
+    root = FOLDER.parents[1]
     copied = re.findall(r"^COPY (.*) \S+$", (FOLDER / "Dockerfile").read_text(encoding="utf-8"), re.MULTILINE)
-    assert all((FOLDER / "../.." / name).exists() for line in copied for name in line.split())
+    sources = [root / name for line in copied for name in line.split()]
+    assert all(source.exists() for source in sources)
+    links = [path for path in (root / "objslam").rglob("*") if path.is_symlink()]
+    assert links
+    assert all(any(link.resolve().is_relative_to(source) for source in sources) for link in links)

@@ -15,7 +15,10 @@ from objslam.fleet.driver import run_fleet
 from objslam.fleet.engines.local_engine import local_engine
 from objslam.fleet.engines.worker import Limits
 from objslam.fleet.job import make_job
+from objslam.fleet.keys import key_of
 from objslam.fleet.logs import Layout, find_logs
+from objslam.fleet.tasks import map_task
+from objslam.fleet.tasks.map_task import MapTask, map_one
 from objslam.sources import SourceOptions
 from objslam.sources.log_folder import write_log_folder
 
@@ -57,6 +60,11 @@ def test_a_fleet_finds_the_boxes_as_a_run_does(tmp_path):
         assert (tmp_path / "out" / "results" / one.key / "detections.jsonl").is_file()
     other = make_job(str(tmp_path / "out"), settings, SourceOptions(), None, report=False)
     assert other.digest != job.digest
+    again = replace(job, store=str(tmp_path / "again"))
+    map_task._network.cache_clear()
+    for log in logs:
+        map_one(MapTask(again, log.path, key_of(log.fingerprint, job.digest)))
+    assert map_task._network.cache_info().misses == 1  # A process loads a model once.
 
 
 def test_new_names_of_classes_are_a_new_job(tmp_path):

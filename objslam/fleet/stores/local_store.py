@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
+from objslam.errors import OutputError
 from objslam.fleet.stores.store import FileState, StoreError
-from objslam.io.atomic_files import write_file
+from objslam.io.atomic_files import copy_files, write_file
 
 
 def local_path(url: str) -> Path:
@@ -57,24 +58,27 @@ class LocalStore:
         return found
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. OutputError or StoreError if the disk refuses."""
+        """Write a file, and replace an older one. StoreError if the disk refuses.
+
+        A folder may have a file for each of a million logs, so no write lists it. `names` leaves out what killed
+        processes left.
+        """
         file = self._folder / name
         self._make(file.parent)
-        write_file(file, data)
+        with _refusals():
+            write_file(file, data, tidy=False)
 
     def upload(self, folder: Path, name: str) -> list[str]:
-        """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order."""
+        """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order.
+
+        StoreError if the disk refuses. The files are on the disk then, before anything says that they are.
+        """
         to = self._folder / name
         self._make(to)
-        names = sorted(file.name for file in folder.iterdir() if file.is_file())
-        try:
-            for one in names:
-                part = to / f".{one}.{os.getpid()}"
-                shutil.copyfile(folder / one, part)
-                part.replace(to / one)
-        except OSError as error:
-            raise _failed(to, error) from error
-        return names
+        files = sorted(file for file in folder.iterdir() if file.is_file())
+        with _refusals():
+            copy_files(files, to)
+        return [file.name for file in files]
 
     def remove(self, name: str) -> None:
         """Delete a file, if it exists."""
@@ -121,6 +125,15 @@ class LocalSource:
 def _state(file: Path) -> FileState:
     found = file.stat()
     return FileState(found.st_size, str(found.st_mtime_ns))
+
+
+@contextmanager
+def _refusals() -> Iterator[None]:
+    """Turn the errors of writing files into StoreError: the log is not to blame, and a later try may succeed."""
+    try:
+        yield
+    except OutputError as error:
+        raise StoreError(error.message, where=error.where, hint=error.hint) from error
 
 
 def _failed(path: Path, error: OSError) -> StoreError:

@@ -38,7 +38,7 @@ class Store(Protocol):
         """Return the contents of files by name. Files that do not exist are left out."""
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. StoreError or OutputError if the store refuses."""
+        """Write a file, and replace an older one. StoreError if the store refuses."""
 
     def upload(self, folder: Path, name: str) -> list[str]:
         """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order."""
