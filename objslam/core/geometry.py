@@ -221,15 +221,14 @@ def interpolate_pair(first: Floats, second: Floats, share: float) -> Floats:
     sine = 1 - turned**2 / 6 if turned < _SMALL else math.sin(turned) / turned
     turn = np.array(
         [
-            [c + a * u * u, a * u * v - sine * w, a * u * w + sine * v, x],
-            [a * u * v + sine * w, c + a * v * v, a * v * w - sine * u, y],
-            [a * u * w - sine * v, a * v * w + sine * u, c + a * w * w, z],
-            [0.0, 0.0, 0.0, 1.0],
+            [c + a * u * u, a * u * v - sine * w, a * u * w + sine * v],
+            [a * u * v + sine * w, c + a * v * v, a * v * w - sine * u],
+            [a * u * w - sine * v, a * v * w + sine * u, c + a * w * w],
         ]
     )
     pose = first.copy()
-    pose[:3, :3] = turn[:3, :3] @ first[:3, :3]
-    pose[:3, 3] += turn[:3, 3]
+    pose[:3, :3] = turn @ first[:3, :3]
+    pose[:3, 3] += x, y, z
     return pose
 
 
