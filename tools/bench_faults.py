@@ -18,6 +18,7 @@ import os
 import sys
 import tempfile
 from collections import Counter
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -48,9 +49,9 @@ def measure(case: Case, folder: Path, count: int, errors: bool) -> list[str]:
 
 
 def shares(cases: list[Case], total: int) -> list[int]:
-    """How many of the faults each case gets: as its calls, but each a fair part."""
-    weights = [case.steps**0.5 for case in cases]
-    return [max(1, round(total * weight / sum(weights))) for weight in weights]
+    """How many of the faults each case gets: as its calls, but each a fair part. Together they are `total`."""
+    ends = list(accumulate(case.steps**0.5 for case in cases))
+    return [round(total * end / ends[-1]) - round(total * begin / ends[-1]) for begin, end in pairwise([0.0, *ends])]
 
 
 def main() -> int:

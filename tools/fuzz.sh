@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
 # Feeds mutated files to every parser, with other inputs in each round: tools/fuzz.sh --minutes N [options of pytest]
+# OBJSLAM_FUZZ_LEAST=5000 gives every target at least so many inputs in each round, also the slow ones.
 set -euo pipefail
 if [[ ${1:-} != --minutes || ! ${2:-} =~ ^[0-9]+$ ]]; then
     echo "usage: tools/fuzz.sh --minutes N [options of pytest]" >&2

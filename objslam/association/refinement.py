@@ -48,7 +48,10 @@ def information(obs: Observations, point: Floats) -> Floats:
     distance, n = np.linalg.norm(point - obs.origin, axis=1), obs.direction
     along = n[:, :, None] * n[:, None, :]
     across = (np.eye(3) - along) / (obs.sigma * np.maximum(distance, MIN_DEPTH))[:, None, None] ** 2
-    weight = np.where(np.isfinite(obs.range), 1 / obs.range_sigma**2, 0.0)
+    ranged = np.isfinite(obs.range)
+    if not ranged.any():
+        return across
+    weight = np.where(ranged, 1 / obs.range_sigma**2, 0.0)
     return across + np.nan_to_num(weight)[:, None, None] * along
 
 

@@ -4,7 +4,8 @@ Twists have the order of GTSAM, rotation first: (wx, wy, wz, vx, vy, vz).
 """
 
 import math
-from typing import Literal
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from objslam.core.rotation import (
     skew,
 )
 
+_SMALL = 1e-4
+"""A series replaces the coefficients of a twist if its angle, rad, is smaller than this. A larger value makes the series
+less exact. At this value, its relative error is below 1e-17."""
 _ON_A_LINE = 1e-9
 """Points lie on a line if the second singular value of their cross-covariance is at most this share of the first. A larger
 share takes more point sets for lines. Rounding leaves about 1e-15."""
@@ -105,18 +109,34 @@ def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
     return turn, np.sqrt(along2 + chord / np.sinc(turn / (2 * np.pi)) ** 2)
 
 
-def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
-    """Return the two numbers of `twist_lengths` for the motion between two poses (4, 4), ten times faster."""
+class Motion(NamedTuple):
+    """The motion between two poses (4, 4), as floats, in the frame of the map and not of the body.
+
+    axis: of the rotation, times the sine of its angle. angle: rad, in [0, pi]. way: m.
+    """
+
+    axis: tuple[float, float, float]
+    angle: float
+    way: tuple[float, float, float]
+
+
+def motion_between(before: Floats, after: Floats) -> Motion:
+    """Return the motion between two poses (4, 4), in a tenth of the time that numpy takes. A session asks for every pose."""
     (a0, a1, a2, ax), (b0, b1, b2, by), (c0, c1, c2, cz) = before[:3].tolist()
     (d0, d1, d2, dx), (e0, e1, e2, ey), (f0, f1, f2, fz) = after[:3].tolist()
-    x, y, z = dx - ax, ey - by, fz - cz  # The step, like the axis below, is in the frame of the map, not of the body.
     trace = a0 * d0 + b0 * e0 + c0 * f0 + a1 * d1 + b1 * e1 + c1 * f1 + a2 * d2 + b2 * e2 + c2 * f2
     # Half the sum of the cross products of the axes before and after is the rotation axis times the sine of the angle.
     u = (b0 * f0 - c0 * e0 + b1 * f1 - c1 * e1 + b2 * f2 - c2 * e2) / 2
     v = (c0 * d0 - a0 * f0 + c1 * d1 - a1 * f1 + c2 * d2 - a2 * f2) / 2
     w = (a0 * e0 - b0 * d0 + a1 * e1 - b1 * d1 + a2 * e2 - b2 * d2) / 2
+    angle = math.atan2(math.sqrt(u * u + v * v + w * w), (trace - 1) / 2)
+    return Motion((u, v, w), angle, (dx - ax, ey - by, fz - cz))
+
+
+def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
+    """Return the two numbers of `twist_lengths` for the motion between two poses (4, 4), ten times faster."""
+    (u, v, w), turn, (x, y, z) = motion_between(before, after)
     sine = math.sqrt(u * u + v * v + w * w)
-    turn = math.atan2(sine, (trace - 1) / 2)
     along2 = ((x * u + y * v + z * w) / max(sine, 1e-150)) ** 2
     chord = max(x * x + y * y + z * z - along2, 0.0)
     half = turn / 2
@@ -138,7 +158,7 @@ def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
     """Return for rotation vectors (..., 3) three arrays (..., 1): the angles, whether each is so small that a series is
     needed, and the angles as divisors, with 1 for the small ones."""
     angle = np.sqrt(np.einsum("...i,...i->...", omega, omega))[..., None]
-    small = angle < 1e-4
+    small = angle < _SMALL
     return angle, small, np.where(small, 1.0, angle)
 
 
@@ -173,6 +193,49 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     step = inverse(first) @ poses[after[valid]]
     result[valid] = first @ exp_se3(log_se3(step) * fraction[valid, None])
     return result, valid
+
+
+def interpolate_pair(first: Floats, second: Floats, share: float) -> Floats:
+    """Return the pose (4, 4) at a share, 0 to 1, of the way between two poses (4, 4), as `interpolate`.
+
+    A session asks for every image. This function avoids numpy, and takes a tenth of the time of `interpolate`.
+    """
+    axis, angle, way = motion_between(first, second)
+    if angle >= math.pi / 2:  # The sine of an angle near pi is small, so that the axis would be inexact.
+        poses, _ = interpolate(np.array([0.0, 1.0]), np.array([first, second]), np.array([share]), np.inf)
+        return poses[0]
+    longer, half, turned = angle / math.sin(angle) if angle > 0 else 1.0, angle / 2, share * angle
+    small = angle < _SMALL
+    k = 1 / 12 + angle**2 / 720 if small else (1 - half / math.tan(half)) / angle**2
+    a = 0.5 - turned**2 / 24 if turned < _SMALL else (1 - math.cos(turned)) / turned**2
+    b = 1 / 6 - turned**2 / 120 if turned < _SMALL else (turned - math.sin(turned)) / turned**3
+    # As in `log_se3` and `exp_se3`, but in the frame of the map, not of the first pose.
+    once = _product(axis, way)
+    twice = _product(axis, once)
+    straight = [share * (p - longer * q / 2 + k * longer**2 * r) for p, q, r in zip(way, once, twice, strict=True)]
+    u, v, w = (share * longer * n for n in axis)
+    once = _product((u, v, w), straight)
+    twice = _product((u, v, w), once)
+    x, y, z = (p + a * q + b * r for p, q, r in zip(straight, once, twice, strict=True))
+    c = math.cos(turned)
+    sine = 1 - turned**2 / 6 if turned < _SMALL else math.sin(turned) / turned
+    turn = np.array(
+        [
+            [c + a * u * u, a * u * v - sine * w, a * u * w + sine * v],
+            [a * u * v + sine * w, c + a * v * v, a * v * w - sine * u],
+            [a * u * w - sine * v, a * v * w + sine * u, c + a * w * w],
+        ]
+    )
+    pose = first.copy()
+    pose[:3, :3] = turn @ first[:3, :3]
+    pose[:3, 3] += x, y, z
+    return pose
+
+
+def _product(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    """Return the cross product of two vectors, as floats."""
+    (x, y, z), (u, v, w) = a, b
+    return y * w - z * v, z * u - x * w, x * v - y * u
 
 
 def align(source: Floats, target: Floats, kind: Literal["none", "se2", "sim2", "se3", "sim3"]) -> tuple[Floats, float]:

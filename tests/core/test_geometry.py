@@ -13,11 +13,13 @@ from objslam.core.geometry import (
     align,
     exp_se3,
     interpolate,
+    interpolate_pair,
     inverse,
     is_planar,
     lift_se2,
     log_se3,
     make_pose,
+    motion_between,
     pose_from_quaternion,
     quaternion,
     skew,
@@ -182,6 +184,25 @@ def test_between_two_poses_the_path_is_the_matrix_power(seed, fraction):
     got, valid = interpolate(np.array([10.0, 12.0]), np.stack([a, b]), query, max_gap=2.0)
     assert valid.all()
     np.testing.assert_allclose(got[0], a @ np.real(expm(fraction * logm(np.linalg.inv(a) @ b))), atol=1e-7)
+
+
+@given(seeds, twists(), st.floats(0, 1))
+def test_a_pair_is_interpolated_as_a_path_is(seed, twist, share):
+    first = some_poses(seed, 1)[0]
+    second = first @ exp_se3(twist)
+    expected, _ = interpolate(np.array([0.0, 1.0]), np.stack([first, second]), np.array([share]), max_gap=1.0)
+    np.testing.assert_allclose(interpolate_pair(first, second, share), expected[0], atol=1e-11)
+
+
+@given(seeds, twists())
+def test_the_motion_between_two_poses_is_a_turn_and_a_way_in_the_map(seed, twist):
+    first = some_poses(seed, 1)[0]
+    second = first @ exp_se3(twist)
+    axis, angle, way = motion_between(first, second)
+    turn = Rotation.from_matrix(second[:3, :3] @ first[:3, :3].T).as_rotvec()
+    np.testing.assert_allclose(angle, np.linalg.norm(turn), atol=1e-7)
+    np.testing.assert_allclose(axis, np.sinc(angle / np.pi) * turn, atol=1e-7)
+    np.testing.assert_allclose(way, second[:3, 3] - first[:3, 3], atol=1e-12)
 
 
 def test_between_two_planar_poses_the_path_is_an_arc():

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 from scipy.special import expit
 from scipy.stats import chi2, norm, rayleigh
 
 import objslam
 from objslam.core import statistics
-from objslam.core.statistics import grouped_median, grouped_quantile, logistic, noise_factors, poisson_tail
+from objslam.core.statistics import grouped_median, grouped_quantile, logistic, noise_factors, poisson_tail, quantile
 
 
 def test_they_are_the_quantiles_that_they_say():
@@ -88,3 +89,8 @@ def test_the_poisson_tail_is_one_less_the_sum_of_the_smaller_counts():
 def test_log_odds_become_probabilities_however_large_they_are():
     odds = np.array([-1e4, -800.0, -30.0, -1.0, 0.0, 2.5, 40.0, 1e4, -np.inf, np.inf])
     np.testing.assert_allclose(logistic(odds), expit(odds), rtol=1e-13, atol=1e-300)
+
+
+@given(npst.arrays(np.float64, st.integers(1, 40), elements=st.floats(-1e3, 1e3)), st.floats(0, 1))
+def test_a_quantile_is_that_of_numpy(values, share):
+    assert quantile(values, share) == pytest.approx(np.quantile(values, share), abs=1e-9)

@@ -54,7 +54,9 @@ def test_no_array_is_rigid_that_is_no_rotation(poses):
 @given(
     npst.arrays(np.float64, 3, elements=st.floats(-3, 3)),
     st.sampled_from([0.0, 1e-15, 1e-13, 1e-9, 1e-4, 1e-2]),
-    st.sampled_from([(0, 0, 1.0), (0, 0, -1.0), (3, 3, 2.0), (3, 0, 1.0), (1, 3, 1e7), (1, 3, np.nan), (2, 2, np.nan)]),
+    st.sampled_from(
+        [(0, 0, 1.0), (0, 0, -1.0), (3, 3, 2.0), (3, 0, 1.0), (1, 3, 1e7), (1, 3, -1e7), (1, 3, np.nan), (2, 2, np.nan)]
+    ),
     st.integers(0, 99),
 )
 def test_one_pose_is_judged_as_many_are(vector, noise, change, seed):

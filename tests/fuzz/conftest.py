@@ -11,7 +11,7 @@ import pytest
 
 sys.path += [str(Path(__file__).parents[1] / part) for part in ("sources/ros", "live", "detection")]
 
-from mutations import COUNTED, ROUNDS
+from mutations import COUNTED, LEAST, ROUNDS
 
 TABLE: dict[str, tuple[int, float]] = {}
 
@@ -27,7 +27,7 @@ def pytest_runtest_call(item):
 
 
 def pytest_terminal_summary(terminalreporter):
-    if ROUNDS > 1:
+    if ROUNDS > 1 or LEAST > 0:
         for name, (inputs, seconds) in TABLE.items():
             terminalreporter.write_line(f"{name:60s}{inputs:10d}{seconds:10.1f}")
         inputs, seconds = (sum(column) for column in zip(*TABLE.values(), strict=True))

@@ -20,6 +20,8 @@ from objslam.errors import ObjslamError
 
 ROUNDS = int(os.environ.get("OBJSLAM_FUZZ_ROUNDS", "1"))
 """How many times the inputs of the suite a target gets. tools/fuzz.sh sets a larger number."""
+LEAST = int(os.environ.get("OBJSLAM_FUZZ_LEAST", "0"))
+"""The least number of inputs of a target. Without it, a slow target gets few in a round."""
 SEED = int(os.environ.get("OBJSLAM_FUZZ_SEED", "0"))
 """The first seed of the byte mutations. tools/fuzz.sh counts it up, so that each of its rounds has other inputs."""
 CORPUS = Path(__file__).parent / "corpus"
@@ -51,9 +53,14 @@ ODD = [
 odd = st.sampled_from(ODD) | st.floats() | st.integers() | st.text(max_size=3) | st.lists(st.integers(), max_size=3)
 
 
-def mutated(data: bytes, count: int) -> Iterator[bytes]:
-    """Yield `count` times ROUNDS mutations of bytes: flips, cuts, doublings, other numbers, and pieces moved."""
-    for number in range(count * ROUNDS):
+def examples(count: int, inputs: int = 1) -> int:
+    """How many examples a target gets: `count` a round, or as LEAST needs. inputs: how many inputs an example makes."""
+    return max(count * ROUNDS, -(-LEAST // inputs))
+
+
+def mutated(data: bytes, count: int, inputs: int = 1) -> Iterator[bytes]:
+    """Yield mutations of bytes, as many as `examples` says: flips, cuts, doublings, other numbers, and pieces moved."""
+    for number in range(examples(count, inputs)):
         chance = random.Random(f"{SEED} {number}")
         made = bytearray(data)
         for _ in range(chance.choice([1, 1, 2, 4, 16])):

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mutations import ROUNDS, altered, as_json, mutated, survives
+from mutations import altered, as_json, examples, mutated, survives
 
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.calibration import Calibration
@@ -114,7 +114,7 @@ STRUCTURED = {
 
 
 @pytest.mark.parametrize("name", STRUCTURED)
-@settings(max_examples=60 * ROUNDS)
+@settings(max_examples=examples(60))
 @given(data=st.data())
 def test_altered_structures(tmp_path_factory, name, data):
     folder = tmp_path_factory.getbasetemp()
@@ -125,7 +125,7 @@ def test_altered_structures(tmp_path_factory, name, data):
     survives(lambda: read(file))
 
 
-@settings(max_examples=300 * ROUNDS)
+@settings(max_examples=examples(300))
 @given(data=st.data())
 def test_altered_journal_records(data):
     record = encode(data.draw(st.sampled_from(MESSAGES)))
@@ -144,7 +144,7 @@ def test_mutated_journals(tmp_path):
     for message in MESSAGES:
         journal.write(message)
     journal.close()
-    for data in mutated(file.read_bytes(), 200):
+    for data in mutated(file.read_bytes(), 200, inputs=2):
         file.write_bytes(data)
         survives(lambda: list(messages(file, Ledger())))
         survives(lambda: read_journal(file, Ledger()))
@@ -154,7 +154,7 @@ def test_mutated_journals(tmp_path):
 def test_mutated_images(ending):
     picture = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
     good = cv2.imencode(ending, picture)[1].tobytes()
-    for data in chain([good], mutated(good, 60)):
+    for data in chain([good], mutated(good, 60, inputs=2)):
         for decode_image in (decode_colour, decode_depth):
             assert survives(partial(read_image, decode_image, data))
 

@@ -11,7 +11,7 @@ import pytest
 from bag_writer import Maker, Raw, serialize, write_bag
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mutations import ROUNDS, altered, check, mutated, survives
+from mutations import altered, check, examples, mutated, survives
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -59,13 +59,13 @@ def test_mutated_bags(tmp_path, kind):
     made = [("/odom", S, maker.odometry(S, np.eye(4)))] if kind == "bag" else rows()
     found = write_bag(tmp_path / "drive", kind, maker, made)
     file = next(found.glob("*.db3")) if found.is_dir() else found
-    for data in mutated(file.read_bytes(), 12):
+    for data in mutated(file.read_bytes(), 12, inputs=2):
         file.write_bytes(data)
         survives(lambda: describe(found))
         survives(lambda: read_bag(found, Ledger()))
 
 
-@settings(max_examples=40 * ROUNDS)
+@settings(max_examples=examples(40, inputs=2))
 @given(data=st.data())
 def test_mutated_messages_in_a_whole_bag(tmp_path_factory, data):
     made = rows()
@@ -98,7 +98,7 @@ def checked(taken):
         decode(encode(message))
 
 
-@settings(max_examples=100 * ROUNDS)
+@settings(max_examples=examples(100, inputs=20))
 @given(data=st.data())
 def test_mutated_messages_of_a_robot(data):
     taken = []
@@ -141,7 +141,7 @@ LINES = [
 ]
 
 
-@settings(max_examples=200 * ROUNDS)
+@settings(max_examples=examples(200, inputs=len(LINES)))
 @given(data=st.data())
 def test_altered_json_lines(data):
     taken = []
@@ -156,7 +156,7 @@ def test_altered_json_lines(data):
 def test_mutated_json_lines():
     taken = []
     adapter = StdinAdapter(intake(taken), io.BytesIO())
-    for number, data in enumerate(chain.from_iterable(mutated(json.dumps(line).encode(), 60) for line in LINES)):
+    for number, data in enumerate(chain.from_iterable(mutated(json.dumps(line).encode(), 60, len(LINES)) for line in LINES)):
         survives(lambda data=data, number=number: adapter._take(data, number), "lines", data)
     assert taken
     checked(taken)

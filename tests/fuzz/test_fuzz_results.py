@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mutations import ROUNDS, altered, as_json, mutated, survives
+from mutations import altered, as_json, examples, mutated, survives
 from synthetic_result import clusters, synthetic_result
 
 from objslam.api.result import Result
@@ -29,6 +29,9 @@ from objslam.output.report import write_report
 from objslam.output.result_folder import write_result
 from objslam.results import files
 from objslam.results.read import load_features, load_trajectory
+
+READERS = 3 + len(FORMATS)
+"""How many commands `read_everything` gives a folder to."""
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +64,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     motions = Motions(stamps[:-1], stamps[1:], np.tile(np.eye(4), (steps, 1, 1)), np.tile(1e-4 * np.eye(6), (steps, 1, 1)))
     (out / files.MOTIONS).write_bytes(dump_motions(motions))
     (out / files.FEATURES).write_bytes(dump_features(RayFeatures(rays, np.eye(5, 8, dtype=np.float32))))
-    assert read_everything(out) == [True] * (3 + len(FORMATS))
+    assert read_everything(out) == [True] * READERS
     return out
 
 
@@ -85,7 +88,7 @@ TABLES = (files.RAYS, files.MOTIONS, files.FEATURES)
 
 
 @pytest.mark.parametrize("name", JSON_FILES)
-@settings(max_examples=10 * ROUNDS)
+@settings(max_examples=examples(10, READERS))
 @given(data=st.data())
 def test_altered_json(result: Path, name: str, data: st.DataObject) -> None:
     made = data.draw(altered(json.loads((result / name).read_text())))
@@ -102,7 +105,7 @@ def test_optional_keys_that_are_missing(result: Path) -> None:
 
 @pytest.mark.parametrize("name", [*JSON_FILES, files.TRAJECTORY, files.CONFIG, *TABLES])
 def test_mutated_bytes(result: Path, name: str) -> None:
-    for data in mutated((result / name).read_bytes(), 4):
+    for data in mutated((result / name).read_bytes(), 4, READERS):
         read_everything(with_file(result, name, data))
 
 
@@ -110,7 +113,7 @@ CELLS = [None, 0.0, -1.0, 1e8, 1e300, float("nan"), float("inf"), "x", b"x", 2**
 
 
 @pytest.mark.parametrize("name", TABLES)
-@settings(max_examples=12 * ROUNDS)
+@settings(max_examples=examples(12, READERS))
 @given(data=st.data())
 def test_altered_tables(result: Path, name: str, data: st.DataObject) -> None:
     table = pq.read_table(result / name)

@@ -54,7 +54,7 @@ def test_mutated_folders(tmp_path, kind):
     folder = tmp_path / "recording"
     taken = list[bool]()
     for name, good in FOLDERS[kind].items():
-        for data in chain([good], known(kind), mutated(good, 20)):
+        for data in chain([good], known(kind), mutated(good, 20, len(FOLDERS[kind]))):
             shutil.rmtree(folder, ignore_errors=True)
             for other, content in FOLDERS[kind].items():
                 (folder / other).parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +68,7 @@ NAMES = [b"{0: 'cup', 1: 'book'}", b'["cup", "book"]', b'{"0": "cup", "1": "book
 
 
 def test_mutated_names_of_a_model(tmp_path):
-    inputs = (data for good in NAMES for data in mutated(good, 100))
+    inputs = (data for good in NAMES for data in mutated(good, 100, len(NAMES)))
     for data in chain(NAMES, known("names"), inputs):
         text = data.decode(errors="surrogateescape")
         survives(lambda text=text: names_from_metadata(text, tmp_path), "names", data)
@@ -80,9 +80,9 @@ def test_mutated_models(tmp_path):
     tiny_model(file, "yolov8", size=(64, 64), metadata={"names": "{0: 'cup', 1: 'book', 2: 'dog'}"}.items())
     good = file.read_bytes()
     at = good.index(b"names")
-    spots = (good[: at - 40] + tail for tail in mutated(good[at - 40 :], 25))
+    spots = (good[: at - 40] + tail for tail in mutated(good[at - 40 :], 25, inputs=2))
     taken = []
-    for data in chain([good], known("model"), spots, mutated(good, 15)):
+    for data in chain([good], known("model"), spots, mutated(good, 15, inputs=2)):
         file.write_bytes(data)
         taken.append(survives(lambda: load_detector(file, Detector(device="cpu")), "model", data))
     assert taken[0]
@@ -95,7 +95,7 @@ def test_mutated_network_messages():
     good = [(topic, message.__msgtype__, serialize(maker, message)) for topic, _, message in rows()]
     for topic, type_, content in good:
         decode = make_decoder(Connection(topic, type_, "cdr"))
-        for data in chain([content], known("cdr"), mutated(content, 10)):
+        for data in chain([content], known("cdr"), mutated(content, 10, len(good))):
 
             def push(decode=decode, data=data, type_=type_, topic=topic):
                 try:

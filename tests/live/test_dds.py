@@ -10,6 +10,7 @@ import threading
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from waiting import LIMIT, wait_for
 pytest.importorskip("cyclonedds")
 sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
 from bag_writer import Maker, serialize
+from cyclonedds.core import DDSException
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
@@ -274,6 +276,41 @@ def test_settings_of_the_user_are_kept(domain, monkeypatch):
     assert open_network() is network
     with pytest.raises(ConfigError, match="open on CYCLONEDDS_URI already"):
         open_network(domain, "auto")
+
+
+SECURITY = (
+    '<CycloneDDS><Domain Id="any"><Security><Authentication><Library path="dds_security_auth"'
+    ' initFunction="init_authentication" finalizeFunction="finalize_authentication"/>'
+    "<IdentityCA>file:/no/ca.pem</IdentityCA><IdentityCertificate>file:/no/own.pem</IdentityCertificate>"
+    "<PrivateKey>file:/no/key.pem</PrivateKey></Authentication></Security></Domain></CycloneDDS>"
+)
+
+
+def test_security_settings_reach_the_library_as_they_are(domain, monkeypatch):
+    given = []
+
+    def refuse(number, settings):
+        given.append((number, settings))
+        raise DDSException(DDSException.DDS_RETCODE_ERROR)
+
+    monkeypatch.setenv("CYCLONEDDS_URI", SECURITY)
+    monkeypatch.setattr("cyclonedds.domain.Domain", refuse)
+    with pytest.raises(ObjslamError, match="cannot be joined on CYCLONEDDS_URI"):
+        open_network(domain)
+    ((number, settings),) = given
+    own = settings.removeprefix(f"{SECURITY},")
+    assert number == domain
+    assert settings != own
+    assert {element.tag for element in ElementTree.fromstring(own).find("Domain")} == {"Tracing", "Internal"}
+
+
+def test_without_security_or_keys_no_session_begins_in_the_clear(domain, monkeypatch):
+    """A library without security does not know the settings, and one with it does not find the keys."""
+    monkeypatch.setenv("CYCLONEDDS_URI", SECURITY)
+    before = set(_datagram_sockets())
+    with pytest.raises(ObjslamError, match=rf"DDS domain {domain} cannot be joined on CYCLONEDDS_URI"):
+        open_network(domain)
+    assert set(_datagram_sockets()) == before
 
 
 @pytest.mark.parametrize("given", [-1, 233])

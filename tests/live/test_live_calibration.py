@@ -12,7 +12,8 @@ from waiting import LIMIT
 
 from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
-from objslam.core.geometry import lift_se2
+from objslam.core.geometry import lift_se2, make_pose
+from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.corrected_log import OdometryCorrection
 from objslam.frontend.shared_errors import SharedErrors
@@ -70,10 +71,13 @@ def rmse(found, log):
     return float(np.sqrt(np.mean(np.sum(np.square(off), axis=1))))
 
 
-def test_odometry_is_corrected_pose_by_pose_as_a_whole():
+@pytest.mark.parametrize("turn", [0.05, 2.0])  # rad. The second also makes steps of more than a quarter turn.
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_odometry_is_corrected_pose_by_pose_as_a_whole(turn, tilt):
     rng = np.random.default_rng(2)
-    steps = np.cumsum(rng.normal([0.05, 0.0, 0.02], [0.02, 0.02, 0.05], (400, 3)), axis=0)
-    said = Trajectory(np.cumsum(rng.uniform(0.02, 0.08, 400)), lift_se2(steps))
+    steps = np.cumsum(rng.normal([0.05, 0.0, 0.02], [0.02, 0.02, turn], (400, 3)), axis=0)
+    tilts = make_pose(rotation_from_vector(rng.normal(0, tilt, (400, 3))), np.zeros((400, 3)))
+    said = Trajectory(np.cumsum(rng.uniform(0.02, 0.08, 400)), lift_se2(steps) @ tilts)
     wrong = {"odometry.scale": -0.04, "odometry.turn_scale": 0.07, "odometry.turn_bias": 0.003}
     names, values = tuple(wrong), np.array(list(wrong.values()))
     whole = SharedErrors(Log("log", (), said), None, None, settings_of(), names, values, np.eye(3)).corrected_log(values)

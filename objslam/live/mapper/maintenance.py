@@ -9,7 +9,7 @@ from objslam.association.refinement import normalised_residuals
 from objslam.association.single_object_fit import fit_point
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint
-from objslam.core.statistics import MOST_NOISE_FACTOR, OUTLIER_RAY, SAME_POINT, noise_factors
+from objslam.core.statistics import MOST_NOISE_FACTOR, OUTLIER_RAY, SAME_POINT, noise_factors, quantile
 from objslam.errors import SolveError
 from objslam.live.mapper.keyframe_culling import cull_keyframes
 from objslam.live.mapper.landmark_table import covariances, in_view, noise
@@ -65,7 +65,7 @@ def _coming(m: MapState) -> Ints:
     if not len(landmarks.id):
         return landmarks.id
     pose, camera = m.graph.pose(int(keyframes.id[-1])), m.cameras[keyframes.camera[-1]]
-    reach = float(np.quantile(landmarks.far, _USUAL))
+    reach = quantile(landmarks.far, _USUAL)
     return np.asarray(landmarks.id[in_view(landmarks, camera, pose, -_AROUND, reach)])
 
 

@@ -44,14 +44,14 @@ class GrowingTable:
 
     def add(self, **rows: ArrayLike) -> None:
         """Append rows (n, ...), given for every column."""
-        arrays = {name: np.asarray(rows[name]) for name in self._room}
-        end = self._length + len(next(iter(arrays.values())))
+        begin = self._length
+        end = begin + len(np.asarray(rows[next(iter(self._room))]))
         for name, room in self._room.items():
             if end > len(room):
                 larger = np.zeros((max(end, 2 * len(room)), *room.shape[1:]), dtype=room.dtype)
-                larger[: self._length] = room[: self._length]
+                larger[:begin] = room[:begin]
                 self._room[name] = room = larger
-            room[self._length : end] = arrays[name]
+            room[begin:end] = rows[name]
         self._length = end
         self._show()
 
@@ -101,7 +101,7 @@ class PathTable(GrowingTable):
         """Append a pose (4, 4) at a stamp, s, later than all others. asked: (K,) s, the stamps that later solves ask for."""
         if len(self) >= self._most:
             self._thin(asked)
-        self.add(stamp=[stamp], pose=pose[None], travel=np.zeros((1, 3)))
+        self.add(stamp=(stamp,), pose=pose[None], travel=0.0)
 
     def trajectory(self) -> Trajectory | None:
         """Return a copy of the path, None if it has no pose."""

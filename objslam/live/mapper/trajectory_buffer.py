@@ -7,7 +7,7 @@ import numpy as np
 
 from objslam.config import Odometry
 from objslam.core.arrays import Floats
-from objslam.core.geometry import interpolate, inverse
+from objslam.core.geometry import interpolate, interpolate_pair, inverse
 from objslam.core.types import Trajectory
 from objslam.frontend.odometry_drift import add_step, gathered_drift
 
@@ -92,10 +92,9 @@ class PathBuffer:
         if self._stamps[after] == stamp:
             return self._path[after]
         (begin, end), (before, then) = self._stamps[after - 1 : after + 1], self._path[after - 1 : after + 1]
-        pair, asked = np.array([before.pose, then.pose]), np.array([stamp])
-        poses, _ = interpolate(np.array([begin, end]), pair, asked, self._max_gap)
         share = (stamp - begin) / (end - begin)
-        return OnPath(poses[0], (1 - share) * before.drift + share * then.drift, stretch)
+        pose = interpolate_pair(before.pose, then.pose, share)
+        return OnPath(pose, (1 - share) * before.drift + share * then.drift, stretch)
 
     def from_start(self, pose: Floats) -> Floats:
         """Return a pose (4, 4) in the coordinate frame of the first pose."""

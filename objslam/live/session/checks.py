@@ -28,6 +28,8 @@ _EXACT = 2**53  # The bound below which a float represents every whole number ex
 
 def floats(values: object, *shape: int) -> Floats | None:
     """Copy values into an array of a shape, None if that fails. An empty list fits every shape that has a 0 in it."""
+    if type(values) is np.ndarray and values.dtype == np.float64 and values.shape == shape:
+        return values.copy()  # Nearly all messages. They need no protection against what a foreign object may raise.
     found = _array(values, np.float64)
     if found is None or found.shape == shape:
         return found
@@ -51,6 +53,8 @@ def track_numbers(values: object, count: int) -> Ints | None:
 
 def stamp_of(value: object) -> float | None:
     """Return a stamp, s. None if the value is no number, not finite or out of range."""
+    if type(value) is float:
+        return value if abs(value) <= MAX_LIVE_STAMP else None
     found = floats(value)
     return float(found) if found is not None and valid_stamps(found, MAX_LIVE_STAMP) else None
 

@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import partial
@@ -13,9 +14,9 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
-from objslam.core.geometry import inverse
+from objslam.core.geometry import inverse, motion_between
 from objslam.core.snapshot import CAME_BEFORE, NOT_USED
-from objslam.core.validity import valid_positions
+from objslam.core.validity import is_valid_position
 from objslam.live.counters import Counters
 from objslam.live.session import checks
 from objslam.live.session.clock import Clock, Lead
@@ -80,7 +81,7 @@ class Intake:
         self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
         self._start_T_odom = np.eye(4)  # Moves poses from the odometry's present frame into its first one.
         self._last: dict[PathKind, PoseMessage] = {}
-        self._heard: dict[PathKind, dict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
+        self._heard: dict[PathKind, OrderedDict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
         self._lead = Lead(self._clock, settings.poses.max_gap)
         self._leaps = StampLeaps[_Checked]()
 
@@ -232,7 +233,7 @@ class Intake:
                 return self._refuse(f"{path} that is late", where)
         if path == "odometry":
             pose = self._continuous(at, pose)
-            if not valid_positions(pose[:3, 3]):
+            if not is_valid_position(*pose[:3, 3].tolist()):
                 return self._refuse("odometry with a position out of range", where)
         message = PoseMessage(path, at, pose)
         if not self._hand_on(message):
@@ -268,17 +269,17 @@ class Intake:
 
     def _is_known(self, path: PathKind, at: float, pose: Floats) -> bool:
         """Return whether this pose was accepted before at this stamp, in session time, s, and newer ones after it."""
-        known = self._heard.get(path, {}).get(at)
+        known = self._heard[path].get(at) if path in self._heard else None
         if known is None or at >= self._last[path].stamp:
             return False
         pose = self._start_T_odom @ pose if path == "odometry" else pose
         return bool(np.abs(known - pose).max() < _SAME_POSE)
 
     def _keep(self, message: PoseMessage) -> None:
-        heard = self._heard.setdefault(message.path, {})
+        heard = self._heard.setdefault(message.path, OrderedDict())
         heard[message.stamp] = message.pose
         if len(heard) > _POSES:
-            del heard[next(iter(heard))]
+            heard.popitem(last=False)  # A plain dict would search 10 us for its oldest entry.
 
     def _place(self, stamp: float) -> float:
         """Return the session time of a mount, of a frame, or of a pose on the path that does not set the clock."""
@@ -293,11 +294,11 @@ class Intake:
         gap = at - last.stamp
         if gap > self._settings.poses.max_gap:
             self.counters.accept("gaps of the odometry")
-        way, turn = _size(inverse(last.pose) @ pose)
-        fast = self._settings.live.max_speed
+        moved, fast = motion_between(last.pose, pose), self._settings.live.max_speed
+        way, turn = math.hypot(*moved.way), moved.angle
         jumped = way > fast * gap + _JUMP or turn > _TURNS_PER_M * fast * gap + _TURN
-        if gap > self._settings.poses.max_gap and max(_size(odom_T_base)) < _ZERO:
-            jumped |= max(_size(inverse(self._start_T_odom) @ last.pose)) > _FAR
+        if gap > self._settings.poses.max_gap and _reach(np.eye(4), odom_T_base) < _ZERO:
+            jumped |= _reach(self._start_T_odom, last.pose) > _FAR
         if jumped:
             self.counters.accept("restarts of the odometry")
             self._start_T_odom = last.pose @ inverse(odom_T_base)
@@ -343,7 +344,7 @@ def _kind(message: Message) -> str:
     return message.path if isinstance(message, PoseMessage) else _KINDS[type(message)]
 
 
-def _size(pose: Floats) -> tuple[float, float]:
-    """Return the length (m) of a pose's translation and the angle (rad) of its rotation. pose: (4, 4)."""
-    angle = math.acos(min(1.0, max(-1.0, (float(np.trace(pose)) - 2.0) / 2.0)))
-    return math.hypot(*pose[:3, 3]), angle
+def _reach(before: Floats, after: Floats) -> float:
+    """Return the angle (rad) or the length (m) of the motion between two poses (4, 4), whichever is the larger number."""
+    _, angle, way = motion_between(before, after)
+    return max(angle, math.hypot(*way))
