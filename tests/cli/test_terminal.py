@@ -219,3 +219,19 @@ def test_numbers_of_one_thing_have_no_plural():
     line = status._Rates().line(snapshot, Ledger())
     assert "1 object," in line
     assert "1 keyframe " in line
+
+
+def test_the_longest_topics_lose_their_types_too(monkeypatch):
+    names = ("topic", "role", "type", "messages", "Hz")
+    rows = [("/front_camera/color/image_raw/compressed", "rgb", "sensor_msgs/CompressedImage", "4450", "30.0")]
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "stdout", Tty())
+    terminal.console_of.cache_clear()
+    try:
+        _table(names, rows)
+    finally:
+        terminal.console_of.cache_clear()
+    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", sys.stdout.getvalue()).splitlines()
+    assert len(lines) == 2
+    assert max(map(len, lines)) <= 80
+    assert "image_raw/compressed  rgb" in lines[1]
