@@ -34,7 +34,12 @@ def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], No
     rates = _Rates()
     if screen.is_terminal:
         with Line(console=screen, refresh_per_second=4, transient=True) as line:
-            yield lambda *seen: line.update(Text(rates.line(*seen, screen.width), no_wrap=True, overflow="ellipsis"))
+
+            def show_line(snapshot: Snapshot, ledger: Ledger) -> None:
+                text = rates.line(snapshot, ledger, screen.width)
+                line.update(Text(text, no_wrap=True, overflow="ellipsis"))
+
+            yield show_line
         return
     printed = time.monotonic()
 
@@ -61,7 +66,7 @@ class _Rates:
         """Return the status line. width: of the terminal, in characters, None if there is none."""
         now, then, before = time.monotonic(), *self._before
         self._before = (now, snapshot.counters)
-        rates = {
+        rates: dict[str, float] = {
             kind: (snapshot.counters.get(kind, 0) - before.get(kind, 0)) / max(now - then, 1e-3)
             for kind in ("odometry", "localization", "frames")
             if kind in snapshot.counters

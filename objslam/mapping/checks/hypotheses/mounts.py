@@ -33,9 +33,8 @@ def mounts(log: Log) -> Iterator[Hypothesis]:
     tried = [_rotations(log)]
     for one in (*_usual(log), *_turns()):
         rotations = _rotations(one.put_right(log))
-        turned = one.name.startswith("mount turned")
         # The usual mistakes may have the same effect. Then all their causes are named.
-        if not any(np.allclose(rotations, other, atol=_SAME) for other in (tried if turned else tried[:1])):
+        if not any(np.allclose(rotations, other, atol=_SAME) for other in (tried[:1] if one.usual else tried)):
             tried.append(rotations)
             yield one
 
@@ -81,7 +80,7 @@ def _turns() -> Iterator[Hypothesis]:
         change = partial(_turned_in_camera if of_camera else _turned_in_base, turn=make_pose(rotation, np.zeros(3)))
         name = f"mount turned, {words}"
         cause = "base_T_camera has axes of another convention, or the camera is mounted in another way"
-        yield _mount(name, f"base_T_camera turned by about {words}", cause, change)
+        yield _mount(name, f"base_T_camera turned by about {words}", cause, change, usual=False)
 
 
 def _right_angles() -> Iterator[Floats]:
@@ -108,13 +107,13 @@ def _in_words(rotation: Floats, of_camera: bool) -> str:
     return f"{degrees} degrees about {name} of {'the camera' if of_camera else 'base'}"
 
 
-def _mount(name: str, what: str, cause: str, change: Callable[[Floats], Floats]) -> Hypothesis:
+def _mount(name: str, what: str, cause: str, change: Callable[[Floats], Floats], *, usual: bool = True) -> Hypothesis:
     def put_right(log: Log) -> Log:
         return with_cameras(
             log, lambda one: replace(one, camera=replace(one.camera, base_T_camera=change(one.camera.base_T_camera)))
         )
 
-    return Hypothesis(name, what, cause, put_right, of_mount=True)
+    return Hypothesis(name, what, cause, put_right, of_mount=True, usual=usual)
 
 
 def _rotations(log: Log) -> Floats:

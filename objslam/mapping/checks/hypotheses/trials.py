@@ -98,10 +98,11 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     good = good or [trial for trial in rest if taken and rivals(trial)]
     if not good:
         return None
-    best = good[0]
-    others = [t for t in good[1:] if t.score >= _EQUAL * best.score and t.hypothesis is not None]
+    equal = [trial for trial in good if trial.score >= _EQUAL * good[0].score]
+    equal = [trial for trial in equal if trial.hypothesis is not None and trial.hypothesis.usual] or equal
+    best = equal[0]
     assert best.hypothesis is not None
-    causes = list(dict.fromkeys([best.hypothesis.cause, *(t.hypothesis.cause for t in others if t.hypothesis)]))[:3]
+    causes = list(dict.fromkeys(trial.hypothesis.cause for trial in equal if trial.hypothesis is not None))[:3]
     fit = f"{100 * best.share:.0f} % of the boxes fit instead of {100 * first.share:.0f} %"
     if _is_crooked(first) and best.straight is not None and best.straight > _STRAIGHT:
         fit += ", and the robot drives where it heads"
