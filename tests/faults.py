@@ -117,9 +117,9 @@ def _run_command(words: Sequence[str], fault: Fault | None, counter: mmap.mmap, 
     try:
         sys.stdin, sys.stdout, sys.stderr = (open(number, mode, closefd=False) for number, mode in enumerate("rww"))  # noqa: SIM115
         from objslam.cli import main
-        from objslam.cli.console import console
+        from objslam.cli.console import console_of
 
-        console.cache_clear()
+        console_of.cache_clear()
         sys.argv = ["objslam", *words]
         before()
         arm(fault, counter)

@@ -14,7 +14,7 @@ from objslam.api.array_input import as_pose
 from objslam.api.mapping import Given, prior_map, settings_of
 from objslam.api.result import Result
 from objslam.core.arrays import Floats
-from objslam.core.snapshot import Snapshot
+from objslam.core.snapshot import LATE_FRAME, Snapshot
 from objslam.live.session.session import Session as LiveSession
 from objslam.results.object_map import ObjectMap
 
@@ -85,7 +85,14 @@ class Session(LiveSession):
         return replace(found, map=ObjectMap.of(found.map))
 
     def result(self) -> Result:
-        """End the session, solve the whole map once more, and return the result. SolveError if no box could be mapped."""
+        """End the session, solve the whole map once more, and return the result. SolveError if no box could be mapped.
+
+        The summary has a warning if frames were pushed after poses that are much newer, because these are not mapped.
+        """
+        late = self.counters.dropped().get(LATE_FRAME, 0)
+        if self._patient and late:
+            order = "push poses and frames together in the order of their stamps, not first all poses"
+            self.counters.ledger.warn(f"{late} frames came after poses that are more than live.max_late newer: {order}")
         return Result.of(self.stop())
 
 

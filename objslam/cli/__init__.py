@@ -61,6 +61,10 @@ app.add_typer(config_app, name="config")
 app.add_typer(journal_app, name="journal")
 
 
+_MEANT = {"--mount": "the pose of a camera: --camera-info FILE with base_T_camera in it"}
+"""Options that newcomers try, and what does the same."""
+
+
 def _version(asked: bool) -> None:
     if asked:
         from objslam import __version__
@@ -88,6 +92,10 @@ def main() -> NoReturn:
     debug = "--debug" in sys.argv
     if sys.argv[1:2] == ["help"]:  # `objslam help run` is what many tools take.
         sys.argv[1:] = [*sys.argv[2:], "--help"]
+    for word in sys.argv[2:]:
+        if (flag := word.partition("=")[0]) in _MEANT:
+            say(f"objslam: there is no {flag}. To give {_MEANT[flag]}", stderr=True)
+            sys.exit(2)
     try:
         app()
     except ObjslamError as error:

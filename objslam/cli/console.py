@@ -67,13 +67,19 @@ def report(ledger: Ledger) -> None:
         say(f"warning: {line}", stderr=True)
 
 
-@functools.cache
-def console(stderr: bool = False) -> Console:
+def console(*, stderr: bool = False) -> Console:
     """Return the console of stdout or stderr, with the width of the terminal, or 120 columns if it is no terminal.
 
     Each stream has one console, so that a line printed during a progress bar or status line does not mix with it. The
     console has no markup: it prints [red] and :smile: as they are. `printable` replaces characters that cannot be printed.
     """
+    return console_of(stderr)
+
+
+@functools.cache
+def console_of(stderr: bool, /) -> Console:
+    """Return the one console of a stream. The cache takes `f(True)` and `f(stderr=True)` for two calls, so only `console`
+    calls this."""
     from rich.console import Console
 
     class Plain(Console):
@@ -86,4 +92,4 @@ def console(stderr: bool = False) -> Console:
 
 def say(text: str, *, stderr: bool = False, style: str | None = None, end: str = "\n") -> None:
     """Print a text without wrapping. style: as rich names it, such as "bold"."""
-    console(stderr).print(text, style=style, end=end, soft_wrap=True)
+    console(stderr=stderr).print(text, style=style, end=end, soft_wrap=True)

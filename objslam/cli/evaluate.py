@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from objslam.cli.console import console, say
-from objslam.cli.options import Align, Json, Radius
+from objslam.cli.options import Align, Json, Quiet, Radius
 
 if TYPE_CHECKING:
     from objslam.evaluation.evaluate_folder import AlignmentChoice
@@ -22,20 +22,28 @@ def evaluate_result(
     ] = None,
     align: Align = "auto",
     radius: Radius = 0.5,
+    quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Compare a result with the ground truth: matched, missed and false objects, errors of the positions and of the path."""
-    print_evaluation(out, truth, align, radius, json)
+    print_evaluation(out, truth, align, radius, json, quiet)
 
 
-def print_evaluation(out: Path, truth: Path | None, align: AlignmentChoice, radius: float, json: bool = False) -> None:
-    """Evaluate a result folder, write evaluation.json into it, and print the table, or with `json` the file's content."""
+def print_evaluation(
+    out: Path, truth: Path | None, align: AlignmentChoice, radius: float, json: bool = False, quiet: bool = False
+) -> None:
+    """Evaluate a result folder, write evaluation.json into it, and print the table, or with `json` the file's content.
+
+    quiet: print nothing.
+    """
     from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
     from objslam.evaluation.table import evaluation_table
     from objslam.results.files import dump_json
 
     found = evaluate_folder(out, truth, align=align, radius=radius)
     write_evaluation(found, out)
+    if quiet:
+        return
     if json:
         say(dump_json(found.to_dict()), end="")
     else:

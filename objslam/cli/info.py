@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from objslam.sources.summary import Contents, Timing
 
 _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
-_SPARE = ("from s", "to s", "frame", "what", "gap s")
+_SPARE = ("from s", "to s", "frame", "what", "gap s", "type")
 """The columns that a narrow terminal has no room for, in the order in which they are left out. `--json` has them all."""
 
 

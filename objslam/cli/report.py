@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from objslam.cli.console import progress_bar, say
+from objslam.cli.options import Json, Quiet
 
 
 def report_result(
@@ -14,13 +15,19 @@ def report_result(
         Path | None, typer.Option("--log", help="The log with the images. Default: the log that the run read.")
     ] = None,
     crops: Annotated[int, typer.Option("--crops", min=0, max=50, help="Image crops of each object (its best boxes).")] = 4,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Write report.html with the map in 3D, objects, residuals, evaluation and settings of a result. It works offline.
 
     The page of a site has its sessions, and what became of each object.
     """
     from objslam.output.report import write_report
+    from objslam.results.files import dump_json
 
     with progress_bar() as show:
         file = write_report(out, log=log, crops=crops, progress=show)
-    say(f"wrote {file}")
+    if json and not quiet:
+        say(dump_json({"wrote": str(file)}), end="")
+    elif not quiet:
+        say(f"wrote {file}")

@@ -46,9 +46,9 @@ def detect_log(
     """
     total = sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None)
     if not total:
-        raise LogError(
-            "no camera has rgb images for the detector", where=log.name, hint="list them in rgb.txt, one a line: stamp path"
-        )
+        refused = [line for line in ledger.warnings if "rgb.txt" in line]  # The reader says what is wrong with a list.
+        hint = "; ".join(refused) or "list them in rgb.txt, one a line: stamp path"
+        raise LogError("no camera has rgb images for the detector", where=log.name, hint=hint)
     for warning in detector.warnings:
         ledger.warn(warning)
     done = count(1)

@@ -146,10 +146,12 @@ def check_target(path: Path, overwrite: bool) -> None:
             raise OutputError("a file is in the way", where=str(path), hint="name another folder")
         if not path.exists() or not any(path.iterdir()):
             return
-        if not is_log_folder(path):
+        # If a recording has no camera, a conversion writes no more than its path.
+        if not any((path / name).is_file() for name in (ODOMETRY, LOCALIZATION)):
             raise OutputError("the folder has files but is not a log", where=str(path), hint="name a new or empty folder")
         if not overwrite:
-            raise OutputError("there is a log already", where=str(path), hint="name another folder, or ask to overwrite it")
+            hint = "name another folder, or replace all that is in it with --overwrite"
+            raise OutputError("there is a log already", where=str(path), hint=hint)
 
 
 @contextmanager

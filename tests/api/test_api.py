@@ -246,6 +246,22 @@ def test_a_session_maps_what_is_pushed(log: Log) -> None:
         assert errors_of(session.result()) < 0.03
 
 
+def test_frames_that_are_pushed_after_all_poses_are_told_the_right_order(log: Log) -> None:
+    camera, boxes, path = log.cameras[0].camera, log.cameras[0].detections, log.localization
+    assert boxes is not None
+    assert path is not None
+    with objslam.Session(poses={"use": "localization"}, patient=True, live={"max_late": 5.0}) as session:
+        session.push_camera(camera)
+        for stamp, pose in zip(path.stamps, path.poses, strict=True):
+            session.push_localization(stamp, pose)
+        for k, stamp in enumerate(boxes.frame_stamps):
+            mine = boxes.frame == k
+            names = [boxes.label_names[i] for i in boxes.label[mine]]
+            session.push_detections(stamp, "left", boxes.boxes[mine], names, boxes.scores[mine])
+        result = session.result()
+    assert any("in the order of their stamps" in warning for warning in result.summary["warnings"])
+
+
 def test_tables_hold_every_number(result: objslam.Result) -> None:
     table = result.objects.to_arrow()
     assert table.column_names == list(COLUMNS)

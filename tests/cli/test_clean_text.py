@@ -72,11 +72,11 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def objslam(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[str, str]]:
     def call(*arguments: object, code: int = 0) -> tuple[str, str]:
         monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
-        terminal.console.cache_clear()
+        terminal.console_of.cache_clear()
         capsys.readouterr()
         with pytest.raises(SystemExit) as exit_:
             main()
-        terminal.console.cache_clear()
+        terminal.console_of.cache_clear()
         said = capsys.readouterr()
         assert exit_.value.code == code, said.err
         assert "Traceback" not in said.err

@@ -65,6 +65,32 @@ def test_an_evaluation_in_json_is_its_file(objslam: Objslam, run: tuple[Call, Pa
     assert told["matched"] == 4
 
 
+def test_an_evaluation_and_a_report_may_be_quiet(objslam: Objslam, run: tuple[Call, Path]) -> None:
+    _, out = run
+    assert objslam("eval", out, "-q").out == ""
+    assert (out / "evaluation.json").is_file()
+    assert objslam("report", out, "--quiet").out == ""
+    assert json.loads(objslam("report", out, "--json").out) == {"wrote": str(out / "report.html")}
+
+
+def test_a_mount_as_an_option_says_where_it_goes(objslam: Objslam, log: Path) -> None:
+    done = objslam("run", log, "--mount=0,0,1,0,0,0")
+    assert done.code == 2
+    done.says("no --mount", "--camera-info FILE")
+
+
+def test_images_behind_a_link_are_told_to_who_runs_a_detector(objslam: Objslam, log: Path, tmp_path: Path) -> None:
+    shutil.copytree(log, tmp_path / "log")
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "1.png").write_bytes(b"an image")
+    (tmp_path / "log" / "rgb").symlink_to(tmp_path / "photos")
+    (tmp_path / "log" / "rgb.txt").write_text("1700000000.5 rgb/1.png\n")
+    model = Path(__file__).parents[2] / "objslam" / "models" / "ssd7.onnx"
+    done = objslam("run", tmp_path / "log", "-o", tmp_path / "out", "--detector", model)
+    assert done.code == 1
+    done.says_somewhere("no camera has rgb images", "behind a link", "copy them into the log")
+
+
 def test_a_quiet_session_prints_warnings_only(objslam: Objslam, log: Path, tmp_path: Path) -> None:
     done = objslam("live", log, "-o", tmp_path / "out", "--speed", "0", "--quiet", *LEAN, "--set", "rays.border=100")
     assert (done.code, done.out) == (0, "")

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from objslam.cli import console as terminal
 from objslam.cli.info import _table
+from objslam.cli.live_command import status
 from objslam.cli.live_command.status import status_line
 from objslam.cli.run import advice_on_tags, objects_table
 from objslam.config.tags import Tags
@@ -65,11 +66,11 @@ def terminal_in_place_of_stderr(columns):
         patch.setattr(sys, "stderr", screen)
         patch.setenv("COLUMNS", str(columns))
         patch.setenv("TERM", "xterm")
-        terminal.console.cache_clear()
+        terminal.console_of.cache_clear()
         try:
             yield screen
         finally:
-            terminal.console.cache_clear()
+            terminal.console_of.cache_clear()
 
 
 def test_the_status_line_is_one_line_and_gives_way_to_others():
@@ -79,7 +80,7 @@ def test_the_status_line_is_one_line_and_gives_way_to_others():
         show(snapshot, Ledger())
         terminal.say("warning: no publisher of boxes", stderr=True)
         show(snapshot, Ledger())
-    assert re.search(r"0 objects, 0 unresolved \| odometry \d+/s frames \d+/s \| ", screen.getvalue())
+    assert re.search(r"0 objects \| odometry \d+/s frames \d+/s \| lag 0 ms \| dropped 2", screen.getvalue())
     lines = [""]
     for part in re.split(r"(\x1b\[[0-9?]*[A-Za-z]|\r|\n)", screen.getvalue()):
         if part == "\n":
@@ -137,7 +138,7 @@ def test_the_status_line_says_why_most_was_dropped(monkeypatch):
     monkeypatch.setattr("objslam.cli.live_command.status._LINES", 0.0)
     seen = io.StringIO()
     monkeypatch.setattr(sys, "stderr", seen)
-    terminal.console.cache_clear()
+    terminal.console_of.cache_clear()
     ledger = Ledger()
     ledger.drop("line malformed: not JSON", 3)
     snapshot = Snapshot(np.nan, ObjectMap(()), EMPTY, counters={"localization not used": 141}, dropped={"frame too late": 1})
@@ -145,7 +146,7 @@ def test_the_status_line_says_why_most_was_dropped(monkeypatch):
         with status_line() as show:
             show(snapshot, ledger)
     finally:
-        terminal.console.cache_clear()
+        terminal.console_of.cache_clear()
     assert "dropped 4 (line malformed: not JSON), 141 localization not used" in seen.getvalue()
 
 
@@ -156,7 +157,7 @@ def test_at_80_columns_the_status_line_shows_rates_lag_and_keyframes(monkeypatch
     monkeypatch.setattr("objslam.cli.live_command.status.time.monotonic", iter(range(0, 1000, 10)).__next__)
     monkeypatch.setenv("COLUMNS", "80")
     monkeypatch.setenv("TERM", "xterm")
-    terminal.console.cache_clear()
+    terminal.console_of.cache_clear()
     counters = {"odometry": 200, "frames": 50}
     snapshot = Snapshot(1.0, ObjectMap(()), EMPTY, 378, lag=0.03, counters=counters)
     snapshot = replace(snapshot, dropped={CUT_OFF: 55, TOO_SLOW: 7})
@@ -164,8 +165,8 @@ def test_at_80_columns_the_status_line_shows_rates_lag_and_keyframes(monkeypatch
         with status_line() as show:
             show(snapshot, Ledger())
     finally:
-        terminal.console.cache_clear()
-    shown = "0 objects, 0 unresolved | odometry 20/s frames 5/s | lag 30 ms | 378 keyframes"
+        terminal.console_of.cache_clear()
+    shown = "0 objects | odometry 20/s frames 5/s | lag 30 ms | 378 keyframes | dropped 7"
     assert shown in screen.getvalue()
 
 
@@ -177,13 +178,60 @@ def test_at_80_columns_the_topics_of_a_bag_lose_columns_and_nothing_wraps(monkey
     monkeypatch.setenv("COLUMNS", "80")
     for screen, most in ((Tty(), 80), (io.StringIO(), 200)):
         monkeypatch.setattr(sys, "stdout", screen)
-        terminal.console.cache_clear()
+        terminal.console_of.cache_clear()
         try:
             _table(names, rows)
         finally:
-            terminal.console.cache_clear()
+            terminal.console_of.cache_clear()
         lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.getvalue()).splitlines()
         assert len(lines) == 2
         assert max(map(len, lines)) <= most
         assert "/camera/color/camera_info" in lines[1]
         assert ("plumb_bob" in lines[1]) == (most > 80)
+
+
+def test_a_line_clears_the_status_line_that_is_on_the_screen():
+    snapshot = Snapshot(1.0, ObjectMap(()), EMPTY, 7)
+    with terminal_in_place_of_stderr(80) as screen, status_line() as show:
+        show(snapshot, Ledger())
+        terminal.console(stderr=True).print()  # As the thread that draws the line does.
+        mark = len(screen.getvalue())
+        terminal.say("removed the older result from out", stderr=True)
+    assert re.match(r"(\r|\x1b\[2K|\x1b\[1A)+removed the older result", screen.getvalue()[mark:])
+
+
+@pytest.mark.parametrize("localised", [False, True])
+def test_a_status_line_of_80_columns_tells_how_many_data_were_dropped(localised):
+    counters = {"odometry": 12345, "frames": 4000} | ({"localization": 9000} if localised else {})
+    objects = ObjectMap(tuple(thing(i, "cup", (1.0, 2.0, 3.0)) for i in range(25)))
+    snapshot = Snapshot(1.0, objects, EMPTY, 1234, lag=0.123, counters=counters, dropped={TOO_SLOW: 123})
+    for width, rest in ((80, ("25 objects", "lag 123 ms")), (200, ("25 objects, 0 unresolved", "1234 keyframes"))):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(status.time, "monotonic", iter((0.0, 100.0)).__next__)
+            line = status._Rates().line(snapshot, Ledger(), width)
+        assert "dropped 123" in line[:width]
+        assert all(words in line for words in rest)
+        assert "frames 40/s" in line
+
+
+def test_numbers_of_one_thing_have_no_plural():
+    snapshot = Snapshot(1.0, ObjectMap((thing(1, "cup", (1.0, 2.0, 3.0)),)), EMPTY, 1)
+    line = status._Rates().line(snapshot, Ledger())
+    assert "1 object," in line
+    assert "1 keyframe " in line
+
+
+def test_the_longest_topics_lose_their_types_too(monkeypatch):
+    names = ("topic", "role", "type", "messages", "Hz")
+    rows = [("/front_camera/color/image_raw/compressed", "rgb", "sensor_msgs/CompressedImage", "4450", "30.0")]
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "stdout", Tty())
+    terminal.console_of.cache_clear()
+    try:
+        _table(names, rows)
+    finally:
+        terminal.console_of.cache_clear()
+    lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", sys.stdout.getvalue()).splitlines()
+    assert len(lines) == 2
+    assert max(map(len, lines)) <= 80
+    assert "image_raw/compressed  rgb" in lines[1]

@@ -507,6 +507,17 @@ def test_the_same_messages_make_the_same_map_and_a_killed_session_goes_on(log, t
     session.abort()
 
 
+def test_the_path_before_is_the_one_that_was_pushed(log):
+    pushes = list(events(log))[:300]
+    result = drive(log, pushes=pushes).stop()
+    count = len(result.path)
+    assert count > len(result.keyframes)
+    np.testing.assert_array_equal(result.path.stamps, log.robot_path.stamps[:count])
+    way = np.linalg.norm(np.diff(result.path.poses[:, :3, 3], axis=0), axis=1).sum()
+    true = np.linalg.norm(np.diff(log.robot_path.poses[:count, :3, 3], axis=0), axis=1).sum()
+    assert way == pytest.approx(true, rel=0.1)  # only the shared errors are taken out
+
+
 @pytest.mark.parametrize("killed", [False, True])
 def test_messages_that_come_again_change_nothing(log, tmp_path, killed):
     """A program that starts anew may send the last seconds again. They are no clock that was set back."""
@@ -521,6 +532,8 @@ def test_messages_that_come_again_change_nothing(log, tmp_path, killed):
     again = feed(session, log, pushes=pushes[200:])
     assert again.counters.accepted()["odometry that came before"] > 250
     assert "odometry that came before" not in again.counters.dropped()
+    assert (again.counters.accepted().get("frames that came before", 0) > 30) == killed
+    assert not (killed and any(reason.startswith("frame") for reason in again.counters.dropped()))
     assert "clock set back" not in again.counters.accepted()
     assert "restarts of the odometry" not in again.counters.accepted()
     for one, other in zip(again.snapshot().map.objects, unbroken.objects, strict=True):

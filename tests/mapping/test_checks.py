@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from small_log import small_log
 
 from objslam.config import Odometry, load_settings
@@ -16,11 +17,11 @@ from objslam.errors import LogError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.agreement import bounded_part
 from objslam.mapping.checks.diagnosis import diagnose
-from objslam.mapping.checks.hypotheses import Hypothesis
+from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis
+from objslam.mapping.checks.hypotheses.trials import Trial, verdict
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.stamps import check_stamps
-from objslam.mapping.checks.trials import Trial, verdict
-from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
+from objslam.simulation import DepthNoise, PoseNoise, make_camera, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.wrong_inputs import MISTAKES, join, with_cameras, with_frame_stamps, with_poses
 from objslam.sources import read
@@ -72,8 +73,13 @@ HELD = ("camera moved in the middle",)
 
 
 @cache
-def drive(mode: str, seed: int = 0, depth: bool = False, **more: Any) -> Log:
-    """300 frames; localisation for the mode fixed, odometry alone for the mode joint."""
+def drive(mode: str, seed: int = 0, depth: bool = False, pitch: float = 0.0, yaw: float = 0.0, **more: Any) -> Log:
+    """300 frames; localisation for the mode fixed, odometry alone for the mode joint.
+
+    pitch, yaw: how far the camera looks up and to the left, degrees.
+    """
+    if pitch or yaw:
+        more["cameras"] = (looking(pitch, yaw),)
     room = {"objects": 10, "classes": 10, "pixel_sigma": 2.0, "missed": 0.1, "false": 0.01, "frames": 300}
     poses = {"odometry": None, "localization": PoseNoise(xy=0.02, yaw=0.005)}
     if mode == "joint":
@@ -262,6 +268,106 @@ def test_a_map_of_wrong_input_has_no_object_that_is_ok(name):
     (first, *_) = result.summary["wrong_input"]
     assert first["spoils_positions"]
     assert first["message"] in result.summary["warnings"]
+
+
+def remounted(log: Log, change) -> Log:
+    """The log with the rotation (3, 3) of each mount changed."""
+
+    def mounted(one):
+        pose = one.camera.base_T_camera.copy()
+        pose[:3, :3] = change(pose[:3, :3])
+        return replace(one, camera=replace(one.camera, base_T_camera=pose))
+
+    return with_cameras(log, mounted)
+
+
+def looking(pitch: float, yaw: float = 0.0):
+    """The camera of the room, but it looks up by `pitch` and to the left by `yaw`, degrees."""
+    (camera,) = preset("demo").cameras
+    turned = make_camera(position=tuple(camera.base_T_camera[:3, 3]), pitch=np.radians(pitch), yaw=np.radians(yaw))
+    return replace(camera, base_T_camera=turned.base_T_camera)
+
+
+def degrees(axes: str, *angles: float):
+    return Rotation.from_euler(axes, angles, degrees=True).as_matrix()
+
+
+def w_first(turn):
+    x, y, z, w = Rotation.from_matrix(turn).as_quat()
+    return Rotation.from_quat([w, x, y, z]).as_matrix()
+
+
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_mount_without_a_rotation_is_named_also_for_a_tilted_camera(mode, seed):
+    found = findings(remounted(drive(mode, seed, pitch=-10), lambda turn: np.eye(3)), mode)
+    assert [one.name for one in found] == ["mount unset, ahead"]
+
+
+@pytest.mark.parametrize("pitch", [0, -10])
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda turn: degrees("z", 90) @ turn, "-90 degrees about z of base"),
+        (lambda turn: degrees("z", 180) @ turn, "180 degrees about z of base"),
+        (lambda turn: turn @ degrees("z", 90), "-90 degrees about"),
+        (lambda turn: degrees("y", 90) @ turn, "-90 degrees about y of base"),
+    ],
+)
+def test_a_mount_that_is_turned_by_a_right_angle_is_named(pitch, change, named):
+    (found,) = findings(remounted(drive("fixed", 1, pitch=pitch), change), "fixed")
+    assert found.name.startswith(f"mount turned, {named}")
+    assert found.spoils
+
+
+def test_a_quaternion_with_w_first_is_named_also_where_a_run_corrects_it():
+    """For a camera that is tilted by 10 degrees, it is a turn of 14 degrees, and a run estimates that."""
+    wrong = remounted(drive("fixed", 0, pitch=-10), w_first)
+    (found,) = diagnose(wrong, load_settings(None, ("mode=fixed",)), Ledger(), thorough=True).findings
+    assert found.name == "mount wxyz"
+    assert "front.tilt +" in found.message
+    assert not found.spoils
+    place = {item.label: item.position for item in wrong.truth.objects}
+    off = [np.linalg.norm(item.position - place[item.label]) for item in run(wrong, "fixed")[0].map.resolved()]
+    assert len(off) == len(place)
+    assert max(off) < 0.05
+
+
+@pytest.mark.parametrize(("axis", "name"), [("yaw", "mount yaw sign"), ("pitch", "mount tilt sign")])
+def test_an_angle_of_a_mount_with_the_wrong_sign_is_named(axis, name):
+    angles = {"pitch": -20.0, "yaw": 40.0}
+    wrong = looking(**{**angles, axis: -angles[axis]})
+    log = drive("fixed", 2, **angles)
+    (found,) = findings(remounted(log, lambda turn: wrong.base_T_camera[:3, :3]), "fixed")
+    assert found.name == name
+    assert "the wrong sign" in found.message
+
+
+def test_a_mount_that_no_usual_mistake_explains_is_said_to_be_wrong():
+    """The nearest right angle is 45 degrees away, about no axis."""
+    names = []
+    for seed in range(3, 6):
+        found = findings(remounted(drive("fixed", seed), lambda turn: degrees("xyz", 40, 35, 45) @ turn), "fixed")
+        names += [one.name for one in found if one.spoils]
+    assert names == ["boxes disagree"] * 3
+
+
+def test_boxes_of_distant_things_agree_with_the_poses():
+    """A robot that turns on the spot: nothing shows parallax, and each thing keeps its direction."""
+    log = drive("fixed", 3)
+    poses = log.localization.poses.copy()
+    far = replace(log, localization=replace(log.localization, poses=poses))
+    camera = log.cameras[0].camera
+    found = log.cameras[0].detections
+    # Directions of the things from 1 km below the robot's path are directions in the map.
+    turn = poses[np.searchsorted(log.localization.stamps, found.stamps).clip(max=len(poses) - 1), :3, :3]
+    away = np.array([[np.cos(a), np.sin(a), 0.1] for a in np.linspace(0, 2 * np.pi, 10, endpoint=False)])
+    rays = np.einsum("nij,nj->ni", np.swapaxes(turn @ camera.base_T_camera[:3, :3], 1, 2), away[found.label])
+    seen = rays[:, 2] > 0.8
+    px = (rays[seen] / rays[seen, 2:]) @ camera.matrix.T
+    boxes = replace(found.take(seen), boxes=np.hstack([px[:, :2] - 10, px[:, :2] + 10]))
+    far = with_cameras(far, lambda one: replace(one, detections=boxes))
+    assert not any(one.name == "boxes disagree" for one in findings(far, "fixed"))
 
 
 def test_a_log_that_shows_its_mistake_is_not_explored():

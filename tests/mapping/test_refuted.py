@@ -14,9 +14,9 @@ from objslam.mapping import pipeline, refuted
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.hypotheses import Hypothesis
+from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis
+from objslam.mapping.checks.hypotheses.trials import Trial
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
-from objslam.mapping.checks.trials import Trial
 from objslam.mapping.refuted import without_refuted
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
 from objslam.simulation.wrong_inputs import MISTAKES, join

@@ -18,7 +18,8 @@ from objslam.errors import LogError, OutputError
 from objslam.io import folders
 from objslam.io.objects_json import read_truth_objects
 from objslam.sources import log_folder as folder_module
-from objslam.sources.log_folder import is_log_folder, read_log_folder, write_log_folder
+from objslam.sources.log_folder import is_log_folder, read_log_folder, write_log_folder, write_path
+from objslam.sources.no_camera import NoCamera
 
 _POSE = "1 0 0 0 0 0 0 1\n"
 
@@ -165,6 +166,16 @@ def test_what_is_no_log_is_never_replaced(log, tmp_path):
     assert (tmp_path / "photos" / "cat.png").read_text() == "mine"
     write_log_folder(log, tmp_path / "empty")
     assert is_log_folder(tmp_path / "empty")
+
+
+def test_a_path_without_a_camera_is_replaced_if_asked(log, tmp_path):
+    """As a second conversion of a bag without images does."""
+    found = NoCamera("no camera", "bag", "", log.odometry, log.localization, {})
+    write_path(found, tmp_path / "out")
+    with pytest.raises(OutputError, match="--overwrite"):
+        write_path(found, tmp_path / "out")
+    write_path(found, tmp_path / "out", overwrite=True)
+    assert {file.name for file in (tmp_path / "out").iterdir()} <= {"odometry.txt", "localization.txt"}
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])

@@ -143,7 +143,7 @@ def finish(
     last = session.snapshot()
     report(session.counters.ledger)
     if again := sum(n for kind, n in last.counters.items() if kind.endswith(CAME_BEFORE)):
-        say(f"{again} poses had come before and are in the map already, so nothing is lost", stderr=True)
+        say(f"{again} poses and frames had come before and are in the map already, so nothing is lost", stderr=True)
     thinned = last.counters.get("keyframes left out", 0)
     more = f" ({thinned} more left out: live.max_keyframes)" if thinned else ""
     if not quiet:

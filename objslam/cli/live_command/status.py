@@ -34,7 +34,12 @@ def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], No
     rates = _Rates()
     if screen.is_terminal:
         with Line(console=screen, refresh_per_second=4, transient=True) as line:
-            yield lambda *seen: line.update(Text(rates.line(*seen), no_wrap=True, overflow="ellipsis"))
+
+            def show_line(snapshot: Snapshot, ledger: Ledger) -> None:
+                text = rates.line(snapshot, ledger, screen.width)
+                line.update(Text(text, no_wrap=True, overflow="ellipsis"))
+
+            yield show_line
         return
     printed = time.monotonic()
 
@@ -50,36 +55,59 @@ def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], No
 class _Rates:
     """The formatter of the status line. Message rates are averages since the previous status line.
 
-    A narrow terminal cuts the end of the line. So what changes comes first, and long reasons come after it.
+    A narrow terminal cuts the end of the line, so long reasons come last. What does not change how the user drives is left
+    out until the number of dropped data fits too.
     """
 
     def __init__(self) -> None:
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
 
-    def line(self, snapshot: Snapshot, ledger: Ledger) -> str:
+    def line(self, snapshot: Snapshot, ledger: Ledger, width: int | None = None) -> str:
+        """Return the status line. width: of the terminal, in characters, None if there is none."""
         now, then, before = time.monotonic(), *self._before
         self._before = (now, snapshot.counters)
-        rates = {
+        rates: dict[str, float] = {
             kind: (snapshot.counters.get(kind, 0) - before.get(kind, 0)) / max(now - then, 1e-3)
             for kind in ("odometry", "localization", "frames")
             if kind in snapshot.counters
         }
-        shown = " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet"
-        resolved = len(snapshot.map.resolved())
-        found = f"{resolved} objects, {len(snapshot.map) - resolved} unresolved | "
-        place = snapshot.in_map
-        mapped = (
-            "" if place is None else f"localised by {place.objects} objects | " if place.objects else "not localised yet | "
-        )
-        calibrated = f"{n} calibrations | " if (n := snapshot.counters.get("calibrations", 0)) else ""
-        return (
-            f"{found if snapshot.keyframes else ''}{shown} | lag {1e3 * snapshot.lag:.0f} ms | "
-            f"{snapshot.keyframes} keyframes | {mapped}{_lost(snapshot, ledger)} | {calibrated}{times(snapshot, '')}"
-        ).rstrip(" |")
+        for spare in range(4):
+            line, needed = _status(snapshot, ledger, rates, spare)
+            if width is None or needed <= width:
+                break
+        return line
 
 
-def _lost(snapshot: Snapshot, ledger: Ledger) -> str:
-    """Return a text with the number of dropped data, the most frequent reason, and the numbers of unused data by kind."""
+def _status(snapshot: Snapshot, ledger: Ledger, rates: dict[str, float], spare: int) -> tuple[str, int]:
+    """Return a status line, and the length up to the number of dropped data.
+
+    spare: how much is left out: the unresolved objects from 1 on, the keyframes from 2, each path's rate from 3.
+    """
+    resolved = len(snapshot.map.resolved())
+    found = f"{resolved} object{'' if resolved == 1 else 's'}"
+    if spare < 1:
+        found += f", {len(snapshot.map) - resolved} unresolved"
+    if spare >= 3 and len(rates) == 3:
+        rates = {"poses": rates["odometry"] + rates["localization"], "frames": rates["frames"]}
+    place = snapshot.in_map
+    mapped = "" if place is None else f"localised by {place.objects} objects" if place.objects else "not localised yet"
+    dropped, why = _lost(snapshot, ledger)
+    parts = (
+        found if snapshot.keyframes else "",
+        " ".join(f"{kind} {rate:.0f}/s" for kind, rate in rates.items()) or "no messages yet",
+        f"lag {1e3 * snapshot.lag:.0f} ms",
+        f"{snapshot.keyframes} keyframe{'' if snapshot.keyframes == 1 else 's'}" if spare < 2 else "",
+        mapped,
+        f"dropped {dropped}",
+    )
+    line = " | ".join(part for part in parts if part)
+    calibrations = snapshot.counters.get("calibrations", 0)
+    more = (f"{calibrations} calibration{'' if calibrations == 1 else 's'}" if calibrations else "", times(snapshot, ""))
+    return " | ".join([line + why, *(part for part in more if part)]), len(line)
+
+
+def _lost(snapshot: Snapshot, ledger: Ledger) -> tuple[int, str]:
+    """Return the number of dropped data, and the most frequent reason and the numbers of unused data by kind in words."""
     from objslam.core.snapshot import NOT_USED
     from objslam.frontend.bearings import CUT_OFF
 
@@ -87,7 +115,7 @@ def _lost(snapshot: Snapshot, ledger: Ledger) -> str:
     del dropped[CUT_OFF]  # Every camera has such boxes. The report at the end counts them.
     reason = f" ({dropped.most_common(1)[0][0]})" if dropped else ""
     unused = "".join(f", {n} {kind}" for kind, n in snapshot.counters.items() if kind.endswith(NOT_USED))
-    return f"dropped {dropped.total()}{reason}{unused}"
+    return dropped.total(), reason + unused
 
 
 def times(snapshot: Snapshot, then: str) -> str:

@@ -32,6 +32,7 @@ class _Publication:
     type: str
     kind: _Kind
     type_id: Any
+    own: bool = False  # Whether this session is the publisher.
 
 
 @dataclass
@@ -109,7 +110,9 @@ class DdsAdapter:
                 if handle not in self._publications and len(self._publications) >= _MAX_PUBLICATIONS:
                     self.messages.refuse(f"publisher beyond the first {_MAX_PUBLICATIONS}", topic)
                     continue
-                self._publications[handle] = _Publication(plain(topic), type_, _kind(sample.qos, type_), sample.type_id)
+                own = sample.participant_key == self.network.participant.guid
+                kind = _kind(sample.qos, type_)
+                self._publications[handle] = _Publication(plain(topic), type_, kind, sample.type_id, own)
             if len(samples) < _TAKE:
                 return
 
@@ -207,7 +210,8 @@ class DdsAdapter:
             where = f"{self.network.where}, domain {self.network.domain}{hint}"
             self.ledger.warn(f"no publisher of odometry, tf or detections on {where}")
         for reader in self._readers.values():
-            present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in self._publications.values())
+            others = (p for p in self._publications.values() if not p.own)  # A reader is never matched with its own tf.
+            present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in others)
             if not reader.warned and present and now - reader.since > _LONELY:
                 reader.warned = True
                 if not reader.entity.get_matched_publications():

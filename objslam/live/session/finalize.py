@@ -30,13 +30,13 @@ from objslam.mapping.localization import PriorMap, describe_in_map, localize, mo
 from objslam.mapping.solution import Solution, without_errors
 
 
-def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = None) -> RunResult:
+def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None = None) -> RunResult:
     """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
 
     If every label is one object so far, that association is solved. If many of its rays do not fit, the drive is associated
     anew as in an offline run. If there are more rays than live.reassociate, the session's association is kept.
 
-    name: of the log. path: of the journal, None without one. known: a prior map. If the whole drive is found in it, the
+    name: of the log. journal: its file, None without one. known: a prior map. If the whole drive is found in it, the
     result is in the frame of that map, as in an offline run. SolveError when no box could be mapped.
     """
     begin = time.perf_counter()
@@ -74,8 +74,9 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
     counts = {"detection_frames": accepted.get("frames", 0), "frames_on_path": sum(m.frames.values())}
     counts["detections"] = accepted.get("boxes", 0)
     seconds = {"finish": round(time.perf_counter() - begin, 4)}
-    summary = summarise(name, path, counts, settings, ledger, solution, objects, seconds)
-    stamps, first = np.unique(keyframes.stamps, return_index=True)
+    summary = summarise(name, journal, counts, settings, ledger, solution, objects, seconds)
+    path = log.robot_path
+    assert path is not None  # There is no keyframe without a path.
     return make_result(
         solution,
         objects,
@@ -88,7 +89,7 @@ def finish(m: MapState, name: str, path: Path | None, known: PriorMap | None = N
         },
         settings=settings,
         cameras=cameras,
-        path=Trajectory(stamps, keyframes.map_T_base[first]),
+        path=path,
         path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
     )
 

@@ -15,7 +15,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse, motion_between
-from objslam.core.snapshot import CAME_BEFORE, NOT_USED
+from objslam.core.snapshot import CAME_BEFORE, LATE_FRAME, NOT_USED
 from objslam.core.validity import is_valid_position
 from objslam.live.counters import Counters
 from objslam.live.session import checks
@@ -39,9 +39,7 @@ _FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or r
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
-_POSES = 10_000
-"""The number of newest poses of each path that are kept. They show when a program starts again and repeats its messages. A
-larger number recognises a longer repetition and costs memory, 0.3 kB a pose."""
+_POSES = 10_000  # The poses per path that are kept to notice repeats. A larger number costs memory, 0.3 kB a pose.
 _SAME_POSE = 1e-9  # Poses of one stamp that differ by less than this, m, are one pose. It only allows for rounding.
 _WAIT = 2.0
 """A stamp that leads the path by more than this, s, may be from before a change of the clock, so earlier shifts are tried. A
@@ -79,6 +77,7 @@ class Intake:
         self._cameras: dict[str, Camera] = {}
         self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
+        self._resumed: dict[str, float] = {}  # The stamp of the last frame of each camera in a resumed journal.
         self._start_T_odom = np.eye(4)  # Moves poses from the odometry's present frame into its first one.
         self._last: dict[PathKind, PoseMessage] = {}
         self._heard: dict[PathKind, OrderedDict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
@@ -173,6 +172,7 @@ class Intake:
             elif isinstance(message, FrameMessage):
                 self._labels.update(message.labels)
                 self._remember(message.camera, message.stamp)
+                self._resumed[message.camera] = message.stamp
         self.counters.accept(_kind(message))
         if isinstance(message, FrameMessage):
             self.counters.accept("boxes", len(message))
@@ -248,13 +248,14 @@ class Intake:
         camera, at, newest = frame.camera, frame.stamp + self._clock.shift, self.newest
         if math.isfinite(newest):
             at = self._place(frame.stamp)
-            if at < newest - self._settings.live.max_late:
-                return self._refuse("frame that is late (live.max_late)", where)
             if at > newest + _AHEAD:
                 return self._refuse("frame with a stamp too far ahead of the path", where)
-        seen = self._stamps.get(camera, {})
-        if at in seen:
-            return self._refuse("frame with a repeated stamp", where)
+        seen, late = self._stamps.get(camera, {}), at < newest - self._settings.live.max_late
+        if late or at in seen:
+            if at <= self._resumed.get(camera, -math.inf):  # The source began again, as a replay does.
+                self.counters.accept(f"frames{CAME_BEFORE}")
+                return False
+            return self._refuse(LATE_FRAME if late else "frame with a repeated stamp", where)
         if seen and at < next(reversed(seen)):
             self.counters.accept("frames out of order")
         frame = self._with_known_labels(frame, where)

@@ -14,7 +14,9 @@ from objslam.frontend.known_errors import coarse, estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.hypotheses import later
+from objslam.mapping.checks.hypotheses.disagreement import disagree
+from objslam.mapping.checks.hypotheses.every import later
+from objslam.mapping.checks.hypotheses.trials import Trial, crooked, try_hypotheses, verdict
 from objslam.mapping.checks.parts.halves import check_halves
 from objslam.mapping.checks.parts.mixture import check_mixture
 from objslam.mapping.checks.parts.moved_camera import check_moved_camera
@@ -22,7 +24,6 @@ from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.ranges import check_ranges
 from objslam.mapping.checks.small_errors import SmallErrors, find_small_errors, with_clock
 from objslam.mapping.checks.stamps import check_stamps
-from objslam.mapping.checks.trials import Trial, crooked, try_hypotheses, verdict
 from objslam.mapping.checks.usual_errors import without_usual_errors
 from objslam.mapping.progress import Progress
 
@@ -114,14 +115,17 @@ def diagnose(
         odd = bool(findings) or crooked(log) or _misfits(part, found, settings)
         if thorough or (odd and not impossible):
             trials = try_hypotheses(part, log, found, settings, progress)
-            named = None if impossible else verdict(trials, part, _corrected_score(part, found, settings))
+            named = None if impossible else verdict(trials, part, *_corrected(part, found, settings))
             if named is not None:
                 return Diagnosis((named, *findings), tuple(trials))
     errors: SmallErrors | None = None
     if impossible:  # Boxes at such poses agree with anything by chance.
         return Diagnosis(tuple(findings), tuple(trials))
     if found is not None and part.boxes >= _FEWEST:
-        findings += _parts_differ(part, found, settings)
+        doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
+        none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part)
+        # Where boxes agree only by chance, they say nothing of single frames, of halves, and of how a camera is turned.
+        findings += [none_fits] if none_fits else _parts_differ(part, found, settings)
         if not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
             if errors is not None:
@@ -143,15 +147,17 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
     return any(trial is not None and trial.score > found.score for trial in trials)
 
 
-def _corrected_score(part: Part, found: Agreement | None, settings: Settings) -> float:
+def _corrected(part: Part, found: Agreement | None, settings: Settings) -> tuple[float, str]:
     """Return the score of a log without the small errors that a run in this mode estimates from given poses, 0 if there are
-    none."""
+    none. Also return those of the errors, in words, that are too large for a usual camera."""
     estimated = _estimated(part, settings)
     if found is None or part.drifts or settings.mode == "joint" or not estimated:
-        return 0.0
+        return 0.0, ""
     errors = find_small_errors(part.log, found, settings, pose_noise(part, settings))
     after = None if errors is None else agreement(part, errors.corrected(part.log, estimated), settings)
-    return 0.0 if after is None else after.score
+    if errors is None or after is None:
+        return 0.0, ""
+    return after.score, replace(errors, estimated=estimated).unusual(settings)
 
 
 def _estimated(part: Part, settings: Settings) -> frozenset[str]:

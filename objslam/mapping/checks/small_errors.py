@@ -30,6 +30,8 @@ _LEAST_GAIN = 40.0
 _LEAST_SHARE = 0.04
 """The least decrease as a share of all squared deviations. Rays of a real log are not independent, so the sum of many small
 deviations proves nothing. A larger value finds fewer errors."""
+_UNUSUAL = 4.0
+"""The number of prior standard deviations above which an error is no usual one. A larger number calls fewer unusual."""
 _ROUNDS = 6
 """The number of Gauss-Newton steps after each added error. A larger number is more exact."""
 _CLOCK_SIGMA = 0.05
@@ -78,9 +80,18 @@ class SmallErrors:
 
     def in_words(self) -> str:
         """Return the harmful errors with their sizes."""
+        return self._words_of(self.harmful)
+
+    def unusual(self, settings: Settings) -> str:
+        """Return the errors that the run estimates, but that are far larger than their priors, with sizes. "" without."""
+        found = zip(self.names, self.values.tolist(), strict=True)
+        far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings))
+        return self._words_of(tuple(far))
+
+    def _words_of(self, names: Collection[str]) -> str:
         parts = []
         for name, value, sigma in zip(self.names, self.values.tolist(), self.sigma.tolist(), strict=True):
-            if name in self.harmful:
+            if name in names:
                 unit = UNITS.get(kind(name), "share")
                 if unit == "rad":
                     value, sigma, unit = np.degrees(value), np.degrees(sigma), "deg"

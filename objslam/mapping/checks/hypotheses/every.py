@@ -1,7 +1,7 @@
-"""Hypotheses about wrong input. Each is a change that would correct the log."""
+"""All hypotheses about wrong input."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,13 +9,10 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import inverse, lift_se2, make_pose
-from objslam.core.rotation import quaternion_from_rotation, rotation_from_quaternion, rotation_from_vector
 from objslam.core.types import CameraLog, Log, Trajectory
+from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_cameras
+from objslam.mapping.checks.hypotheses.mounts import mounts, w_last
 
-_OPTICAL = make_pose(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-"""The pose of an optical frame (x right, y down, z forward) in a body frame (x forward, y left, z up)."""
-_SIDES = {"ahead": 0, "to the left": 90, "back": 180, "to the right": -90}
-"""The usual directions of a camera (degrees)."""
 _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
 """The tried sizes of the images in which the boxes were found, as multiples of the image size in the calibration."""
 _SQUARES = (320, 416, 512, 640)
@@ -24,50 +21,12 @@ _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 """The tried clock offsets (s). `small_errors` finds smaller offsets."""
 
 
-@dataclass(frozen=True)
-class Hypothesis:
-    """A possible fault of the input. name: short and fixed. what: a description of the corrected log. cause: the probable
-    mistake. put_right: returns the corrected log."""
-
-    name: str
-    what: str
-    cause: str
-    put_right: Callable[[Log], Log]
-
-
 def hypotheses(log: Log) -> Iterator[Hypothesis]:
     """Yield each hypothesis that applies to a log."""
-    yield from _mounts(log)
+    yield from mounts(log)
     yield from _paths(log)
     yield from _boxes(any(one.camera.sees_size for one in log.cameras))
     yield from _clocks()
-
-
-def _mounts(log: Log) -> Iterator[Hypothesis]:
-    if all(one.mount is not None for one in log.cameras):
-        return
-
-    def mounted(change: Callable[[Floats], Floats]) -> Callable[[Log], Log]:
-        return lambda log: _with_cameras(
-            log, lambda one: replace(one, camera=replace(one.camera, base_T_camera=change(one.camera.base_T_camera)))
-        )
-
-    cause = "base_T_camera is probably camera_T_base"
-    yield Hypothesis("mount inverted", "base_T_camera inverted", cause, mounted(inverse))
-    if all(np.allclose(one.camera.base_T_camera[:3, :3], np.eye(3), atol=1e-3) for one in log.cameras):
-        for side, degrees in _SIDES.items():
-            turn = make_pose(rotation_from_vector(np.array([0.0, 0.0, np.radians(degrees)])), np.zeros(3))
-            yield Hypothesis(
-                f"mount unset, {side}",
-                f"a camera that looks {side}",
-                "base_T_camera is not set, or its axes are those of a body and not of an optical frame",
-                mounted(partial(_mounted, turn=turn)),
-            )
-        return
-    cause = "base_T_camera probably has the axes of a body (x forward) instead of those of an optical frame (z forward)"
-    yield Hypothesis("mount axes", "the axes of an optical frame in base_T_camera", cause, mounted(lambda p: p @ _OPTICAL))
-    cause = "the quaternion of base_T_camera is probably w x y z instead of x y z w"
-    yield Hypothesis("mount wxyz", "the quaternion of base_T_camera read as w x y z", cause, mounted(w_last))
 
 
 def _paths(log: Log) -> Iterator[Hypothesis]:
@@ -98,7 +57,7 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
 
     def boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
         def put_right(log: Log) -> Log:
-            return _with_cameras(log, lambda one: _with_boxes(one, change))
+            return with_cameras(log, lambda one: _with_boxes(one, change))
 
         return put_right
 
@@ -148,7 +107,7 @@ def with_frame_stamps(log: Log, change: Callable[[Floats], Floats]) -> Log:
         found = one.detections
         return one if found is None else replace(one, detections=replace(found, frame_stamps=change(found.frame_stamps)))
 
-    return _with_cameras(log, changed)
+    return with_cameras(log, changed)
 
 
 def with_poses(log: Log, change: Callable[[Floats], Floats]) -> Log:
@@ -163,16 +122,6 @@ def with_poses(log: Log, change: Callable[[Floats], Floats]) -> Log:
 def later(log: Log, offset: float) -> Log:
     """Return the log with the stamps of all frames later by an offset (s)."""
     return with_frame_stamps(log, lambda stamps: stamps + offset)
-
-
-def _mounted(pose: Floats, turn: Floats) -> Floats:
-    return pose @ turn @ _OPTICAL
-
-
-def w_last(poses: Floats) -> Floats:
-    """Correct poses (..., 4, 4) whose quaternions were stored with w first, but were read with w last."""
-    read = quaternion_from_rotation(poses[..., :3, :3])
-    return make_pose(rotation_from_quaternion(np.roll(read, -1, axis=-1)), poses[..., :3, 3])
 
 
 def yaws(poses: Floats) -> Floats:
@@ -242,10 +191,6 @@ def _stretched(boxes: Floats, camera: Camera, side: float) -> Floats:
 
 def _from_shares(boxes: Floats, camera: Camera) -> Floats:
     return boxes * np.tile(camera.size, 2)
-
-
-def _with_cameras(log: Log, change: Callable[[CameraLog], CameraLog]) -> Log:
-    return replace(log, cameras=tuple(change(one) for one in log.cameras))
 
 
 def _with_boxes(one: CameraLog, change: Callable[[Floats, Camera], Floats]) -> CameraLog:

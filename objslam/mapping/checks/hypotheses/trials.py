@@ -7,7 +7,8 @@ from objslam.config import Settings
 from objslam.core.types import Log
 from objslam.mapping.checks.agreement import Agreement, Part, agreements
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.hypotheses import Hypothesis, hypotheses
+from objslam.mapping.checks.hypotheses.every import hypotheses
+from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis
 from objslam.mapping.checks.path import straightness
 from objslam.mapping.progress import Progress
 
@@ -27,6 +28,12 @@ _NOT_WORSE = 0.8
 _EQUAL = 0.95
 """Another hypothesis is as good as the best if it has this share of the best score. A larger share names fewer
 alternatives."""
+_HALF = 0.5
+"""A hypothesis about a log with a localisation must let at least this share of the boxes fit. One that explains fewer fits
+by chance: a right one lets 0.9 of the boxes fit. A larger share names fewer causes."""
+_RIVAL = 0.02
+"""A mount explains the boxes as well as an unusual error if its score is at most this much smaller. Two fits of one log with
+different random pairs differ by as much. A larger value names more mounts."""
 
 
 @dataclass(frozen=True)
@@ -61,37 +68,48 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
     return [first, *sorted(trials, key=lambda trial: -trial.score)]
 
 
-def verdict(trials: list[Trial], part: Part, corrected: float) -> Finding | None:
+def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = "") -> Finding | None:
     """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log.
 
     corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
-    better than this: a mount with another order of its quaternion may look like one that is tilted a little.
+    better than this: a mount with another order of its quaternion may look like one that is tilted a little. unusual: those
+    of the errors, in words, that are too large for a usual mount, "" if there are none. Then a mount that explains the boxes
+    as well is the more probable cause. It is named, but the run corrects it.
     """
     first, rest = trials[0], trials[1:]
-    before = max(first.score, corrected)
-    times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
 
-    def holds(trial: Trial) -> bool:
+    def holds(trial: Trial, before: float) -> bool:
+        times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
         more = trial.score > max(times * before, before + least)
-        more &= (trial.score - before) * part.boxes > _MORE_BOXES
+        more &= (trial.score - before) * part.boxes > _MORE_BOXES and (part.drifts or trial.share >= _HALF)
         # Better boxes are no reason to make a straight path crooked.
         return bool(more and not (_is_straight(first) and trial.straight is not None and trial.straight < _CROOKED))
 
     def straightens(trial: Trial) -> bool:
         return bool(_is_crooked(first) and (trial.straight or 0.0) > _STRAIGHT and trial.score >= _NOT_WORSE * first.score)
 
-    good = [trial for trial in rest if straightens(trial)] or [trial for trial in rest if holds(trial)]
+    def rivals(trial: Trial) -> bool:
+        of_mount = trial.hypothesis is not None and trial.hypothesis.of_mount
+        return of_mount and trial.score >= corrected - _RIVAL and holds(trial, first.score)
+
+    good = [trial for trial in rest if straightens(trial)]
+    good = good or [trial for trial in rest if holds(trial, max(first.score, corrected))]
+    taken = not good and bool(unusual)
+    good = good or [trial for trial in rest if taken and rivals(trial)]
     if not good:
         return None
-    best = good[0]
-    others = [t for t in good[1:] if t.score >= _EQUAL * best.score and t.hypothesis is not None]
+    equal = [trial for trial in good if trial.score >= _EQUAL * good[0].score]
+    equal = [trial for trial in equal if trial.hypothesis is not None and trial.hypothesis.usual] or equal
+    best = equal[0]
     assert best.hypothesis is not None
-    causes = list(dict.fromkeys([best.hypothesis.cause, *(t.hypothesis.cause for t in others if t.hypothesis)]))[:3]
+    causes = list(dict.fromkeys(trial.hypothesis.cause for trial in equal if trial.hypothesis is not None))[:3]
     fit = f"{100 * best.share:.0f} % of the boxes fit instead of {100 * first.share:.0f} %"
     if _is_crooked(first) and best.straight is not None and best.straight > _STRAIGHT:
         fit += ", and the robot drives where it heads"
     message = f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}"
-    return Finding(best.hypothesis.name, message, basis="log" if _is_crooked(first) else "boxes")
+    if taken:
+        message += f". The run takes it for {unusual}, and corrects that"
+    return Finding(best.hypothesis.name, message, spoils=not taken, basis="log" if _is_crooked(first) else "boxes")
 
 
 def crooked(log: Log) -> bool:

@@ -1,0 +1,4 @@
+"""Hypotheses about wrong input: changes that would correct a log, and the test of how well each explains it.
+
+`every` yields all hypotheses, `mounts` those about the mounts of cameras. `trials` tests them and names the best.
+"""

@@ -1,0 +1,65 @@
+"""Find that the boxes of a log agree with its poses no better than they would with a wrong mount."""
+
+import numpy as np
+
+from objslam.core.arrays import Bools
+from objslam.mapping.checks.agreement import Agreement, Part
+from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.hypotheses.mounts import unset
+from objslam.mapping.checks.hypotheses.trials import Trial
+
+_BAD_SCORE = 0.4
+"""Boxes may disagree with the poses if their score is below this. Clean logs have at least 0.56, recorded or simulated. Logs
+with a camera that is turned in any way have at most 0.3. A larger score accuses more logs."""
+_CHANCE, _TIMES = 90.0, 2.0
+"""Boxes agree by chance if their score is below this multiple of what this percentage of all turned mounts does not reach.
+Clean logs have at least 2.9 times as much, logs with turned cameras at most 1.9. Larger values accuse more logs."""
+_DISTANT = 0.9
+"""The share of boxes that fit a point or a direction from which boxes are not said to disagree. It is at least 0.94 in logs
+without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
+_CONE = np.radians(4.0)
+"""The angle (rad) within which rays have one direction. Rays that differ by less give no point. A larger angle accuses fewer
+logs."""
+_PILE = 0.2
+"""The least share of a label's rays that show one distant thing. Fewer have one direction by chance. A larger share accuses
+more logs."""
+_TRIED = 64  # The most directions that are tried for a distant thing. A larger number finds smaller piles.
+
+
+def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | None:
+    """Return a finding if the boxes agree with the poses only by chance, although they would show parallax.
+
+    found: after the usual errors of the cameras are corrected, as far as the boxes show them. Turned mounts show what chance
+    does in this log. Things that are too far for parallax give no point, but each has one direction.
+    """
+    turned = [trial.score for trial in trials if trial.hypothesis is not None and trial.hypothesis.of_mount]
+    if not turned or found.score >= min(_BAD_SCORE, _TIMES * float(np.percentile(turned, _CHANCE))):
+        return None
+    if _at_rest(found).sum() >= _DISTANT * found.boxes:
+        return None
+    message = (
+        f"only {100 * found.share:.0f} % of the boxes agree with the poses, hardly more than with a camera that is turned "
+        "at random, and no usual mistake explains that: look at base_T_camera, at the frame of the poses, and at the stamps"
+    )
+    if unset(part.log):
+        message += ". base_T_camera has no rotation, so the camera looks where z of the poses points"
+    return Finding("boxes disagree", message, basis="boxes")
+
+
+def _at_rest(found: Agreement) -> Bools:
+    """Return which rays (R,) fit a point, or show a distant thing: many rays of one label that have the same direction."""
+    fits = found.point >= 0
+    directions = found.rays.in_map(found.keyframes.map_T_camera)[1]
+    for label in np.unique(found.rays.label).tolist():
+        mine = np.flatnonzero(found.rays.label == label)
+        least = _PILE * len(mine)
+        left = mine[~fits[mine]]
+        while len(left) >= least and len(left):
+            some = np.linspace(0, len(left) - 1, min(_TRIED, len(left))).astype(int)
+            near = directions[left] @ directions[left[some]].T > np.cos(_CONE)
+            pile = near[:, near.sum(axis=0).argmax()]
+            if pile.sum() < least:
+                break
+            fits[left[pile]] = True
+            left = left[~pile]
+    return fits

@@ -1,0 +1,25 @@
+"""A hypothesis: a possible fault of the input, as a change that would correct the log."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from objslam.core.types import CameraLog, Log
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A possible fault of the input. name: short and fixed. what: a description of the corrected log. cause: the probable
+    mistake. put_right: returns the corrected log. of_mount: whether it is about how a camera is turned on the robot. usual:
+    whether people often make this mistake. Of two hypotheses that explain a log equally, the usual one is named."""
+
+    name: str
+    what: str
+    cause: str
+    put_right: Callable[[Log], Log]
+    of_mount: bool = False
+    usual: bool = True
+
+
+def with_cameras(log: Log, change: Callable[[CameraLog], CameraLog]) -> Log:
+    """Return the log with each of its cameras changed."""
+    return replace(log, cameras=tuple(change(one) for one in log.cameras))
