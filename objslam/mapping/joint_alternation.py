@@ -217,8 +217,10 @@ class JointState:
         otherwise decide.
         """
         gain = attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
-        if not gain > 0:
-            return self
+        return self.replaced(attempt) if gain > 0 else self
+
+    def replaced(self, attempt: Self) -> Self:
+        """Return the result of an attempt, with the ledger and the trace of this state."""
         self.ledger.add(attempt.ledger)
         if self.trace is not None and attempt.trace is not None:
             self.trace.rounds.extend(attempt.trace.rounds)
