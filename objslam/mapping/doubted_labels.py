@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.core.arrays import Ints
+from objslam.core.arrays import Bools, Ints
 from objslam.core.noise import NoiseFactors
-from objslam.core.types import Keyframes, Rays
+from objslam.core.types import Association, Keyframes, Rays
 from objslam.mapping.labels import MANY, SECOND
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
     from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.solution import Solution
 
 _WITNESSES = 2
 """The least number of other labels that must be seen before and after a moment, to check a label there. The places of two
@@ -37,7 +38,26 @@ _NOISIER = 1.5
 object for each label does not count. A larger factor favours one object for each label."""
 
 
-def doubted_labels(rays: Rays, keyframes: Keyframes, estimate: Estimate) -> Ints:
+CLEAR_ODDS = 7.0
+"""The log of the odds above which the evidence is clear: 1000 to 1. With a larger value, more maps need a look."""
+
+
+def doubted_names(state: JointState | Solution) -> tuple[str, ...]:
+    """Return the names of the `doubted_labels` of a map with one object for each label."""
+    assert state.association is not None
+    assert state.estimate is not None
+    doubted = doubted_labels(state.rays, state.association, state.keyframes, state.estimate)
+    return tuple(state.rays.label_names[i] for i in doubted.tolist())
+
+
+def same_counts(one: JointState, other: JointState) -> bool:
+    """Return whether two maps have the same number of objects for each label."""
+    assert one.association is not None
+    assert other.association is not None
+    return np.array_equal(np.sort(one.association.label), np.sort(other.association.label))
+
+
+def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, estimate: Estimate) -> Ints:
     """Return the labels that may name several objects, though the rays agree with a map of one object for each label.
 
     They are the labels that too few others check (`unchecked_labels`), if the map needs noisy odometry, or rejects many of
@@ -45,6 +65,7 @@ def doubted_labels(rays: Rays, keyframes: Keyframes, estimate: Estimate) -> Ints
 
     Args:
         rays: with their labels.
+        association: of the rays. A second box of a label in one frame may have no object.
         keyframes: of the rays.
         estimate: the solved map of one object for each label.
     """
@@ -54,11 +75,8 @@ def doubted_labels(rays: Rays, keyframes: Keyframes, estimate: Estimate) -> Ints
     unchecked = unchecked_labels(rays, keyframes)
     if max(noise.along, noise.across, noise.turning) > _GREW:
         return unchecked
-    count = len(rays.label_names)
-    rejected, number = (
-        np.bincount(rays.label[estimate.weight == 0], minlength=count),
-        np.bincount(rays.label, minlength=count),
-    )
+    count, held = len(rays.label_names), association.object >= 0
+    rejected, number = (np.bincount(rays.label[which], minlength=count) for which in (held & (estimate.weight == 0), held))
     return unchecked[(rejected >= np.maximum(MANY, _REJECTED * number))[unchecked]]
 
 
@@ -97,7 +115,7 @@ def evidence_against(named: JointState, other: JointState) -> float:
     Both maps have the noise of the odometry that `named` found, which suits `named` best. At the noise of the settings, the
     truth would lose in a log of a robot with worse odometry, because a second object costs less than the error of the path.
     The noise of boxes and depths shows in each view, whatever the objects are. So if `other` found much less of it, at most
-    `_NOISIER` times that counts. Each map keeps its own shared errors, which count by their prior.
+    `_NOISIER` times that counts. A second box around one thing has no object in `named`, and in neither map here. Each map keeps its own shared errors, which count by their prior.
 
     Args:
         named: solved, with one object for each label.
@@ -108,15 +126,21 @@ def evidence_against(named: JointState, other: JointState) -> float:
     found, most = named.errors.noise, other.errors.noise
     sensors = {name: min(getattr(found, name), _NOISIER * getattr(most, name)) for name in ("rays", "ranges", "range_bias")}
     held = replace(found, **sensors)
-    return _explained_at(held, other) - _explained_at(held, named)
+    assert named.association is not None
+    counts = named.association.object >= 0
+    return _explained_at(held, other, counts) - _explained_at(held, named, counts)
 
 
-def _explained_at(noise: NoiseFactors, state: JointState) -> float:
-    """Return the log evidence for the association of a state at another noise, with the prior of its shared errors."""
+def _explained_at(noise: NoiseFactors, state: JointState, counts: Bools) -> float:
+    """Return the log evidence for the association of a state at another noise, with the prior of its shared errors.
+
+    counts: (R,) the rays that may have an object.
+    """
     assert state.errors is not None
     assert state.association is not None
     theta = state.errors.mean if state.theta is None else state.theta
     there = replace(state.attempt(), theta=theta, hold=True)
-    solved = there.solve_once(state.association, state.errors.with_noise(noise), state.solved_poses)
+    association = replace(state.association, object=np.where(counts, state.association.object, -1))
+    solved = there.solve_once(association, state.errors.with_noise(noise), state.solved_poses)
     off = theta - state.errors.mean
     return solved.log_evidence - float(off @ np.linalg.solve(state.errors.prior, off)) / 2

@@ -11,10 +11,9 @@ import numpy as np
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.geometry import inverse
 from objslam.core.noise import NoiseFactors
-from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.mapping.doubted_labels import doubted_labels, evidence_against
+from objslam.mapping.doubted_labels import CLEAR_ODDS, doubted_names, evidence_against, same_counts
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.labels import (
     angles_to_objects,
@@ -27,7 +26,6 @@ from objslam.mapping.labels import (
 )
 
 if TYPE_CHECKING:
-    from objslam.core.estimate import Estimate
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _NOISIER = 1.5
@@ -42,43 +40,34 @@ _LOOSE = 3.0
 factor suits worse odometry, and loses more objects of good odometry."""
 
 
-def solve_joint(
-    state: JointState, start: InitialEstimate | None
-) -> tuple[Association, Estimate, tuple[dict[str, int], ...]]:
-    """Associate and solve a log, and return the association, the estimate, and the counts of each round.
+def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
+    """Return the state after association and solve of a log. It has an association and an estimate.
 
     start: a known start. With it, the log is not explored, and labels are not trusted.
     """
     state = _with_clocks(state)
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
-        return _result(_associated(state, start))
+        return _associated(state, start)
     named, agree = _by_label(state)
-    assert named.estimate is not None
-    sure = state.settings.association.method == "by_label"
-    if sure or not len(doubted_labels(named.rays, named.keyframes, named.estimate)):
-        return _result(named if agree else _associated(replace(named, association=None, estimate=None), None))
+    if state.settings.association.method == "by_label" or not doubted_names(named):
+        return named if agree else _associated(replace(named, association=None, estimate=None), None)
     # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
     if not agree:
-        return _result(_associated(state, None))
-    return _result(_with_several_a_label(state, named))
+        return _associated(state, None)
+    return _with_several_a_label(state, named)
 
 
 def _with_several_a_label(state: JointState, named: JointState) -> JointState:
     """Return the state with several objects a label if there is more evidence for it, else the state `named`, which has one
     object for each label. state: before the solve by labels."""
+    doubted = doubted_names(named)
     try:
         other = _associated(state.attempt(), None)
     except SolveError:
-        return named
-    if not evidence_against(named, other) > 0:
-        return named
-    return named.replaced(other)
-
-
-def _result(state: JointState) -> tuple[Association, Estimate, tuple[dict[str, int], ...]]:
-    assert state.association is not None
-    assert state.estimate is not None
-    return state.association, state.estimate, state.rounds
+        return replace(named, doubted=doubted)
+    odds = evidence_against(named, other)
+    found = named.replaced(other) if odds > 0 else named
+    return replace(found, doubted=doubted) if abs(odds) < CLEAR_ODDS and not same_counts(named, other) else found
 
 
 def _associated(state: JointState, start: InitialEstimate | None) -> JointState:

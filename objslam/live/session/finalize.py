@@ -25,7 +25,7 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.doubted_labels import doubted_labels
+from objslam.mapping.doubted_labels import doubted_names
 from objslam.mapping.labels import labels_tell
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
@@ -104,7 +104,8 @@ def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], setti
         solution = _solve_joint(found, settings, own)
         if not (by_label and few and _may_have_several(solution, settings)):
             ledger.add(own)
-            return solution
+            sure = few or not by_label or settings.association.method == "by_label"
+            return solution if sure else replace(solution, doubted=doubted_names(solution))
     start = None if by_label else InitialEstimate(found.map_T_camera, found.association, found.positions)
     return solve(found.keyframes, found.rays, cameras, settings, ledger, lambda *_: None, start, found.errors)
 
@@ -115,7 +116,7 @@ def _may_have_several(solution: Solution, settings: Settings) -> bool:
         return False
     if not labels_tell(solution.association, solution.estimate):
         return True
-    return len(doubted_labels(solution.rays, solution.keyframes, solution.estimate)) > 0
+    return bool(doubted_names(solution))
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
