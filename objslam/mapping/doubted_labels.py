@@ -115,7 +115,8 @@ def evidence_against(named: JointState, other: JointState) -> float:
     Both maps have the noise of the odometry that `named` found, which suits `named` best. At the noise of the settings, the
     truth would lose in a log of a robot with worse odometry, because a second object costs less than the error of the path.
     The noise of boxes and depths shows in each view, whatever the objects are. So if `other` found much less of it, at most
-    `_NOISIER` times that counts. A second box around one thing has no object in `named`, and in neither map here. Each map keeps its own shared errors, which count by their prior.
+    `_NOISIER` times that counts. A second box around one thing has no object in `named`, so here it has none in `other`.
+    Each map keeps its own shared errors, which count by their prior.
 
     Args:
         named: solved, with one object for each label.
