@@ -47,6 +47,7 @@ def solve(
     """
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
+    doubted: tuple[str, ...] = ()
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
         if errors is None:
@@ -64,7 +65,10 @@ def solve(
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
-        association, estimate, rounds = solve_joint(begin, start)
+        state = solve_joint(begin, start)
+        assert state.association is not None
+        assert state.estimate is not None
+        association, estimate, rounds, doubted = state.association, state.estimate, state.rounds, state.doubted
         estimate, added = solve_to_centres(begin, association, estimate)
         if errors is not None:
             keyframes, rays_of_keyframes = without_errors(errors, estimate)
@@ -72,4 +76,4 @@ def solve(
             rays_of_keyframes = to_centres(rays_of_keyframes, added)
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
-    return Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)
+    return Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded, doubted=doubted)

@@ -193,6 +193,7 @@ def summarise(
         "unexplained_share": {
             label: round(float(n / of), 4) for label, n, of in zip(rays.label_names, left, total, strict=True) if n
         },
+        "doubted_labels": list(solution.doubted),
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),
         "noise": None if estimate.noise is None else estimate.noise.to_dict(),

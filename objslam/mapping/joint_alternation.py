@@ -47,7 +47,8 @@ class JointState:
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
     (P,) their last values, None before the first solve. hold: whether they are known well enough to stay fixed until the
-    last solve. settled: whether no ray changed its object in the last round.
+    last solve. settled: whether no ray changed its object in the last round. doubted: the labels of which it is not clear
+    whether they name one object or several.
     """
 
     frames: Keyframes
@@ -63,6 +64,7 @@ class JointState:
     theta: Floats | None = None
     hold: bool = False
     settled: bool = True
+    doubted: tuple[str, ...] = ()
     rounds: tuple[dict[str, int], ...] = ()
     association: Association | None = None
     estimate: Estimate | None = None
@@ -217,8 +219,10 @@ class JointState:
         otherwise decide.
         """
         gain = attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
-        if not gain > 0:
-            return self
+        return self.replaced(attempt) if gain > 0 else self
+
+    def replaced(self, attempt: Self) -> Self:
+        """Return the result of an attempt, with the ledger and the trace of this state."""
         self.ledger.add(attempt.ledger)
         if self.trace is not None and attempt.trace is not None:
             self.trace.rounds.extend(attempt.trace.rounds)

@@ -11,8 +11,9 @@ import numpy as np
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.geometry import inverse
 from objslam.core.noise import NoiseFactors
-from objslam.core.types import Association
+from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
+from objslam.mapping.doubted_labels import CLEAR_ODDS, doubted_names, evidence_against, same_counts
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.labels import (
     angles_to_objects,
@@ -25,7 +26,6 @@ from objslam.mapping.labels import (
 )
 
 if TYPE_CHECKING:
-    from objslam.core.estimate import Estimate
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _NOISIER = 1.5
@@ -40,21 +40,38 @@ _LOOSE = 3.0
 factor suits worse odometry, and loses more objects of good odometry."""
 
 
-def solve_joint(
-    state: JointState, start: InitialEstimate | None
-) -> tuple[Association, Estimate, tuple[dict[str, int], ...]]:
-    """Associate and solve a log, and return the association, the estimate, and the counts of each round.
+def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
+    """Return the state after association and solve of a log. It has an association and an estimate.
 
     start: a known start. With it, the log is not explored, and labels are not trusted.
     """
     state = _with_clocks(state)
-    if start is None and may_be_by_label(state.settings, state.all_rays):
-        state, agree = _by_label(state)
-        if agree:
-            assert state.association is not None
-            assert state.estimate is not None
-            return state.association, state.estimate, ()
-        state = replace(state, association=None, estimate=None)
+    if start is not None or not may_be_by_label(state.settings, state.all_rays):
+        return _associated(state, start)
+    named, agree = _by_label(state)
+    if state.settings.association.method == "by_label" or not doubted_names(named):
+        return named if agree else _associated(replace(named, association=None, estimate=None), None)
+    # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
+    if not agree:
+        return _associated(state, None)
+    return _with_several_a_label(state, named)
+
+
+def _with_several_a_label(state: JointState, named: JointState) -> JointState:
+    """Return the state with several objects a label if there is more evidence for it, else the state `named`, which has one
+    object for each label. state: before the solve by labels."""
+    doubted = doubted_names(named)
+    try:
+        other = _associated(state.attempt(), None)
+    except SolveError:
+        return replace(named, doubted=doubted)
+    odds = evidence_against(named, other)
+    found = named.replaced(other) if odds > 0 else named
+    return replace(found, doubted=doubted) if abs(odds) < CLEAR_ODDS and not same_counts(named, other) else found
+
+
+def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
+    """Return the state after association and solve from a known start, or from an exploration of the log."""
     if start is not None or state.keyframes.localized_every:
         state = _relocalized(_from_start(state, start))
     else:
@@ -68,9 +85,7 @@ def solve_joint(
     assert state.association is not None
     if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
-    assert state.association is not None
-    assert state.estimate is not None
-    return state.association, state.estimate, state.rounds
+    return state
 
 
 def _with_clocks(state: JointState) -> JointState:
@@ -116,8 +131,12 @@ def _by_label(state: JointState) -> tuple[JointState, bool]:
         return solved, False
     noisier = noise_explains(association, solved.estimate, solved.errors, partial(solved.solve_once, association))
     if noisier is not None:
+        again = solved.solve("labels", association, noisier.map_T_base @ solved.keyframes.base_T_camera)
+        assert again.estimate is not None
         warn_of_noise(solved.errors, noisier, state.ledger)
-        return solved.solve("labels", association, noisier.map_T_base @ solved.keyframes.base_T_camera), True
+        # The last solve estimates the noise again, unless the settings fix it, and may reject the rays of an object.
+        known = solved.errors.with_unknown_noise().unknown_noise != solved.errors.unknown_noise
+        return (again, True) if known or labels_tell(association, again.estimate) else (solved, False)
     begin = clock_explains(association, errors, lambda at: solved.solve_once(association, errors, begin=at))
     if begin is None:
         return solved, False

@@ -25,7 +25,8 @@ class Solution:
     association and solve. trace: the rounds in detail, empty without a recording. bodies: the body of each object, None for
     a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
     the box. to_centre: (R, 3) is added to the direction of each ray, in the camera frame, to point to the centre of its
-    body. The last three are None if no bodies were solved.
+    body. bodies, body_share and to_centre are None if no bodies were solved. doubted: the labels of which it is not clear
+    whether they name one object or several.
     """
 
     keyframes: Keyframes
@@ -37,6 +38,7 @@ class Solution:
     bodies: tuple[PlacedBody | None, ...] | None = None
     body_share: float | None = None
     to_centre: Floats | None = None
+    doubted: tuple[str, ...] = ()
 
 
 def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:

@@ -25,6 +25,7 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.doubted_labels import doubted_names
 from objslam.mapping.labels import labels_tell
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
@@ -102,12 +103,21 @@ def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], setti
     if by_label or not few:
         own = Ledger()  # Its entries count only if this solution is returned.
         solution = _solve_joint(found, settings, own)
-        told = settings.association.method == "by_label" or labels_tell(solution.association, solution.estimate)
-        if told or not by_label or not few:  # Else a label has several objects, which no frame showed together.
+        if not (by_label and few and _may_have_several(solution, settings)):
             ledger.add(own)
-            return solution
+            sure = few or not by_label or settings.association.method == "by_label"
+            return solution if sure else replace(solution, doubted=doubted_names(solution))
     start = None if by_label else InitialEstimate(found.map_T_camera, found.association, found.positions)
     return solve(found.keyframes, found.rays, cameras, settings, ledger, lambda *_: None, start, found.errors)
+
+
+def _may_have_several(solution: Solution, settings: Settings) -> bool:
+    """Return whether a label may have several objects, which no frame showed together. solution: with one for each label."""
+    if settings.association.method == "by_label":
+        return False
+    if not labels_tell(solution.association, solution.estimate):
+        return True
+    return bool(doubted_names(solution))
 
 
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:

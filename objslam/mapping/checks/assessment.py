@@ -40,7 +40,8 @@ class Evidence:
     noise, NaN without objects. odometry_frame: whether the map has the frame of the odometry. fixed: whether the run kept
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
     frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
-    journal: the file with all messages of a live session, "" without one.
+    journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
+    whether they name one object or several.
     """
 
     resolved: int
@@ -58,6 +59,7 @@ class Evidence:
     frames: int = 0
     late: int = 0
     journal: str = ""
+    doubted: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         frames=counts["detection_frames"],
         late=sum(summary["dropped"].get(reason, 0) for reason in (TOO_SLOW, RARE_POSES)),
         journal=summary["log_path"] or "",
+        doubted=tuple(summary["doubted_labels"]),
     )
 
 
@@ -133,6 +136,11 @@ def _check(e: Evidence) -> list[str]:
         found.append(
             f"The rays miss their objects {e.misses:.1f} times as far as the settings say, so poses, clock, calibration or "
             "boxes are worse than that."
+        )
+    if e.doubted:
+        found.append(
+            f"It is not clear whether {', '.join(e.doubted)} name one object each, or several. Drive past them and others "
+            "again, so that the path between them is known."
         )
     if e.cut > _CUT * e.boxes:
         found.append(f"{100 * e.cut / e.boxes:.0f} % of the boxes were dropped, because the image's edge cuts them off.")
