@@ -54,18 +54,18 @@ def with_doubts(result: RunResult) -> RunResult:
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
-    reasons = [*_of_doubles(doubles), *_of_lost_things(found.groups, result)]
-    if reasons and "assessment" in summary:
-        summary["assessment"] = _assessed(summary["assessment"], reasons)
+    if "assessment" in summary:
+        lost = _of_lost_things(found.groups, result)
+        summary["assessment"] = _assessed(summary["assessment"], _of_doubles(doubles), lost)
     return replace(result, doubts=doubts, summary=summary)
 
 
-def _assessed(assessment: dict[str, Any], reasons: list[str]) -> dict[str, Any]:
-    """Return the assessment of a map with more reasons to look at it."""
-    if assessment["level"] == "bad":
+def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -> dict[str, Any]:
+    """Return the assessment of a map with more reasons to look at it: doubles first, and lost things last."""
+    if assessment["level"] == "bad" or not (doubles or lost):
         return assessment
     others = assessment["reasons"][assessment["level"] == "good" :]  # The first reason of a good map praises it.
-    return {**assessment, "level": "check", "reasons": [*reasons, *others]}
+    return {**assessment, "level": "check", "reasons": [*doubles, *others, *lost]}
 
 
 def _of_doubles(doubles: int) -> list[str]:
