@@ -61,6 +61,8 @@ _NOISE: Final = {
     "along": "odometry along",
     "across": "odometry across",
     "turning": "odometry in turns",
+    "heading": "heading of the poses",
+    "place": "place of the poses",
 }
 """The words for the factors of the noise. A factor of 1 is not shown: the log does not tell it, or confirms the settings."""
 NOT_LOCALISED = 3

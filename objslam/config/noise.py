@@ -11,8 +11,9 @@ class Noise(Section):
     """Estimate the noise of measurements from the log. The settings of an estimated noise, such as rays.pixel_sigma, are
     then only a prior of the weight `prior`.
 
-    auto: in joint mode, estimate the noise if the log has odometry and the settings of this noise have their defaults. true:
-    estimate it even if these settings differ from their defaults. false: never estimate it.
+    auto: estimate the noise if the settings of this noise have their defaults. The noise of rays, ranges and odometry is
+    estimated only in joint mode with odometry. true: estimate it even if these settings differ from their defaults. false:
+    never estimate it.
     """
 
     rays: Estimated = "auto"
@@ -22,6 +23,9 @@ class Noise(Section):
     auto estimates none of them if a camera has its own depth_noise."""
     odometry: Estimated = "auto"
     """the noise of the odometry along, across and in turning, with a factor for each."""
+    localization: Estimated = "auto"
+    """the noise of localised poses, with a factor for localization.yaw and one for localization.xy, each at least 1. It is
+    estimated in fixed mode only, from frames that show several objects."""
     prior: Positive = 10.0
     """the weight of the noise in the settings, as a number of residuals. With a larger weight, short logs change the noise
     less."""

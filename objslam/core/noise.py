@@ -17,7 +17,8 @@ class NoiseFactors:
 
     rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges: `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`.
     along: `odometry.x_per_m` and `odometry.xy_per_rad`. across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the
-    odometry's noise of the heading. shrinkage: the share by which a joint solve makes all lengths too short.
+    odometry's noise of the heading. heading: `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a
+    joint solve makes all lengths too short.
     """
 
     rays: float = 1.0
@@ -26,6 +27,8 @@ class NoiseFactors:
     along: float = 1.0
     across: float = 1.0
     turning: float = 1.0
+    heading: float = 1.0
+    place: float = 1.0
     shrinkage: float = 0.0
 
     def settings(self, nominal: Settings) -> Settings:

@@ -193,7 +193,8 @@ class Keyframes:
     stamps: (K,) s, non-decreasing. After a correction of the cameras' clocks, this holds for each camera alone. camera: (K,)
     index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera. base_T_camera: (K, 4, 4).
     map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation. localized_every: how many
-    keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. odom_T_base:
+    keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. pose_noise:
+    the factors on `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. odom_T_base:
     (K, 4, 4) in the coordinate frame of the first odometry pose, None without odometry. drift: (K, 6, 6) covariance,
     rotation first, of the odometry's error since its start, in the frame of odom_T_base. stretch: (K,) the stretch of the
     odometry between two gaps, None means one for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have
@@ -206,6 +207,7 @@ class Keyframes:
     base_T_camera: Floats
     map_T_base: Floats
     localized_every: float = 0.0
+    pose_noise: tuple[float, float] = (1.0, 1.0)
     odom_T_base: Floats | None = None
     drift: Floats | None = None
     stretch: Ints | None = None

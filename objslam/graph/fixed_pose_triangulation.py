@@ -43,10 +43,11 @@ def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Fl
 def noise_of_poses(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
     """Return the standard deviations of localised poses: of headings, rad, and of places, m. 0 without a localisation.
 
-    Keyframes that share one measured pose share its error, so its variance is multiplied by their number.
+    Keyframes that share one measured pose share its error, so its variance is multiplied by their number. The noise is that
+    of the settings, or the larger one that the log shows.
     """
-    share = float(np.sqrt(keyframes.localized_every))
-    return settings.localization.yaw * share, settings.localization.xy * share
+    share, (yaw, place) = float(np.sqrt(keyframes.localized_every)), keyframes.pose_noise
+    return settings.localization.yaw * share * yaw, settings.localization.xy * share * place
 
 
 def _triangulate(

@@ -13,7 +13,7 @@ from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.bodies.centre_bearings import solve_to_centres, to_centres
 from objslam.mapping.checks.unexplained import warn_of_unexplained
-from objslam.mapping.fixed.fixed_poses import FixedPoses, calibrate_fixed
+from objslam.mapping.fixed.fixed_poses import FixedPoses, associate_fixed, calibrate_fixed
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.joint_solve import solve_joint
 from objslam.mapping.progress import Progress
@@ -51,16 +51,10 @@ def solve(
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
         if errors is None:
-            progress("association", 0, 0)
-            association, rounds = at.associate(), tuple[dict[str, int], ...]()
-            progress("solve", 0, 0)
-            estimate = at.solve(association, trace)
-            every_object = at.add_few(association, estimate)
-            if every_object.count > association.count:
-                association, estimate = every_object, at.solve(every_object, trace)
+            at, association, estimate, rounds = associate_fixed(at, progress, trace)
         else:
             at, association, estimate, rounds = calibrate_fixed(at, errors, ledger, progress, trace)
-            keyframes, rays_of_keyframes = at.seen, at.rays_seen
+        keyframes, rays_of_keyframes = at.seen, at.rays_seen
     elif not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:

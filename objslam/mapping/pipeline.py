@@ -24,7 +24,7 @@ from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
-from objslam.mapping.checks.residuals import check_residuals
+from objslam.mapping.checks.residuals import check_pose_noise, check_residuals
 from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
@@ -108,10 +108,9 @@ def run(
     trusted = not diagnosis.spoilt
     objects, residual = describe(solution, cameras, settings, trusted=trusted)
     if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings:
-        calibrated = estimate.calibration is not None
-        missing = check_residuals(
-            objects, keyframes, solution.rays, solution.association, residual, settings, calibrated=calibrated
-        )
+        calibrated, held = estimate.calibration is not None, (keyframes, solution.rays, solution.association)
+        noisy = check_pose_noise(objects, *held, settings, calibrated=calibrated)
+        missing = noisy or check_residuals(objects, *held, residual, settings, calibrated=calibrated)
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
     objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)

@@ -50,10 +50,21 @@ def test_the_warning_says_how_many_times_the_noise_is_larger(times):
 
 def test_poses_that_are_worse_than_said_are_told_and_good_settings_silence_it():
     log = drive(classes=12, localization=PoseNoise(xy=0.1, yaw=0.03))
-    (line,) = warnings(log, "association.method=by_label", "calibration.use=false")
+    (line,) = warnings(log, "association.method=by_label", "calibration.use=false", "noise.localization=false")
     assert "a label is several things, or the poses, the clock, the calibration or the boxes are worse" in line
     assert "--set calibration.use=true, or --mode joint" in line
     assert warnings(log, "association.method=by_label", "localization.xy=0.1", "localization.yaw=0.03") == []
+
+
+def test_noise_that_the_rays_of_a_frame_share_is_named_with_its_size():
+    """The poses are drawn at the stamps of the images, so no interpolation makes their noise smaller."""
+    log = drive(classes=12, false=0.0, localization=PoseNoise(xy=0.1, yaw=0.03), localization_rate=None)
+    (line,) = warnings(log, "association.method=by_label", "calibration.use=false")
+    assert "all boxes of a frame miss their objects together" in line
+    assert "--set calibration.use=true" in line
+    found = re.search(r"the poses err by ([\d.]+) deg and ([\d.]+) cm", line)
+    assert float(found[1]) == pytest.approx(1.72, rel=0.2)
+    assert float(found[2]) == pytest.approx(10, rel=0.2)
 
 
 def test_after_a_calibration_it_is_no_longer_the_cameras():

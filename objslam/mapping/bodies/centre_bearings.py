@@ -34,6 +34,7 @@ again."""
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
     """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
 
+    Nothing is added to a ray that the solve rejects.
     The bearings of an object that would be lost stay at the centres of its boxes. If no body shifts its bearings enough
     (`_WORTH`), or if an object would still be lost, the estimate is as before, and the second value is None. A second
     round, from the bodies at the new poses, would change the path by 1 mm and the objects by less than their noise (24
@@ -62,7 +63,9 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
         return estimate, None
     if state.trace is not None:
         state.trace.end_round("bodies", association, solved)
-    return solved, shift
+    # A rejected ray shows something else than its object, so it has no centre of this body. Turned, such rays of a second
+    # thing would no longer meet in its place.
+    return solved, np.where((solved.weight > 0)[:, None], shift, 0.0)
 
 
 def _solve(

@@ -1,13 +1,16 @@
-"""A check of a map at fixed poses: whether rays miss their objects by more than the noise in the settings."""
+"""Checks of a map at fixed poses: whether poses err, or rays miss their objects, by more than the noise in the settings."""
+
+from dataclasses import replace
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
+from objslam.core.noise import MOST_NOISE
 from objslam.core.object_map import ObjectMap
 from objslam.core.statistics import RAYLEIGH_MEDIAN
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.graph.fixed_pose_triangulation import pose_noise
+from objslam.graph.fixed_pose_triangulation import noise_of_poses, pose_noise
 from objslam.mapping.checks.finding import Finding
 
 _MOST = np.sqrt(2.0)
@@ -32,12 +35,46 @@ def misses(
     held = _held(objects, association)
     if not held.any():
         return float("nan")
+    promised = _promised(objects, keyframes, rays, association, settings)
+    return float(np.median(residual[held] / promised)) / RAYLEIGH_MEDIAN
+
+
+def _promised(objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> Floats:
+    """Return the standard deviations (H,), rad, of the rays whose objects are ok, seen from their cameras."""
+    held = _held(objects, association)
     angle, place = pose_noise(rays, keyframes, settings) if settings.mode == "fixed" else (rays.sigma, 0.0)
     origins, _ = rays.in_map(keyframes.map_T_camera)
     positions = np.array([one.position for one in objects.objects])
     distance = np.linalg.norm(positions[association.object[held]] - origins[held], axis=1)
-    promised = np.hypot(angle[held], place / np.maximum(distance, 1e-9))
-    return float(np.median(residual[held] / promised)) / RAYLEIGH_MEDIAN
+    return np.hypot(angle[held], place / np.maximum(distance, 1e-9))
+
+
+def check_pose_noise(
+    objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, *, calibrated: bool
+) -> Finding | None:
+    """Return a finding if the noise of the poses that the log shows makes most rays far noisier than the settings say.
+
+    The map counts with this noise, so it is honest. With better poses it would be more exact. calibrated: whether the
+    cameras were calibrated against the poses.
+    """
+    if keyframes.pose_noise == (1.0, 1.0) or not _held(objects, association).any():
+        return None
+    usual = replace(keyframes, pose_noise=(1.0, 1.0))
+    found, promised = (_promised(objects, frames, rays, association, settings) for frames in (keyframes, usual))
+    if np.median(found / promised) < _MOST:
+        return None
+    (yaw, place), (turns, shifts) = noise_of_poses(keyframes, settings), keyframes.pose_noise
+    least = "at least " if max(turns, shifts) >= 0.999 * MOST_NOISE else ""
+    cause = "is the localisation that noisy?"
+    if not calibrated:
+        cause = "is the localisation that noisy, or are the clock or the calibration wrong (--set calibration.use=true)?"
+    return Finding(
+        "localisation noise",
+        f"all boxes of a frame miss their objects together: the poses err by {least}{np.degrees(yaw):.2g} deg and "
+        f"{100 * place:.2g} cm, {turns:.1f} and {shifts:.1f} times what localization.yaw and localization.xy say. The map "
+        f"counts with these errors, so its sigmas are large; {cause}",
+        spoils=False,
+    )
 
 
 def _held(objects: ObjectMap, association: Association) -> Bools:

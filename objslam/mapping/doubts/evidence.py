@@ -16,14 +16,18 @@ from objslam.core.result import RunResult
 from objslam.core.types import Keyframes
 from objslam.graph.fixed_pose_triangulation import pose_noise
 
+_FAR = 2.0
+"""A rejected ray that misses its object by more than this many gates shows something else. Rays of the object itself, even
+with the noise of a bad box, miss it by less. A larger number finds fewer second things of a label."""
+
 
 @dataclass(frozen=True)
 class Evidence:
     """The resolved objects (N) and all rays (R) of a result.
 
     state: the objects as landmarks, and the rays sorted by frame. object: (N,) the index of each landmark in the map. ray:
-    (R,) the index of each observation in the result. left: (R,) whether an observation belongs to no object. covariance:
-    (N, 3, 3) m^2. gate: the largest squared deviation of a ray from its object.
+    (R,) the index of each observation in the result. left: (R,) whether an observation belongs to no object, or was rejected
+    and lies far from its object. covariance: (N, 3, 3) m^2. gate: the largest squared deviation of a ray from its object.
     """
 
     state: State
@@ -66,8 +70,11 @@ def evidence_of(result: RunResult) -> Evidence:
     view = frames_of(frames, order, result.cameras, poses, settings)
     state = State(obs, view, Landmarks.new(position[known], np.ones(len(known)), label, labels), matched)
     state = replace(state, landmarks=replace(state.landmarks, noise=state.noise))
+    gate = gate_limit(settings.association.gate)
     left = result.association.object[ray] < 0
-    return Evidence(state, known, ray, left, covariance, gate_limit(settings.association.gate))
+    far = state.deviation > _FAR * np.sqrt(gate)
+    left[state.assigned[far & (result.weight[ray[state.assigned]] == 0)]] = True
+    return Evidence(state, known, ray, left, covariance, gate)
 
 
 def _all_frames(keyframes: Keyframes, views: Keyframes | None) -> tuple[Keyframes, Ints]:

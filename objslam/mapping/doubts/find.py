@@ -5,15 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from objslam.core.result import DOUBT_KINDS, RunResult
 from objslam.mapping.doubts.evidence import evidence_of
-from objslam.mapping.doubts.groups import BoxGroups, find_groups
+from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
 from objslam.mapping.doubts.pairs import Pairs, find_pairs
 from objslam.mapping.doubts.splits import Splits, find_splits
 from objslam.mapping.doubts.words import in_words
 
 _DOUBLE = 0.5
 """The probability from which a pair that may be one counts in the assessment. With a larger value, more maps are good."""
+
+
+_LOST = 0.1
+"""The share of the boxes of a label from which a group of boxes that became no object counts in the assessment. A detector's
+false boxes of one kind at one place are rarer. With a larger share, more maps are good."""
+_FEWEST_LOST = 5
+"""The fewest boxes of such a group. With a larger number, more maps are good."""
+_PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
+"""The reasons of groups whose boxes agree on one place at rest, and more closely than by chance."""
 
 
 @dataclass(frozen=True)
@@ -33,24 +44,47 @@ def find_doubts(result: RunResult) -> Doubts:
 
 
 def with_doubts(result: RunResult) -> RunResult:
-    """Return the result with its doubts in words, and their counts by kind in the summary. A map with objects that are more
-    likely doubles than not is not called good."""
+    """Return the result with its doubts in words, and their counts by kind in the summary.
+
+    A map with objects that are more likely doubles than not is not called good. Neither is a map without an object where
+    many boxes of a label meet.
+    """
     found = find_doubts(result)
     doubts = in_words(result, found.pairs, found.splits, found.groups)
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
-    if doubles and "assessment" in summary:
-        summary["assessment"] = _assessed(summary["assessment"], doubles)
+    if "assessment" in summary:
+        lost = _of_lost_things(found.groups, result)
+        summary["assessment"] = _assessed(summary["assessment"], _of_doubles(doubles), lost)
     return replace(result, doubts=doubts, summary=summary)
 
 
-def _assessed(assessment: dict[str, Any], doubles: int) -> dict[str, Any]:
-    """Return the assessment of a map that may have doubles."""
-    if assessment["level"] == "bad":
+def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -> dict[str, Any]:
+    """Return the assessment of a map with more reasons to look at it: doubles first, and lost things last."""
+    if assessment["level"] == "bad" or not (doubles or lost):
         return assessment
-    reason = f"{doubles} objects may be doubles of neighbours: `objslam explain` names them."
-    if doubles == 1:
-        reason = "1 object may be a double of a neighbour: `objslam explain` names it."
     others = assessment["reasons"][assessment["level"] == "good" :]  # The first reason of a good map praises it.
-    return {**assessment, "level": "check", "reasons": [reason, *others]}
+    return {**assessment, "level": "check", "reasons": [*doubles, *others, *lost]}
+
+
+def _of_doubles(doubles: int) -> list[str]:
+    if doubles == 1:
+        return ["1 object may be a double of a neighbour: `objslam explain` names it."]
+    return [f"{doubles} objects may be doubles of neighbours: `objslam explain` names them."] if doubles else []
+
+
+def _of_lost_things(groups: BoxGroups, result: RunResult) -> list[str]:
+    """Return a reason for each label with a thing that is not in the map, though many of its boxes meet in one place."""
+    if not len(groups):
+        return []
+    labels = result.rays.label_names
+    every = np.bincount(result.rays.label, minlength=len(labels))
+    number = np.bincount(groups.group, minlength=len(groups))
+    placed = np.isin(groups.reason, [REASONS.index(reason) for reason in _PLACED])
+    lost = placed & (number >= np.maximum(_FEWEST_LOST, _LOST * every[groups.label]))
+    return [
+        f"{number[g]} of {every[groups.label[g]]} boxes of {labels[groups.label[g]]!r} fit no object, but meet in one "
+        "place: a thing may be missing, and `objslam explain` says where."
+        for g in np.flatnonzero(lost)
+    ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -93,6 +93,9 @@ def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
     A box belongs to the first group that takes it. The reasons at a place are those of the association itself, in its order.
     """
     left = np.flatnonzero(evidence.left)
+    # A rejected ray shows another thing than its object, so it is no box of this object.
+    free = replace(evidence.state, matched=np.where(evidence.left, -1, evidence.state.matched))
+    evidence = replace(evidence, state=free)
     groups: list[Ints] = []
     kinds: list[int] = []
     owners: list[int] = []

@@ -13,10 +13,12 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
+from objslam.core.noise import NoiseFactors
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.fixed.pose_noise import noise_in_frames
 from objslam.mapping.progress import Progress
 
 if TYPE_CHECKING:
@@ -31,6 +33,10 @@ _SAME = 0.05
 this share of the noise. Such a small change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A
 larger share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the
 association can swing between two states for ever."""
+_FIRST = 0.05
+"""The noise (rad) of ray directions, in addition to that of the settings, in an association that shows the noise of the
+poses. The priors of the shared errors of a camera allow about as much. With a larger value, near objects become one, and
+then their rays show nothing of the poses."""
 _EXPLAINED = 0.5
 """If an association with wide gates explains at most this share of the rays, one with narrow gates is tried as well. The
 narrow one is taken if the wide one explains less than this share of its number of rays. With a larger share, the narrow one
@@ -56,7 +62,27 @@ class FixedPoses:
         """Return the same input, corrected for the shared errors theta (P,)."""
         frames, rays, _ = errors.take(self.frames, self.rays).at(theta, drift=False)
         seen, rays_seen, _ = errors.at(theta, drift=False)
-        return replace(self, frames=frames, rays=rays, seen=seen, rays_seen=rays_seen)
+        corrected = replace(self, frames=frames, rays=rays, seen=seen, rays_seen=rays_seen)
+        return corrected.with_noise_of_poses(self.seen.pose_noise)
+
+    def with_noise_of_poses(self, factors: tuple[float, float]) -> FixedPoses:
+        """Return the same input with factors on `localization.yaw` and `localization.xy`."""
+        return replace(self, frames=replace(self.frames, pose_noise=factors), seen=replace(self.seen, pose_noise=factors))
+
+    @property
+    def noise_unknown(self) -> bool:
+        """Whether the noise of the poses is estimated: if the poses are localised, and as `noise.localization` says."""
+        use, usual = self.settings.noise.localization, self.settings.localization == Settings().localization
+        return bool(self.frames.localized_every and (usual if use == "auto" else use))
+
+    def noise_of_poses(self, association: Association, positions: Floats, weight: Floats) -> tuple[float, float]:
+        """Return the factors on `localization.yaw` and `localization.xy` that the rays show, 1 if they are not estimated.
+
+        positions: (N, 3) m, NaN for an object without a position. weight: (R,) 0 for a rejected ray. It does not count."""
+        if not self.noise_unknown:
+            return 1.0, 1.0
+        agreeing = replace(association, object=np.where(weight > 0, association.object, -1))
+        return noise_in_frames(self.seen, self.rays_seen, agreeing, positions, self.settings)
 
     def associate(self, more: Floats | float = 0.0) -> Association:
         """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses."""
@@ -120,6 +146,39 @@ class FixedPoses:
         return estimate
 
 
+def associate_fixed(
+    at: FixedPoses, progress: Progress, trace: Trace | None
+) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
+    """Find the objects, and the noise of the poses if the settings allow it.
+
+    With too narrow gates, one object becomes several, and their rays show hardly any noise. So the noise is first taken from
+    an association with wide gates. Then both alternate until the noise stays. Returns the input with this noise, the
+    association, the estimate, and the number of objects in each round if there were several.
+    """
+    rounds: tuple[dict[str, int], ...] = ()
+    earlier: list[tuple[float, float]] = []
+    if at.noise_unknown:
+        progress("association, first", 0, 0)
+        wide = at.associate(_FIRST)
+        solved = at.solve(wide, None)
+        at = at.with_noise_of_poses(at.noise_of_poses(wide, _placed(solved), solved.weight))
+    for number in range(_ROUNDS):
+        progress("association" if number == 0 else f"association, round {number + 1}", 0, 0)
+        association = at.associate()
+        rounds = (*rounds, {"objects": association.count})
+        progress("solve", 0, 0)
+        estimate = at.solve(association, trace)
+        earlier.append(at.seen.pose_noise)
+        found = at.noise_of_poses(association, _placed(estimate), estimate.weight)
+        if any(_same_noise(found, before) for before in earlier):
+            break
+        at = at.with_noise_of_poses(found)
+    every_object = at.add_few(association, estimate)
+    if every_object.count > association.count:
+        association, estimate = every_object, at.solve(every_object, trace)
+    return at, association, _with_noise(estimate, at), rounds if len(rounds) > 1 else ()
+
+
 def calibrate_fixed(
     at: FixedPoses, errors: SharedErrors, ledger: Ledger, progress: Progress, trace: Trace | None
 ) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
@@ -135,11 +194,9 @@ def calibrate_fixed(
 
     calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     every = errors.take(at.frames, at.rays)
-    noise = noise_of_poses(errors.keyframes, at.settings)
     told = noise_of_errors(every, calibration)
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[Floats, Floats]] = []
-    own = np.hypot(errors.rays.sigma, noise[0])
     for number in range(_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         now = at.without(errors, calibration.values)
@@ -149,15 +206,18 @@ def calibrate_fixed(
         rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
-        placed = np.where(estimate.solved[:, None], estimate.positions, np.nan)
+        placed, noise = _placed(estimate), noise_of_poses(now.seen, now.settings)
         try:
             found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
         except SolveError as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
             return now, association, replace(estimate, calibration=calibration), rounds
-        earlier.append((calibration.values, np.hypot(own, told)))
+        earlier.append((calibration.values, np.hypot(_own(now), told)))
+        moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
         calibration, told = found.calibration, noise_of_errors(every, found.calibration)
-        allowed = np.hypot(own, told)
+        corrected = at.without(errors, calibration.values)
+        at = at.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
+        allowed = np.hypot(_own(at), told)
         if any(
             _rms(turned_by_errors(every, values, calibration.values) / before) < _SAME and _rms(allowed / before - 1) < _SAME
             for values, before in earlier
@@ -171,10 +231,34 @@ def calibrate_fixed(
     if every_object.count > association.count:
         association = every_object
         estimate = now.solve(association, trace, _parameters(calibration))
-        placed = np.where(estimate.solved[:, None], estimate.positions, np.nan)
-        sensitivity = calibrate_at_poses(errors, association, placed, calibration.values, noise).sensitivity
+        noise = noise_of_poses(now.seen, now.settings)
+        sensitivity = calibrate_at_poses(errors, association, _placed(estimate), calibration.values, noise).sensitivity
         found = replace(found, sensitivity=sensitivity)
-    return now, association, _with_covariance(estimate, found), rounds
+    return now, association, _with_noise(_with_covariance(estimate, found), now), rounds
+
+
+def _placed(estimate: Estimate) -> Floats:
+    """Return the positions (N, 3), m, NaN for an object without one."""
+    return np.where(estimate.solved[:, None], estimate.positions, np.nan)
+
+
+def _own(at: FixedPoses) -> Floats:
+    """Return the standard deviations (R,), rad, of ray directions by their own noise and that of the headings."""
+    from objslam.graph.fixed_pose_triangulation import pose_noise
+
+    return pose_noise(at.rays_seen, at.seen, at.settings)[0]
+
+
+def _same_noise(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    return all(abs(a - b) < _SAME * b for a, b in zip(one, other, strict=True))
+
+
+def _with_noise(estimate: Estimate, at: FixedPoses) -> Estimate:
+    """Return an estimate that names the noise of the poses, if the log shows more than the settings say."""
+    heading, place = at.seen.pose_noise
+    if heading == place == 1.0:
+        return estimate
+    return replace(estimate, noise=NoiseFactors(heading=heading, place=place))
 
 
 def _rms(values: Floats) -> float:

@@ -1,0 +1,148 @@
+"""The noise of given poses, from the errors that all rays of a frame share.
+
+A wrong heading of a pose turns all rays of its frame to one side, and a wrong place shifts them to one side. The noise of
+boxes does neither. So frames that show several objects tell the noise of the poses, even if the noise of boxes is unknown.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.association.observations import MIN_DEPTH
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.noise import MOST_NOISE
+from objslam.core.statistics import NORMAL_MEDIAN
+from objslam.core.types import Association, Keyframes, Rays
+from objslam.graph.fixed_pose_triangulation import noise_of_poses
+
+_FEWEST = 4
+"""The fewest rays of an object that counts. Two of them determine its place. A larger number uses fewer objects."""
+_MOST_POSES = 500
+"""The most poses that count, spread evenly. They determine a factor to 3 %. More poses are more exact and slower."""
+_BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])
+"""The logarithms of the least and largest factors on the noise of rays, headings and places. The noise of poses never falls
+below the settings: a few frames with small errors do not promise the same of the others."""
+_STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
+"""The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
+_SIGNIFICANT = 13.816
+"""The least fall of -2 ln of the posterior density below that of poses as the settings say: chi-squared of 2 degrees of
+freedom at 99.9 %. With a larger value, the settings stay for longer logs."""
+_STRAY = 3.0
+"""The deviation of a stray ray, in standard deviations of all noise together. A larger number lets false boxes raise the
+noise, a smaller one lowers the noise of true boxes: by 1.3 % at 3."""
+_ROUNDS = 4
+"""The most rounds in which stray rays are told from noisy poses. More rounds hardly change a factor."""
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Sums over the rays of each of K poses, in units of the nominal noise of rays.
+
+    shared: (K, 3, 3) the information about an error of the pose: heading (rad), x and y (m). pulled: (K, 3) this information
+    times the error that fits best. squares: of all rays, their sum. rays: their number. noise: (3,) the nominal standard
+    deviations of the error. prior: the weight of the nominal noise, as a number of residuals.
+    """
+
+    shared: Floats
+    pulled: Floats
+    squares: float
+    rays: int
+    noise: Floats
+    prior: float
+
+    def cost(self, logarithms: Floats) -> float:
+        """Return -2 ln of the posterior density of the logarithms (3,) of the factors on rays, headings and places."""
+        factors = np.exp(logarithms)
+        sigma = self.noise * factors[[1, 2, 2]]
+        inner = np.eye(3) + sigma[:, None] * self.shared * sigma / factors[0] ** 2
+        pulled = self.pulled * sigma / factors[0] ** 2
+        explained = (pulled * np.linalg.solve(inner, pulled[:, :, None])[:, :, 0]).sum()
+        likelihood = self.squares / factors[0] ** 2 - explained + np.log(np.linalg.det(inner)).sum()
+        likelihood += 2 * self.rays * logarithms[0]
+        return float(likelihood + self.prior * (2 * logarithms + factors**-2.0).sum())
+
+
+def noise_in_frames(
+    keyframes: Keyframes, rays: Rays, association: Association, positions: Floats, settings: Settings
+) -> tuple[float, float]:
+    """Return the factors (at least 1) on `localization.yaw` and `localization.xy` that agree best with the rays.
+
+    A variance component model (Searle, Casella and McCulloch 1992): the miss of a ray, seen from above, is the sum of its
+    own noise, of the error of its pose's heading, and of the error of the pose's place as seen from the object. The three
+    sizes are those of the largest posterior density. Both factors are 1 unless the rays refute the settings. Only poses with
+    rays to two objects and more count, because a single ray does not tell which of the three errors it has.
+
+    positions: (N, 3) m, NaN for an object without a position.
+    """
+    number = np.bincount(association.object[association.object >= 0], minlength=association.count)
+    usable = np.append(np.isfinite(positions[:, 0]) & (number >= _FEWEST), False)
+    held = np.flatnonzero(usable[association.object])  # The index -1 (no object) gives the last entry.
+    pose = np.unique(keyframes.stamps, return_inverse=True)[1][rays.keyframe[held]]
+    several = np.flatnonzero(np.bincount(pose) > 1)
+    some = np.isin(pose, several[:: -(-len(several) // _MOST_POSES) or 1])
+    held, pose = held[some], pose[some]
+    if not len(held) or not keyframes.localized_every:
+        return 1.0, 1.0
+    owner = association.object[held]
+    origin, direction = (values[held] for values in rays.in_map(keyframes.map_T_camera))
+    to = positions[owner] - origin
+    level = np.maximum(np.hypot(to[:, 0], to[:, 1]), MIN_DEPTH)
+    left = np.column_stack([-to[:, 1], to[:, 0]]) / level[:, None]
+    miss = (direction[:, :2] * left).sum(axis=1) / np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
+    miss *= np.sqrt(number[owner] / (number[owner] - 2))  # The place of an object follows its own rays.
+    own = rays.sigma[held] * np.maximum(np.linalg.norm(to, axis=1), MIN_DEPTH) / level
+    by_pose = np.column_stack([np.ones(len(held)), left / level[:, None]])
+    yaw, place = noise_of_poses(replace(keyframes, pose_noise=(1.0, 1.0)), settings)
+    usual = np.hypot(own, np.hypot(yaw, place / level))
+    factors = np.full(3, max(1.0, float(np.median(np.abs(miss) / usual)) / NORMAL_MEDIAN))
+    inside = np.zeros(len(held), dtype=bool)
+    for _ in range(_ROUNDS):
+        total = np.hypot(own * factors[0], np.hypot(yaw * factors[1], place * factors[2] / level))
+        near = np.abs(miss) < _STRAY * total
+        near &= np.bincount(pose, near)[pose] > 1
+        if not near.any():
+            return 1.0, 1.0
+        if np.array_equal(near, inside):
+            break
+        inside = near
+        sums = _summed(miss[near] / own[near], by_pose[near] / own[near, None], pose[near], (yaw, place), settings)
+        factors = _most_likely(sums)
+    return float(factors[1]), float(factors[2])
+
+
+def _summed(miss: Floats, by_pose: Floats, pose: Ints, noise: tuple[float, float], settings: Settings) -> _Sums:
+    """Return the sums over the rays of each pose. miss: (R,), by_pose: (R, 3) its derivative by the error of the pose, both
+    in standard deviations of the rays. noise: of headings, rad, and of places, m."""
+    count, pose = len(np.unique(pose)), np.unique(pose, return_inverse=True)[1]
+    shared, pulled = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    np.add.at(shared, pose, by_pose[:, :, None] * by_pose[:, None, :])
+    np.add.at(pulled, pose, by_pose * miss[:, None])
+    yaw, place = noise
+    return _Sums(shared, pulled, float(miss @ miss), len(miss), np.array([yaw, place, place]), settings.noise.prior)
+
+
+def _most_likely(sums: _Sums) -> Floats:
+    """Return the factors (3,) on the noise of rays, headings and places with the least cost.
+
+    The last two are 1 unless larger ones cost significantly less."""
+    usual, cost_usual = _searched(sums, np.array([True, False, False]), np.zeros(3))
+    found, cost = _searched(sums, np.ones(3, dtype=bool), usual)
+    return np.exp(found if cost < cost_usual - _SIGNIFICANT else usual)
+
+
+def _searched(sums: _Sums, free: Bools, start: Floats) -> tuple[Floats, float]:
+    """Return the logarithms (3,) of factors with the least cost, and this cost: steps along the axes, then smaller ones.
+
+    free: (3,) which factors change. start: (3,) logarithms."""
+    best, cost = start, sums.cost(start)
+    moves = np.concatenate([np.eye(3), -np.eye(3)])[np.tile(free, 2)]
+    for step in _STEPS:
+        moved = True
+        while moved:
+            moved = False
+            for move in moves:
+                other = np.clip(best + step * move, *_BOUNDS)
+                if (tried := sums.cost(other)) < cost - 1e-9:
+                    best, cost, moved = other, tried, True
+    return best, cost

@@ -1,0 +1,59 @@
+"""A second thing of a label with a tenth of its boxes: the verdict names the label, and false boxes do not raise it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from doubtful_drives import LEAN, mapped
+
+from objslam.config import Settings
+from objslam.core.result import RunResult
+from objslam.core.types import Log
+from objslam.simulation import preset, simulate
+
+BY_LABEL = LEAN.model_copy(update={"association": LEAN.association.model_copy(update={"method": "by_label"})})
+
+
+def mugs(*, absolute: bool, scattered: bool = False, share: float = 0.12, false: float = 0.0) -> Log:
+    """A drive with 12 things, of which two are mugs. The second has a share of the boxes of mugs, in the images that are
+    drawn at random. scattered: its boxes lie anywhere in these images."""
+    poses = {"odometry": None} if absolute else {"localization": None}
+    log = simulate(preset("demo", objects=12, classes=12, tracks="perfect", false=false, **poses), 1)
+    (camera,), rng = log.cameras, np.random.default_rng(1)
+    found = camera.detections
+    number = np.bincount(found.track_ids[found.track_ids >= 0], minlength=12)
+    first, second = np.argsort(-number)[:2]
+    theirs = np.flatnonzero(found.track_ids == second)
+    kept = rng.choice(theirs, round(share * number[first] / (1 - share)), replace=False)
+    mug = found.label[found.track_ids == first][0]
+    label, boxes = np.where(found.track_ids == second, mug, found.label), found.boxes.copy()
+    if scattered:
+        size = boxes[kept, 2:] - boxes[kept, :2]
+        corner = rng.random(size.shape) * (camera.camera.size - 1 - size)
+        boxes[kept] = np.hstack([corner, corner + size])
+    names = tuple("mug" if i == mug else name for i, name in enumerate(found.label_names))
+    changed = replace(found, label=label, boxes=boxes, label_names=names, track_ids=np.full(len(label), -1))
+    left = np.ones(len(label), dtype=bool)
+    left[np.setdiff1d(theirs, kept)] = False
+    return replace(log, cameras=(replace(camera, detections=changed.take(left)),))
+
+
+def lost(result: RunResult) -> list[str]:
+    return [reason for reason in result.summary["assessment"]["reasons"] if "fit no object, but meet in one place" in reason]
+
+
+@pytest.mark.parametrize(("absolute", "settings"), [(False, LEAN), (True, LEAN), (True, BY_LABEL)])
+def test_a_second_thing_of_a_label_is_in_the_map_or_in_the_verdict(absolute: bool, settings: Settings) -> None:
+    result = mapped(mugs(absolute=absolute), settings)
+    if sum(item.label == "mug" for item in result.map.resolved()) < 2:
+        (reason,) = lost(result)
+        assert "boxes of 'mug'" in reason
+        assert result.summary["assessment"]["level"] == "check"
+
+
+@pytest.mark.parametrize(("absolute", "settings"), [(False, LEAN), (True, BY_LABEL)])
+def test_boxes_that_scatter_are_no_second_thing(absolute: bool, settings: Settings) -> None:
+    assert lost(mapped(mugs(absolute=absolute, scattered=True), settings)) == []
+    assert lost(mapped(mugs(absolute=absolute, share=0.0, false=0.1), settings)) == []
