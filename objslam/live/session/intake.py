@@ -116,9 +116,8 @@ class Intake:
         with self._lock:
             if not checks.is_camera_name(camera) or camera not in self._cameras:
                 return self._refuse("mount of an unknown camera", checks.told(camera))
-            checked = _Checked(
-                partial(self._take_mount, given, camera, pose), "mount", f"camera {camera}, stamp {given:.3f}"
-            )
+            where = f"camera {camera}, stamp {given:.3f}"
+            checked = _Checked(partial(self._take_mount, given, camera, pose), "mount", where)
             return self._take(f"mounts of {camera}", given, checked)
 
     def push_detections(
