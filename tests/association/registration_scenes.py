@@ -51,6 +51,13 @@ def twins(rng, count, labels, overlap, changed=0.2):
     return a, b, b_T_a, np.column_stack([np.cumsum(in_a)[both] - 1, np.cumsum(in_b)[both] - 1])
 
 
+def rooms(rng):
+    """One room of twelve objects, and three rooms just like it in a row."""
+    points, labels = place(rng, 12, 4, density=0.6)
+    three = np.concatenate([points + np.array([8.0 * k, 0, 0]) for k in range(3)])
+    return points, labels, three + rng.normal(0, SIGMA, three.shape), np.tile(labels, 3)
+
+
 def errors(found, truth, points):
     """How far b_T_a is off at the middle of points (N, 3), m, and in yaw, rad."""
     middle = points.mean(axis=0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from association.registration_scenes import SIGMA, errors, of, place, twins
+from association.registration_scenes import SIGMA, errors, of, place, rooms, twins
 
 from objslam.association.registration.map_registration import register_maps
 from objslam.core.geometry import align
@@ -33,13 +33,6 @@ def test_maps_of_different_places_are_refused():
     for _ in range(20):
         a, b = of(*place(rng, int(rng.integers(10, 80)), 3)), of(*place(rng, int(rng.integers(10, 80)), 3))
         assert not register_maps(a, b).accepted
-
-
-def rooms(rng):
-    """One room of twelve objects, and three rooms just like it in a row."""
-    points, labels = place(rng, 12, 4, density=0.6)
-    three = np.concatenate([points + np.array([8.0 * k, 0, 0]) for k in range(3)])
-    return points, labels, three + rng.normal(0, SIGMA, three.shape), np.tile(labels, 3)
 
 
 @pytest.mark.parametrize("seed", range(3))

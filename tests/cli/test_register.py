@@ -55,7 +55,7 @@ def test_a_run_says_by_its_exit_code_whether_it_was_found_in_a_map(tmp_path, mon
     second = simulate(preset("demo", frames=200, objects=0, placed=objects, path=(3, 2)), 102)
     write_log_folder(replace(first, truth=None), tmp_path / "first")
     write_log_folder(moved_log(second, lift_se2(np.array([3.0, -2.0, 1.0]))), tmp_path / "second")
-    (tmp_path / "empty.json").write_text('{"format": "objslam.objects/1", "frame": "map", "objects": []}')
+    write_log_folder(simulate(preset("demo", frames=200), 5), tmp_path / "elsewhere")  # Objects of the same labels.
     quick = ["--set", "output.recording=false", "--set", "output.picture=false"]
 
     def objslam(*arguments):
@@ -65,8 +65,9 @@ def test_a_run_says_by_its_exit_code_whether_it_was_found_in_a_map(tmp_path, mon
         return ended.value.code, capsys.readouterr().out
 
     assert objslam("run", tmp_path / "first", "-o", tmp_path / "map", *quick)[0] == 0
-    before = (tmp_path / "map" / "objects.json").read_bytes()
-    for known, code, words in ((tmp_path / "map", 0, "localised in"), (tmp_path / "empty.json", 3, "not localised in")):
+    assert objslam("run", tmp_path / "elsewhere", "-o", tmp_path / "other", *quick)[0] == 0
+    for known, code, words in ((tmp_path / "map", 0, "localised in"), (tmp_path / "other", 3, "not localised in")):
+        before = (known / "objects.json").read_bytes()
         out = tmp_path / f"out{code}"
         ended, said = objslam("run", tmp_path / "second", "-o", out, "--map", known, *quick)
         assert ended == code
@@ -76,5 +77,5 @@ def test_a_run_says_by_its_exit_code_whether_it_was_found_in_a_map(tmp_path, mon
         assert told["line"] in said
         assert objslam("report", out)[0] == 0
         assert words in (out / "report.html").read_text().lower()
-    assert (tmp_path / "map" / "objects.json").read_bytes() == before
+        assert (known / "objects.json").read_bytes() == before
     assert ObjectMap.load(tmp_path / "out0").by_id(0).label == ObjectMap.load(tmp_path / "map").by_id(0).label

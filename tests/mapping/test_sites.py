@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping.site_days import DAY, Day, Place, session
+from mapping.site_days import DAY, Day, Place, month, session, there
 from scipy.optimize import least_squares
 
 from objslam.association.registration.object_maps import register
@@ -15,40 +15,13 @@ from objslam.mapping.sites.compare import compare
 from objslam.mapping.sites.merge import merge_sessions
 
 
-def there(objects, at, within=0.25):
-    """The object of a map at a place, None if there is none."""
-    distance = np.linalg.norm(objects.positions - at, axis=1)
-    return objects[int(distance.argmin())] if distance.min() < within else None
-
-
 def test_thirty_days_of_changes():
     """A tenth of the objects moves, comes or goes each week. Two visits later the map knows it, and no phantom is left."""
-    place, site, since = Place(np.random.default_rng(0)), None, {}
-    right, errors, phantoms = [], [], []
-    for day in range(30):
-        if day and day % 7 == 0:
-            place.change(0.1, day)
-            since |= {k: day for k in place.truth if k not in since and day}
-        today, _ = session(place, day)
-        (island,) = merge_sessions([today] if site is None else [site, today])
-        site = Day("site", island.objects)
-        known = [(k, there(site.objects, at)) for k, (_, at) in place.truth.items()]
-        right += [o is not None for k, o in known if day > since.get(k, 0)]
-        standing = np.array([at for _, at in place.truth.values()])
-        for when, _, at in place.past.values():
-            if day > when and np.linalg.norm(standing - at, axis=1).min() > 0.5:
-                right.append(there(site.objects, at) is None)
-        errors.append([np.linalg.norm(o.position - place.truth[k][1]) for k, o in known if o is not None])
-        real = {o.id for _, o in known if o is not None}
-        phantoms += [
-            o for o in site.objects if o.id not in real and o.life.sessions_seen == 1 < o.life.sessions_expected - 1
-        ]
-    assert np.mean(right) >= 0.95
-    assert not phantoms  # Nothing that one session saw and two missed is left.
-    first, last = (np.sqrt(np.mean(np.concatenate(part) ** 2)) for part in (errors[:7], errors[-7:]))
-    assert last <= first
-    confirmed = [o.life.state == "confirmed" for o in site.objects if o.life.sessions_seen > 3]
-    assert np.mean(confirmed) >= 0.9
+    found = month(0)
+    assert found.right.mean() >= 0.95
+    assert found.phantoms == 0  # Nothing that one session saw and two missed is left.
+    assert np.square(found.last_week).mean() <= np.square(found.first_week).mean()
+    assert found.confirmed.mean() >= 0.9
 
 
 def quiet(place, day):
