@@ -45,6 +45,13 @@ def test_a_task_beyond_its_limits_is_ended(worker):
         worker.call(WORK + "hang", None, Limits(seconds=0.2))
 
 
+def test_a_closed_worker_leaves_no_process_behind(worker):
+    idle, _ = worker.call(WORK + "process", 1, Limits())
+    worker.close()
+    with pytest.raises(ProcessLookupError):
+        works.os.kill(idle, 0)
+
+
 def test_an_engine_yields_every_answer_and_names_each_failure():
     engine = local_engine(2, Limits(memory=10**9, retries=0))
     answers = list(engine(WORK + "fill", [10, 3 * 10**9, 20, 30]))

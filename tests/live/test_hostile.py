@@ -128,6 +128,7 @@ class Discovery:
                 type_name=dds_type(type_),
                 qos=Qos(),
                 type_id=None,
+                participant_key=None,
                 sample_info=SimpleNamespace(**vars(info), instance_handle=handle),
             )
             for handle, (topic, type_) in enumerate(offered)
@@ -144,7 +145,8 @@ def test_topics_without_end_cost_a_bounded_memory():
     same = [(f"/odom{i}", ODOMETRY) for i in range(5_000)]
     tags = [(f"/tags{i}", f"apriltag{i}/msg/TagArray") for i in range(5_000)]
     messages = RosMessages(Recorder())
-    adapter, found = DdsAdapter(None, messages, TopicChoice(messages.chosen)), Discovery(odometry + other + same + tags)
+    network = SimpleNamespace(participant=SimpleNamespace(guid="this session"))
+    adapter, found = DdsAdapter(network, messages, TopicChoice(messages.chosen)), Discovery(odometry + other + same + tags)
     rounds = 0
     while found.samples:
         adapter._look_around(found)

@@ -82,8 +82,10 @@ class Worker:
     def close(self) -> None:
         """End the process, whatever it does, and start no other one. Any thread may call this."""
         self._closed = True
-        if self._process is not None:
-            self._process.kill()
+        process = self._process  # Its own thread may forget it meanwhile.
+        if process is not None:
+            process.kill()
+            process.wait()  # An idle process has no task whose thread would wait for its end.
 
     def _end(self) -> None:
         """End the process. The next task starts another one."""

@@ -25,9 +25,12 @@ _BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])
 below the settings: a few frames with small errors do not promise the same of the others."""
 _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
 """The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
-_SIGNIFICANT = 13.816
-"""The least fall of -2 ln of the posterior density below that of poses as the settings say: chi-squared of 2 degrees of
-freedom at 99.9 %. With a larger value, the settings stay for longer logs."""
+_CHANCE = 1e-3
+"""The chance that a log whose poses have the noise of the settings shows more. With a larger value, shorter logs may show
+more, and more logs do so by chance."""
+_SIGNIFICANT = -2 * np.log(_CHANCE)
+"""The least fall of -2 ln of the posterior density with the two noises of poses free: the quantile of chi-squared with 2
+degrees of freedom that is exceeded by `_CHANCE`."""
 _STRAY = 3.0
 """The deviation of a stray ray, in standard deviations of all noise together. A larger number lets false boxes raise the
 noise, a smaller one lowers the noise of true boxes: by 1.3 % at 3."""
