@@ -39,7 +39,8 @@ object for each label does not count. A larger factor favours one object for eac
 
 
 CLEAR_ODDS = 7.0
-"""The log of the odds above which the evidence is clear: 1000 to 1. With a larger value, more maps need a look."""
+"""The log of the odds above which the evidence is clear: 1000 to 1. Bent paths of simulated drives had 107 and more. With a
+larger value, more maps need a look."""
 
 
 def doubted_names(state: JointState | Solution) -> tuple[str, ...]:
@@ -50,11 +51,17 @@ def doubted_names(state: JointState | Solution) -> tuple[str, ...]:
     return tuple(state.rays.label_names[i] for i in doubted.tolist())
 
 
-def same_counts(one: JointState, other: JointState) -> bool:
-    """Return whether two maps have the same number of objects for each label."""
+def has_several(state: JointState) -> bool:
+    """Return whether a label has several objects in a map."""
+    assert state.association is not None
+    return len(np.unique(state.association.label)) < state.association.count
+
+
+def has_labels_of(one: JointState, other: JointState) -> bool:
+    """Return whether a map has an object for each label that has one in another map."""
     assert one.association is not None
     assert other.association is not None
-    return np.array_equal(np.sort(one.association.label), np.sort(other.association.label))
+    return bool(np.isin(other.association.label, one.association.label).all())
 
 
 def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, estimate: Estimate) -> Ints:

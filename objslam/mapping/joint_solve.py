@@ -13,7 +13,7 @@ from objslam.core.geometry import inverse
 from objslam.core.noise import NoiseFactors
 from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.mapping.doubted_labels import CLEAR_ODDS, doubted_names, evidence_against, same_counts
+from objslam.mapping.doubted_labels import CLEAR_ODDS, doubted_names, evidence_against, has_labels_of, has_several
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.labels import (
     angles_to_objects,
@@ -58,16 +58,21 @@ def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
 
 
 def _with_several_a_label(state: JointState, named: JointState) -> JointState:
-    """Return the state with several objects a label if there is more evidence for it, else the state `named`, which has one
-    object for each label. state: before the solve by labels."""
+    """Return the state with several objects a label if there is clear evidence for it, else the state `named`, which has one
+    object for each label. state: before the solve by labels.
+
+    A short drive may show too little for an exploration, which then finds fewer objects than there are labels, or parts of
+    one object. So labels count as names unless the other map has objects for all of them, and is far more likely.
+    """
     doubted = doubted_names(named)
     try:
         other = _associated(state.attempt(), None)
     except SolveError:
         return replace(named, doubted=doubted)
-    odds = evidence_against(named, other)
-    found = named.replaced(other) if odds > 0 else named
-    return replace(found, doubted=doubted) if abs(odds) < CLEAR_ODDS and not same_counts(named, other) else found
+    odds = evidence_against(named, other) if has_several(other) else -np.inf
+    if odds > CLEAR_ODDS and has_labels_of(other, named):
+        return named.replaced(other)
+    return replace(named, doubted=doubted) if odds > -CLEAR_ODDS else named
 
 
 def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
