@@ -13,7 +13,14 @@ from objslam.core.geometry import inverse
 from objslam.core.noise import NoiseFactors
 from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.mapping.doubted_labels import CLEAR_ODDS, doubted_names, evidence_against, has_labels_of, has_several
+from objslam.mapping.doubted_labels import (
+    CLEAR_ODDS,
+    doubted_names,
+    evidence_against,
+    has_labels_of,
+    has_several,
+    needs_noisy_boxes,
+)
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.labels import (
     angles_to_objects,
@@ -72,7 +79,8 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
     odds = evidence_against(named, other) if has_several(other) else -np.inf
     if odds > CLEAR_ODDS and has_labels_of(other, named):
         return named.replaced(other)
-    return replace(named, doubted=doubted) if odds > -CLEAR_ODDS else named
+    unclear = odds > -CLEAR_ODDS or (has_several(other) and needs_noisy_boxes(named, other))
+    return replace(named, doubted=doubted) if unclear else named
 
 
 def _associated(state: JointState, start: InitialEstimate | None) -> JointState:

@@ -1,20 +1,23 @@
 """Whether a label names one thing, on drives with a turn on the spot, where a bent path brings two things to one place."""
 
 from collections import Counter
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from objslam.association.nearest_neighbour import associate_by_label
 from objslam.config import load_settings
 from objslam.core.camera import project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
+from objslam.core.noise import NoiseFactors
 from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays, Trajectory, Truth, TruthObject
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import pipeline
-from objslam.mapping.doubted_labels import unchecked_labels
+from objslam.mapping.doubted_labels import doubted_labels, unchecked_labels
 from objslam.simulation import make_camera
 
 LAMP = ("lamp", 1.2, 3.5, 1.2)
@@ -93,3 +96,18 @@ def test_labels_that_others_see_on_both_sides_are_checked():
     witnesses = [np.ptp(keyframes.stamps[rays.keyframe[rays.label == i]]) for i in range(5)]
     assert min(witnesses) > 1.0
     assert 0 not in unchecked_labels(rays, keyframes)
+
+
+def test_noisy_boxes_and_noisy_odometry_together_doubt_labels_that_check_one_another():
+    """If several labels have two things each, each is seen on both sides of a moment, and checks the others in vain."""
+    beside = [(name, 4.2 + 0.2 * i, 1.0 + 0.5 * i, 0.7) for i, name in enumerate(ALL_NAMED)]
+    rays, keyframes = measured(turning_drive((FIRST, *beside)))
+    association = associate_by_label(rays)
+
+    def doubted(**noise):
+        estimate = SimpleNamespace(noise=NoiseFactors(**noise), weight=np.ones(len(rays)))
+        return doubted_labels(rays, association, keyframes, estimate).tolist()
+
+    assert 0 not in doubted(turning=4.0)
+    assert doubted(rays=4.0) == []
+    assert doubted(turning=4.0, rays=4.0) == [0, 1, 2, 3, 4]
