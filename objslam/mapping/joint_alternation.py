@@ -30,8 +30,8 @@ _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve, and on a path from a grid. A larger factor tolerates
 larger residuals."""
 _STILL = 0.01
-"""The rounds along the most likely path end if at most this share of the rays changes its object. A larger share ends them
-sooner. A few rays change in each round, because the path has the steps of a grid."""
+"""The rounds along the most likely path stop when at most this share of the rays changes its object. A larger share stops
+them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
 _WORSE = 2
 """The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
 takes longer, and continues after more rounds in which close objects merged."""

@@ -91,7 +91,7 @@ def learn_ratio(boxes: Boxes, frame: Ints, track: Ints, owner: Ints, labels: int
 
 
 def _followers(boxes: Boxes, frame: Ints, group: Ints) -> tuple[Ints, Ints]:
-    """Return the pairs (P,) of boxes with vectors that follow each other in a group, and have one label."""
+    """Return the pairs (P,) of consecutive boxes of a group that have the same label. Only boxes with a vector count."""
     feature, _ = _vectors(boxes)
     some = np.flatnonzero((group >= 0) & (feature >= 0))
     some = some[np.lexsort((frame[some], group[some]))]

@@ -21,8 +21,8 @@ _CONVERGED = 0.01
 _CAUCHY = 3.0
 """The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
 _STRETCHES = 50
-"""The number of stretches of the drive that count as independent. With fewer and longer stretches, errors that last longer
-are found, but their size is less exact."""
+"""The number of stretches of the drive that count as independent. Fewer and longer stretches also show errors that are
+correlated over a longer time, but the size of these errors is less exact then."""
 _FREE = 1e-6
 """The information (m^-2) added to each object, so that an object without rays is determined too. A larger value moves other
 objects."""

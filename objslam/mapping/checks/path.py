@@ -33,7 +33,8 @@ _FEWEST_STEPS = 20
 _STILL = 1e-4
 """The distance (m) and turn (rad) between two poses below which the robot stands still."""
 _FROZEN_SECONDS = 8.0
-"""The shortest time (s) without motion that may be a frozen path. While a robot really stands, its boxes stand too."""
+"""The shortest time (s) without motion that may be a frozen path. If a robot really stands
+still, its boxes do not move in the image either. A larger value finds fewer frozen paths."""
 _MOVING_PX = 12.0
 """The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves."""
 _LEAST_STEP = 0.01

@@ -17,8 +17,8 @@ _MOST = np.sqrt(2.0)
 """A run warns if the residuals exceed this multiple of the noise in the settings. From this value on, at least half of their
 variance has a cause that the settings do not contain. A larger value warns less often."""
 _SIGMAS = 3.0
-"""The least excess of the multiple over `_MOST`, in standard deviations of the multiple. A larger number warns only for
-longer logs."""
+"""A run warns if the multiple of the noise exceeds `_MOST` by at least this many standard deviations of the multiple. With a
+larger number, a log must be longer before it can cause a warning."""
 _MEDIAN_SIGMA = 0.72
 """The standard deviation of the multiple from one ray: 1 / (2 p(m) m) for the density p of a Rayleigh distribution at its
 median m. From n independent rays, it is smaller by the root of n."""

@@ -61,7 +61,7 @@ def with_doubts(result: RunResult) -> RunResult:
 
 
 def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -> dict[str, Any]:
-    """Return the assessment of a map with more reasons to look at it: doubles first, and lost things last."""
+    """Return the assessment with more reasons for a look at the map: possible doubles come first, lost things last."""
     if assessment["level"] == "bad" or not (doubles or lost):
         return assessment
     others = assessment["reasons"][assessment["level"] == "good" :]  # The first reason of a good map praises it.

@@ -26,8 +26,8 @@ below the settings: a few frames with small errors do not promise the same of th
 _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
 """The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
 _CHANCE = 1e-3
-"""The chance that a log whose poses have the noise of the settings shows more. With a larger value, shorter logs may show
-more, and more logs do so by chance."""
+"""The chance of a false alarm: that poses which are as good as the settings say are found noisier. With a larger value,
+shorter logs can show noisy poses, and more good logs seem to."""
 _SIGNIFICANT = -2 * np.log(_CHANCE)
 """The least fall of -2 ln of the posterior density with the two noises of poses free: the quantile of chi-squared with 2
 degrees of freedom that is exceeded by `_CHANCE`."""
