@@ -74,9 +74,9 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
     doubted = doubted_names(named)
     try:
         other = _associated(state.attempt(), None)
-    except SolveError:
+        odds = evidence_against(named, other) if has_several(other) else -np.inf
+    except SolveError:  # The map by labels is there, whatever is wrong with the other one.
         return replace(named, doubted=doubted)
-    odds = evidence_against(named, other) if has_several(other) else -np.inf
     if odds > CLEAR_ODDS and has_labels_of(other, named):
         return named.replaced(other)
     unclear = odds > -CLEAR_ODDS or (has_several(other) and needs_noisy_boxes(named, other))

@@ -13,10 +13,11 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.noise import NoiseFactors
 from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays, Trajectory, Truth, TruthObject
+from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.mapping import pipeline
+from objslam.mapping import joint_solve, pipeline
 from objslam.mapping.doubted_labels import doubted_labels, unchecked_labels
 from objslam.simulation import make_camera
 
@@ -111,3 +112,13 @@ def test_noisy_boxes_and_noisy_odometry_together_doubt_labels_that_check_one_ano
     assert 0 not in doubted(turning=4.0)
     assert doubted(rays=4.0) == []
     assert doubted(turning=4.0, rays=4.0) == [0, 1, 2, 3, 4]
+
+
+def test_a_comparison_that_fails_keeps_the_map_by_labels_and_says_so(monkeypatch):
+    def fail(named, other):
+        raise SolveError("the linear system has no single solution")
+
+    monkeypatch.setattr(joint_solve, "evidence_against", fail)
+    result = pipeline.run(turning_drive((FIRST, SECOND, LAMP)), load_settings(None, ("output.recording=false",)), Ledger())
+    assert len(result.map) > 0
+    assert "mug" in result.summary["doubted_labels"]
