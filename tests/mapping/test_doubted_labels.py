@@ -18,6 +18,8 @@ from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import joint_solve, pipeline
+from objslam.mapping.checks.agreement import agreement, bounded_part
+from objslam.mapping.checks.diagnosis import diagnose
 from objslam.mapping.doubted_labels import doubted_labels, unchecked_labels
 from objslam.simulation import make_camera
 
@@ -122,3 +124,14 @@ def test_a_comparison_that_fails_keeps_the_map_by_labels_and_says_so(monkeypatch
     result = pipeline.run(turning_drive((FIRST, SECOND, LAMP)), load_settings(None, ("output.recording=false",)), Ledger())
     assert len(result.map) > 0
     assert "mug" in result.summary["doubted_labels"]
+
+
+def test_boxes_that_show_a_thing_from_one_direction_are_no_fault():
+    """In the window of the quick check, the robot turns to the bin and drives towards it. Its rays do not cross yet."""
+    log = turning_drive((FIRST, LAMP, ("bin", 1.1, 7.0, 0.9)))
+    settings = load_settings(None, ("mode=joint",))
+    part = bounded_part(log, settings)
+    found = agreement(part, part.log, settings)
+    assert found.share < 0.75
+    assert found.narrow.sum() > 40
+    assert diagnose(log, settings, Ledger(), thorough=True).findings == ()

@@ -28,7 +28,8 @@ def test_each_object_of_each_label_gets_a_point_and_its_rays(offset):
     directions[false] = rays_to(points, owner[false], rng, noise=3.0)[1]
     order = rng.permutation(len(label))
     origins, directions, label, owner, false = (a[order] for a in (origins + offset, directions, label, owner, false))
-    found, where, fit = fit_points(origins, directions, np.full(len(label), 0.02), 0.05, label, 0)
+    met = fit_points(origins, directions, np.full(len(label), 0.02), 0.05, label, 0)
+    found, where, fit = met.point, met.points, met.fit
     for number, truth in enumerate(points + offset):
         mine = (owner == number) & ~false
         nearest = int(np.linalg.norm(where - truth, axis=1).argmin())
@@ -50,12 +51,12 @@ def test_other_labels_do_not_change_the_points_of_a_label():
     label = np.repeat(np.arange(40), rng.integers(4, 60, 40))
     origins, directions = rays_to(rng.uniform(-3, 3, (40, 3)), label, rng, noise=0.03)
     tolerance = np.full(len(label), 0.02)
-    together, _, fit = fit_points(origins, directions, tolerance, 0.05, label, 0)
+    together = fit_points(origins, directions, tolerance, 0.05, label, 0)
     for one in range(0, 40, 7):
         mine = label == one
-        alone, _, own = fit_points(origins[mine], directions[mine], tolerance[mine], 0.05, label[mine], 0)
-        np.testing.assert_array_equal(together[mine] >= 0, alone >= 0)
-        np.testing.assert_allclose(fit[mine], own, atol=1e-9)
+        alone = fit_points(origins[mine], directions[mine], tolerance[mine], 0.05, label[mine], 0)
+        np.testing.assert_array_equal(together.point[mine] >= 0, alone.point >= 0)
+        np.testing.assert_allclose(together.fit[mine], alone.fit, atol=1e-9)
 
 
 def test_rays_that_hardly_differ_have_no_point():
@@ -64,10 +65,11 @@ def test_rays_that_hardly_differ_have_no_point():
     origins = 0.001 * rng.normal(size=(50, 3))
     directions = np.array([1.0, 0.0, 0.0]) + 0.005 * rng.normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    found, where, fit = fit_points(origins, directions, np.full(50, 0.02), 0.05, np.zeros(50, dtype=int), 0)
-    assert (found == -1).all()
-    assert len(where) == 0
-    assert not fit.any()
+    met = fit_points(origins, directions, np.full(50, 0.02), 0.05, np.zeros(50, dtype=int), 0)
+    assert (met.point == -1).all()
+    assert len(met.points) == 0
+    assert met.narrow.all()
+    assert not met.fit.any()
 
 
 def test_the_nearest_point_is_that_of_least_squares():

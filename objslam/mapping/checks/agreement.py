@@ -41,7 +41,8 @@ class Agreement:
     that fits worse has less weight, and each point costs three boxes.
 
     boxes: the number of boxes, including boxes without a ray. keyframes, rays: the measurements. point: (R,) the index into
-    points of each ray, -1 for none. points: (N, 3) m. fit: (R,) how well each ray fits, 0 to 1.
+    points of each ray, -1 for none. points: (N, 3) m. fit: (R,) how well each ray fits, 0 to 1. narrow: (R,) whether a ray
+    neither fits nor misses, because the robot saw its thing from one direction only (`Meeting.narrow`).
     """
 
     share: float
@@ -52,6 +53,7 @@ class Agreement:
     point: Ints
     points: Floats
     fit: Floats
+    narrow: Bools
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Ite
         origins = np.concatenate([one.origins for one in known])
         directions = np.concatenate([one.directions for one in known])
         tolerance = _SIGMAS * np.hypot(np.concatenate([one.rays.sigma for one in known]), yaw)
-        point, points, gain = fit_points(origins, directions, tolerance, _SIGMAS * place, label, settings.seed)
+        met = fit_points(origins, directions, tolerance, _SIGMAS * place, label, settings.seed)
     total, first = max(part.boxes, 1), 0
     for one in logs:
         if one is None:
@@ -177,11 +179,13 @@ def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Ite
             continue
         mine = slice(first, first + len(one.rays))
         first = mine.stop
-        number, own = np.unique(point[mine], return_inverse=True)
+        number, own = np.unique(met.point[mine], return_inverse=True)
         number, own = number[number >= 0], own - (number < 0).any()
-        score = (gain[mine].sum() - _COST * len(number)) / total
+        fit = met.fit[mine]
+        score = (fit.sum() - _COST * len(number)) / total
         share = float((own >= 0).sum() / total)
-        yield Agreement(share, float(score), total, one.keyframes, one.rays, own, points[number], gain[mine])
+        of_log = total, one.keyframes, one.rays
+        yield Agreement(share, float(score), *of_log, own, met.points[number], fit, met.narrow[mine])
 
 
 def pose_noise(part: Part, settings: Settings) -> tuple[float, float]:

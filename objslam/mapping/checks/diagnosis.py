@@ -200,8 +200,7 @@ def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Find
     long = bool(min(late.sum(), (~late).sum()) >= _FEWEST)
 
     def differ(at: Agreement) -> Finding | None:
-        late = at.keyframes.stamps[at.rays.keyframe] > middle
-        return check_mixture(at, part) or (check_halves(late, at.point >= 0) if long else None)
+        return check_mixture(at, part) or _halves_differ(at, middle)
 
     one = differ(found)
     if one is not None and not part.drifts:
@@ -210,3 +209,11 @@ def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Find
     if one is not None:
         return [one]
     return check_moved_camera(part, middle, settings) if long else []
+
+
+def _halves_differ(found: Agreement, middle: float) -> Finding | None:
+    """Compare the halves before and after the time `middle` (s) by the rays that can fit or miss."""
+    late = (found.keyframes.stamps[found.rays.keyframe] > middle)[~found.narrow]
+    if min(late.sum(), (~late).sum()) < _FEWEST:
+        return None
+    return check_halves(late, found.point[~found.narrow] >= 0)

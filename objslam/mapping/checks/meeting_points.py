@@ -21,6 +21,9 @@ _FEWEST = 4
 """The fewest rays of a point. Fewer rays agree by chance."""
 _LEAST_ANGLE = np.radians(4.0)
 """The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
+_NARROW = 0.9
+"""The rays of a label that are left show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction.
+With a smaller share, false rays are excused too."""
 _NEAREST = 0.25
 """The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself."""
 _MOST_POINTS = 40
@@ -30,6 +33,20 @@ _REFITS = 2
 _TABLE = 1 << 17
 """The most pairs of a tried point and a ray in one table. A larger table needs fewer passes, but leaves the processor's
 cache."""
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """The points that R rays meet in. point: (R,) the index into points of each ray, -1 for none. points: (N, 3) m.
+
+    fit: (R,) how well each ray fits, from 1 on its point to 0 from its tolerance on, and without a point. narrow: (R,)
+    whether a ray has no point because the rays of its label are nearly parallel, so that they neither meet nor miss.
+    """
+
+    point: Ints
+    points: Floats
+    fit: Floats
+    narrow: Bools
 
 
 @dataclass(frozen=True)
@@ -80,18 +97,17 @@ class _Rows:
         return np.asarray(np.maximum(fit, 0.0, out=fit))
 
 
-def fit_points(
-    origins: Floats, directions: Floats, tolerance: Floats, place: float, label: Ints, seed: int
-) -> tuple[Ints, Floats, Floats]:
-    """Fit points to the rays of each label. Return each ray's point (R,), the points (N, 3), and each ray's fit (R,).
+def fit_points(origins: Floats, directions: Floats, tolerance: Floats, place: float, label: Ints, seed: int) -> Meeting:
+    """Fit points to the rays of each label.
 
-    A ray without a point has -1 and a fit of 0, a ray through its point has a fit of 1. tolerance: (R,) rad. place: m. A ray
-    fits up to its tolerance times the distance, plus place, added in quadrature. The labels do not affect each other.
+    tolerance: (R,) rad. place: m. A ray fits up to its tolerance times the distance, plus place, added in quadrature. The
+    labels do not affect each other.
     """
     rng = np.random.default_rng(seed)
     rays = (origins, directions, tolerance)
     owner = np.unique(label, return_inverse=True)[1]
     point, gain, points = np.full(len(label), -1), np.zeros(len(label)), [np.zeros((0, 3))]
+    narrow = np.zeros(len(label), dtype=bool)
     left = np.argsort(owner, kind="stable")
     for _ in range(_MOST_POINTS):  # Each round finds the best point of each label among the rays that are left.
         dice, again, found = rng.random((2, max(_PAIRS, _JUDGES))), [left[:0]], sum(map(len, points))
@@ -104,11 +120,12 @@ def fit_points(
             points.append((best + rows.middle)[good])
             found += int(good.sum())
             again.append(rows.number[rows.real & ~fits & good[:, None]])
+            narrow[rows.number[rows.real & (~good & _nearly_parallel(rows))[:, None]]] = True
         left = np.concatenate(again)
         if not len(left):
             break
         left = left[np.argsort(owner[left], kind="stable")]
-    return point, np.concatenate(points), gain
+    return Meeting(point, np.concatenate(points), gain, narrow)
 
 
 def nearest_point(origins: Floats, directions: Floats, start: Floats, used: Bools | None = None) -> Floats:
@@ -173,6 +190,14 @@ def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
         best, fit = np.where(better[:, None], moved, best), np.where(better[:, None], other, fit)
     good &= ((fit > 0).sum(axis=1) >= _FEWEST) & _seen_from_around(rows, best, fit > 0)
     return best, fit, good
+
+
+def _nearly_parallel(rows: _Rows) -> Bools:
+    """Return the labels (L,) whose rays are so close to parallel that no point of theirs can be told."""
+    mean = (rows.directions * rows.real[:, :, None]).sum(axis=1)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+    near = (np.einsum("lni,li->ln", rows.directions, mean) >= np.cos(_LEAST_ANGLE)) & rows.real
+    return np.asarray(near.sum(axis=1) >= _NARROW * rows.real.sum(axis=1))
 
 
 def _tried_points(rows: _Rows, size: Ints, dice: Floats) -> tuple[Floats, Bools]:

@@ -22,7 +22,8 @@ def check_mixture(found: Agreement, part: Part) -> Finding | None:
     """Return a finding if some frames belong to another recording. None for odometry, which drifts within windows."""
     if part.drifts:
         return None
-    return find_mixture(found.rays.keyframe, found.point >= 0)
+    judged = ~found.narrow
+    return find_mixture(found.rays.keyframe[judged], found.point[judged] >= 0)
 
 
 def find_mixture(frame: Ints, fits: Bools) -> Finding | None:
