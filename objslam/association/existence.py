@@ -9,7 +9,7 @@ from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
-from objslam.core.statistics import logistic, poisson_tail
+from objslam.core.statistics import grouped_quantiles, logistic, poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
@@ -23,6 +23,7 @@ _PHANTOM_LOG_RANGE = 4.6  # The width of the uniform ln size distribution of pha
 _MOST_ODDS = 20.0  # The largest absolute log odds against chance. This limit only keeps them finite.
 _REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
+_DRIFTED = 2.0  # An object may seem to move by this many standard deviations of the drift of the path. More drops fewer.
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
@@ -147,8 +148,9 @@ def rest_odds(state: State, fitted: int = 0) -> Floats:
 
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
     the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes,
-    which looks like motion. So only a few rays count, and motion within the object's size does not count. fitted: the number
-    of measured coordinates that a moving point explains even by chance. They matter if there are few rays.
+    which looks like motion. So only a few rays count, and motion within the object's size does not count, nor motion within
+    the drift of the path. fitted: the number of measured coordinates that a moving point explains even by chance. They
+    matter if there are few rays.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]
@@ -156,4 +158,22 @@ def rest_odds(state: State, fitted: int = 0) -> Floats:
     size = 2.0 * np.clip(state.ray_count, 1, _COUNTED_RAYS)  # Each ray measures two coordinates.
     left = np.clip(2.0 * state.ray_count - fitted, 0.0, size)
     odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * left * np.log(np.clip(1 - explained, 1e-6, 1.0))
-    return np.where(way > _WITHIN_SIZE * state.size, np.minimum(odds, 0.0), 0.0)
+    allowed = np.maximum(_WITHIN_SIZE * state.size, _DRIFTED * _drift_at(state))
+    return np.where(way > allowed, np.minimum(odds, 0.0), 0.0)
+
+
+def _drift_at(state: State) -> Floats:
+    """Return how far (N,) m, one standard deviation, the path drifts at each landmark from its first ray to its last.
+
+    The drift between two frames is a small rotation and shift (phi, rho) in map. It moves a point p by rho + phi x p.
+    """
+    drift = state.view.drift
+    if drift is None or not state.count:
+        return np.zeros(state.count)
+    ends = grouped_quantiles(state.obs.frame[state.assigned], state.owner, state.count, (0.0, 1.0))
+    first, last = (np.nan_to_num(frame).astype(np.int64) for frame in ends)
+    p = state.landmarks.position
+    turns = np.cross(np.eye(3), p[:, None])  # Row i is e_i x p, the way of p per angle about axis i.
+    moves = np.concatenate([turns, np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=1)
+    covariance = drift[last] - drift[first]
+    return np.sqrt(np.maximum(np.einsum("nai,nab,nbi->n", moves, covariance, moves), 0.0))

@@ -62,6 +62,7 @@ def associate_globally(
     position_sigma: float = 0.0,
     seed: int = 0,
     guess: tuple[Association, Floats] | None = None,
+    drifts: bool = False,
 ) -> Association:
     """Assign rays to objects at known camera poses.
 
@@ -74,9 +75,10 @@ def associate_globally(
         sigma: (R,) rad, the noise of the rays' angles, including the noise of the poses.
         position_sigma: m, the noise of the rays' origins.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
+        drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)

@@ -34,7 +34,7 @@ _FILLED = 0.6  # The share of a box's width and height that its object certainly
 class CameraFrames:
     """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
     (F, 4, 4). A box counts if it is at least `margin` px, and at least `margin_share` of its size, away from the image edge.
-    With a negative margin, each box counts."""
+    With a negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift."""
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -42,6 +42,7 @@ class CameraFrames:
     map_T_camera: Floats
     margin: float
     margin_share: float
+    drift: Floats | None = None
 
     @cached_property
     def solid_angle(self) -> float:
@@ -51,11 +52,21 @@ class CameraFrames:
 
 
 def frames_of(
-    keyframes: Keyframes, order: Ints, cameras: tuple[Camera, ...], map_T_camera: Floats, settings: Settings
+    keyframes: Keyframes,
+    order: Ints,
+    cameras: tuple[Camera, ...],
+    map_T_camera: Floats,
+    settings: Settings,
+    *,
+    drifts: bool = False,
 ) -> CameraFrames:
-    """Return keyframes in an order (K,) as observed frames. map_T_camera: (K, 4, 4) of the keyframes."""
+    """Return keyframes in an order (K,) as observed frames.
+
+    map_T_camera: (K, 4, 4) of the keyframes. drifts: whether these poses drift as the odometry does.
+    """
     poses, margins = map_T_camera[order], (settings.rays.border, settings.rays.border_share)
-    return CameraFrames(keyframes.stamps[order], cameras, keyframes.camera[order], poses, *margins)
+    drift = keyframes.drift[order] if drifts and keyframes.drift is not None else None
+    return CameraFrames(keyframes.stamps[order], cameras, keyframes.camera[order], poses, *margins, drift)
 
 
 @dataclass(frozen=True)

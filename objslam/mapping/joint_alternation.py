@@ -272,4 +272,6 @@ class JointState:
             position_sigma=scale * _SOLVED_XY,
             seed=self.settings.seed,
             guess=guess,
+            # Landmarks of a solve hold the path together. Before it, the odometry alone says how two sights of one lie.
+            drifts=rough and frames.odom_T_base is not None and not frames.localized_every,
         )

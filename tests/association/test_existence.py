@@ -221,8 +221,17 @@ def test_what_moves_is_told_from_what_rests():
     assert rest_odds(state)[0] > -1
     way = np.linspace(-0.3, 0.3, count)[obs.frame, None] * np.array([0.0, 0.0, 1.0])  # it is lifted
     turned = obs.direction + way / np.linalg.norm(scene_to(resting, obs), axis=1, keepdims=True)
-    moving = replace(obs, direction=turned / np.linalg.norm(turned, axis=1, keepdims=True))
-    assert rest_odds(replace(state, obs=moving))[0] < -5
+    moving = replace(state, obs=replace(obs, direction=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
+    assert rest_odds(moving)[0] < -5
+
+    def on_a_path_that_tilts(sigma):
+        drift = np.zeros((count, 6, 6))
+        drift[:, 1, 1] = 0.3 + sigma**2 * np.linspace(0, 1, count)
+        return rest_odds(replace(moving, view=replace(state.view, drift=drift)))[0]
+
+    # It is 2.04 m from the axis of the tilt, and lifted by 0.6 m, which is two standard deviations of a tilt of 0.147 rad.
+    assert on_a_path_that_tilts(0.155) == 0.0
+    assert on_a_path_that_tilts(0.135) < -5
 
 
 def scene_to(scene, obs):
