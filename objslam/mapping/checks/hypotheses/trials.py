@@ -74,7 +74,7 @@ def _unchanged(before: Agreement | None, log: Log) -> Trial:
     if before is None:
         return Trial(None, 0.0, 0.0, _straight(log))
     narrow = float(before.narrow.sum() / before.boxes)
-    return Trial(None, before.score + narrow, before.share + narrow, _straight(log))
+    return Trial(None, before.score + narrow, before.share, _straight(log))
 
 
 def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = "") -> Finding | None:
