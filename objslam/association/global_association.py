@@ -11,7 +11,7 @@ import numpy as np
 
 from objslam import config
 from objslam.association.appearance.evidence import learn_ratio
-from objslam.association.existence import chance_odds, existence
+from objslam.association.existence import chance_odds, existence, rest_odds
 from objslam.association.gating import alternate, explained, gate_limit, near, size_costs
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
@@ -33,6 +33,12 @@ _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames 
 _MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
 _ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
+_CLEAR_MOTION = 3.0
+"""The log odds of a moving point over one at rest above which points at rest are tried for its rays. With smaller odds, they
+are tried more often, which takes time."""
+_EXPLAINED = 0.9
+"""The share of the rays of moving points that points at rest must explain to replace them. With a smaller share, parts of
+the path of a moving thing become objects. With a larger one, wrong boxes keep things at rest from being found."""
 _COOLING = (20.0, 10.0, 5.0, 3.0, 2.0)
 """The factors on the noise of the rays while an association is annealed. A larger first factor lets the appearance move more
 rays, and more factors take longer. In simulated clusters, a first factor of 20 mends more exchanges than 10, and 10 more
@@ -87,16 +93,9 @@ def associate_globally(
         landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
         state = replace(state, landmarks=landmarks, matched=association.object[ray])
         state = _alternate(task, _learned(state.keep(_plausible(task, state))))
-    refuted = np.zeros(len(ray), dtype=bool)
-    for turn in range(_TURNS):
-        before = state.count
-        state = _alternate(task, _discover(task, state, turn, _PARALLAX), 2)
-        state = _merge_round(task, _learned(state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)))
-        kept = _drop(task, state, existence(state, task.gate))
-        refuted |= (state.matched >= 0) & (kept.matched < 0)
-        state = kept
-        if state.count <= before:
-            break
+    state, refuted, moving = _search(task, state, nothing)
+    if moving.count and keyframes.localized_every:  # At poses that drift, things at rest seem to move.
+        state, refuted = _at_rest(task, state, refuted, moving)
     state = _add_distant(task, state)
     for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
         merged = _merge_all(task, state)
@@ -140,9 +139,50 @@ def _annealed(task: _Task, state: State) -> State:
     return replace(begin.keep(~better[begin.label]).joined(now.keep(better[now.label])), ratio=now.ratio)
 
 
-def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
+def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bools, State]:
+    """Search for landmarks, and drop unlikely ones, until a search finds none. excluded: landmarks that are not found.
+
+    Also returns the rays (R,) that belonged to a dropped landmark, and the landmarks that seemed to move, with their rays.
+    """
+    refuted, moving = np.zeros(len(state.matched), dtype=bool), state.keep(np.zeros(state.count, dtype=bool))
+    for turn in range(_TURNS):
+        before = state.count
+        state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded), 2)
+        state = _merge_round(task, _learned(state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)))
+        likely = existence(state, task.gate)
+        moving = moving.joined(state.keep(_seems_to_move(task, state, likely)))
+        kept = _drop(task, state, likely)
+        refuted |= (state.matched >= 0) & (kept.matched < 0)
+        state = kept
+        if state.count <= before:
+            break
+    return state, refuted, moving
+
+
+def _seems_to_move(task: _Task, state: State, likely: Floats) -> Bools:
+    """Return which landmarks (N,) are unlikely to exist, and a moving point explains their rays clearly better."""
+    return (likely < task.settings.min_existence) & (rest_odds(state) < -_CLEAR_MOTION)
+
+
+def _at_rest(task: _Task, state: State, refuted: Bools, moving: State) -> tuple[State, Bools]:
+    """Replace landmarks that seem to move by several at rest, if these explain nearly all of their rays.
+
+    The rays to one thing may cross those to another thing of its label between the two. If they come at different times, a
+    point there seems to move from one thing to the other. It can have more rays than each of them, so that a search finds
+    it each time. Points at rest explain only parts of the path of a thing that really moves.
+    """
+    left = state.keep(~_seems_to_move(task, state, existence(state, task.gate)))
+    other, more, _ = _search(task, left, moving.landmarks)
+    label, labels = state.obs.label[moving.assigned], len(state.unassigned)
+    held = np.bincount(label[other.matched[moving.assigned] >= 0], minlength=labels)
+    better = held > _EXPLAINED * np.bincount(label, minlength=labels)
+    state = state.keep(~better[state.label]).joined(other.keep(better[other.label]))
+    return state, (refuted | more) & (state.matched < 0)
+
+
+def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: Landmarks | None = None) -> State:
     """Add landmarks where unassigned rays of one label agree. turn: the number of the search, which changes the random
-    pairs. parallax: as in `Search`."""
+    pairs. parallax: as in `Search`. excluded: landmarks that are not found."""
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
     for label in np.flatnonzero(state.unassigned).tolist():
         free = np.flatnonzero((obs.label == label) & (state.matched < 0))
@@ -160,7 +200,8 @@ def _discover(task: _Task, state: State, turn: int, parallax: float) -> State:
         # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
         chance = np.pi * task.gate * float((pool.sigma**2).sum()) / state.view.solid_angle
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
-        points = discover(pool, Search(task.settings.hypotheses, support, task.gate, parallax, task.device), rng)
+        search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device)
+        points = discover(pool, search, rng, None if excluded is None else excluded.position[excluded.accepts[:, label]])
         new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
         landmarks = landmarks.and_also(new)
     return replace(state, landmarks=landmarks)

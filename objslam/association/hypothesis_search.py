@@ -15,6 +15,9 @@ _REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. 
 _MIN_LEFT = 0.6
 """The share of its support that a point must keep without the rays of better points. With less, it is left to a later
 search. A larger share leaves more points."""
+_SAME = 0.6
+"""A point is the same as an excluded one if the rays that support both give it at least this share of its support. With a
+larger share, more points near an excluded one are found."""
 _SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision. Beyond it, millimetres would be lost.
 _RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
 _RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away. A larger value trusts ranges more.
@@ -35,20 +38,20 @@ class Search:
     device: str
 
 
-def discover(obs: Observations, search: Search, rng: np.random.Generator) -> Floats:
+def discover(obs: Observations, search: Search, rng: np.random.Generator, excluded: Floats | None = None) -> Floats:
     """Return the points (N, 3) m on which rays of one label agree. The point with the most support comes first.
 
     Each hypothesis is scored against all rays at once. In each frame only the best ray counts: 1 for a perfect fit, 0 at the
-    gate. The support of a point excludes the rays of better points.
+    gate. The support of a point excludes the rays of better points. excluded: (M, 3) m, points that are not found.
     """
     points = _propose(obs, search, rng)
     if len(points) == 0:
         return points
     with array_backend(search.device, len(points) * len(obs) >= _LARGE) as backend:
-        return _best(_Scorer(obs, search, backend), points, search)
+        return _best(_Scorer(obs, search, backend), points, search, np.zeros((0, 3)) if excluded is None else excluded)
 
 
-def _best(scorer: "_Scorer", points: Floats, search: Search) -> Floats:
+def _best(scorer: "_Scorer", points: Floats, search: Search, excluded: Floats) -> Floats:
     """Refine points (H, 3) m, and return the points (N, 3) m with enough support without the rays of better points."""
     moved = scorer.load(points)
     xp = module_of(moved)
@@ -56,6 +59,9 @@ def _best(scorer: "_Scorer", points: Floats, search: Search) -> Floats:
         moved = scorer.refine(moved, scorer.supports(moved))
     support = scorer.supports(moved)
     whole = scorer.per_frame(support)
+    for other in scorer.supports(scorer.load(excluded)):
+        same = scorer.per_frame(xp.minimum(support, other)) >= _SAME * whole
+        support[same], whole[same] = 0.0, 0.0
     left, found = 1 * whole, []
     for _ in range(len(moved)):
         best = int(xp.where(left >= _MIN_LEFT * whole, left, 0.0).argmax())

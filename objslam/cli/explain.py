@@ -23,6 +23,7 @@ _TITLES: dict[DoubtKind, str] = {
     "split": "objects that may be two",
     "unresolved": "objects without a position",
     "boxes": "boxes that became no object",
+    "label": "labels without an object",
 }
 
 

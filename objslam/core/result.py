@@ -14,8 +14,8 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.trace import Round
 from objslam.core.types import Association, Images, Keyframes, Rays, Trajectory
 
-DoubtKind = Literal["pair", "split", "unresolved", "boxes"]
-DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "unresolved", "boxes")
+DoubtKind = Literal["pair", "split", "unresolved", "boxes", "label"]
+DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "unresolved", "boxes", "label")
 """The kinds of doubts: two objects that may be one, an object that may be two, an object without a position, and boxes that
 became no object."""
 

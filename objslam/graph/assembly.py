@@ -11,7 +11,7 @@ from objslam.config import Loss, Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Rays
-from objslam.graph.factors.bearing import point_to_line_fixed
+from objslam.graph.factors.bearing import bearings_fixed, point_to_line_fixed
 from objslam.graph.factors.localization import localizations
 from objslam.graph.factors.noise import robust
 from objslam.graph.factors.odometry import betweens, motions
@@ -181,18 +181,33 @@ class Measurements:
 
 
 def fixed_pose_factors(
-    rays: Rays, origins: Floats, directions: Floats, landmark: Ints, across: Floats, loss: Loss
+    rays: Rays,
+    origins: Floats,
+    directions: Floats,
+    landmark: Ints,
+    distance: Floats,
+    noise: tuple[Floats, float],
+    loss: Loss,
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of rays at fixed poses: first the distance of each ray from its landmark, then the measured ranges.
+    """Return the factors of rays at fixed poses: first that of each ray and its landmark, then the measured ranges.
 
-    With the loss `l1`, this is Eq. 1 of Staszak & Belter, without noise and without ranges.
+    With the loss `l1`, this is Eq. 1 of Staszak & Belter: the distance of each ray from its landmark, without noise and
+    without ranges. Noise of the directions then draws a landmark towards the cameras, because it is nearer to noisy rays if
+    it is nearer to their origins. The other losses are on x / s, where x is the distance of a ray and s its standard
+    deviation. At distance d, s^2 = (angle d)^2 + place^2. Along the line of sight, x / s changes by d angle^2 / s^2 of
+    itself. So does the angle seen from place^2 / (angle^2 d) behind the origin, which is the residual here. Then neither
+    noise of directions nor noise of places moves a landmark to one side.
 
     Args:
         origins, directions: (n, 3), (n, 3) the rays in map.
-        landmark: (n,) the landmark of each ray.
-        across: (n,) m, the standard deviation across each ray, at the distance of its landmark.
+        landmark: (n,) the landmark of each ray. distance: (n,) m, about how far it is.
+        noise: the standard deviations of directions (n,), rad, and of origins, m.
     """
-    noise = robust(loss, np.ones(len(rays)) if loss == "l1" else across, 2)
-    at = np.flatnonzero(np.isfinite(rays.range) & (loss != "l1"))
+    if loss == "l1":
+        return point_to_line_fixed(origins, directions, landmark, robust(loss, np.ones(len(rays)), 2))
+    angle, place = noise
+    standoff = place**2 / (angle**2 * distance)
+    sigma = np.hypot(angle * distance, place) / (distance + standoff)
+    at = np.flatnonzero(np.isfinite(rays.range))
     along = along_ray(origins[at], directions[at], rays.range[at], rays.range_sigma[at], landmark[at])
-    return point_to_line_fixed(origins, directions, landmark, noise) + along
+    return bearings_fixed(origins, directions, standoff, landmark, robust(loss, sigma, 2)) + along

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from objslam.association.observations import MIN_DEPTH
 from objslam.config import Loss, Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, Calibration
@@ -55,29 +56,32 @@ def solve_fixed(
     settings: Settings,
     trace: Trace | None = None,
 ) -> Estimate:
-    """Solve the objects at fixed poses, starting from the triangulation, with one point-to-line factor for each inlier.
+    """Solve the objects at fixed poses, starting from the triangulation, with one factor for each inlier.
 
     The loss `l1` is Eq. 1. For this loss, the triangulation gives the covariances. It also gives the positions that Eq. 1
-    cannot give without ranges. The other losses weigh each ray by the noise across it at the object's distance, and add a
-    factor along the ray for a measured range. Objects that the triangulation did not resolve are left out.
+    cannot give without ranges. The other losses weigh the angle of each ray by its noise, and add a factor along the ray for
+    a measured range. Objects that the triangulation did not resolve are left out.
     """
     loss = settings.fixed.loss
     member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
     used = np.flatnonzero((start.weight > 0) & np.isin(association.object, np.flatnonzero(member)))
     landmark = association.object[used]
     origins, n = (a[used] for a in rays.in_map(keyframes.map_T_camera))
-    angle, place = pose_noise(rays, keyframes, settings)
-    across = np.hypot(angle[used] * np.linalg.norm(start.positions[landmark] - origins, axis=1), place)
-    some = rays.take(used)
-    graph, landmarks = build_graph(fixed_pose_factors(some, origins, n, landmark, across, loss)), np.unique(landmark)
+    some = share_bias(rays, association, settings).take(used)
+    angle, place = pose_noise(some, keyframes, settings)
+    distance = _distances(origins, start.positions[landmark])
+    factors = fixed_pose_factors(some, origins, n, landmark, distance, (angle, place), loss)
+    graph, landmarks = build_graph(factors), np.unique(landmark)
     values = make_values(np.zeros((0, 4, 4)), start.positions, landmarks)
     traced = trace_solve(trace, start.positions, landmarks, keyframes.map_T_camera)
     others = range(len(used), graph.size())
     optimum = optimize(graph, values, loss, settings, others, tolerance=1e-12, on_iteration=traced)
     positions = with_points(start.positions, landmarks, optimum.values)
-    distance = np.linalg.norm(np.cross(positions[landmark] - origins, n), axis=1)
+    distance = _distances(origins, positions[landmark])
+    across = np.hypot(angle * distance, place)
+    residual = angles_off(origins, n, positions[landmark]) * distance / across
     weight = start.weight.copy()
-    weight[used] = _weights(loss, distance / across, optimum)
+    weight[used] = _weights(loss, residual, optimum)
     covariance = start.covariance
     if loss != "l1":
         along = np.where(np.isfinite(some.range), some.range_sigma**-2, 0.0)
@@ -85,8 +89,7 @@ def solve_fixed(
         held = np.linalg.eigvalsh(information)[:, 0] > 0
         covariance = np.full((association.count, 3, 3), np.nan)
         covariance[held] = np.linalg.inv(information[held])
-        covariance *= widening(distance / across, landmark, association.count)[:, None, None]
-        covariance += _of_range_bias(covariance, n, along * np.nan_to_num(some.range_bias), landmark)
+        covariance *= widening(residual, landmark, association.count)[:, None, None]
     return Estimate(
         map_T_base=keyframes.map_T_base,
         positions=positions,
@@ -247,16 +250,9 @@ def solve_joint(
     return with_objects(estimate, measured.tags, rays, map_T_camera, optimum.values, covariances, wider, told, ledger)
 
 
-def _of_range_bias(covariance: Floats, directions: Floats, strength: Floats, landmark: Ints) -> Floats:
-    """Return the covariance (N, 3, 3) that the bias of ranges adds, if all ranges of an object share their bias.
-
-    directions: (r, 3) unit, in map. strength: (r,) m^-1, the information along each ray, times the standard deviation of the
-    bias of its range. landmark: (r,) the object of each ray.
-    """
-    pull = np.zeros(covariance.shape[:2])
-    np.add.at(pull, landmark, strength[:, None] * directions)
-    shift = (covariance @ pull[..., None])[..., 0]
-    return shift[:, :, None] * shift[:, None, :]
+def _distances(origins: Floats, points: Floats) -> Floats:
+    """Return the distances (R,) m of points (R, 3) from origins (R, 3), at least `MIN_DEPTH`."""
+    return np.maximum(np.linalg.norm(points - origins, axis=1), MIN_DEPTH)
 
 
 def share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:

@@ -76,6 +76,26 @@ def point_to_line_fixed(origins: Floats, directions: Floats, landmark: Ints, noi
     ]
 
 
+def bearings_fixed(
+    origins: Floats, directions: Floats, standoff: Floats, landmark: Ints, noise: Noise
+) -> list[gtsam.NonlinearFactor]:
+    """Return a factor for each ray on the angle (rad) between the ray and L(landmark), for fixed poses.
+
+    The angle is seen from a point behind the origin of the ray. Behind this point, the residual is larger and constant.
+
+    Args:
+        origins, directions: (R, 3) m, (R, 3) in map.
+        standoff: (R,) m, the distance of the point from the origin. 0 gives a bearing, a large distance gives Eq. 1 divided
+            by this distance.
+    """
+    make, camera = gtsam.TriangulationFactorCal3Fisheye, gtsam.PinholeCameraCal3Fisheye
+    n = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return [
+        make(camera(pose, _EQUIDISTANT), _CENTRE, model, L0 + j)
+        for pose, model, j in zip(_poses(origins - standoff[:, None] * n, n), noise, landmark.tolist(), strict=True)
+    ]
+
+
 def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
     """Return a camera for each ray, far behind its origin (R, 3) m, looking along its direction (R, 3).
 

@@ -12,6 +12,7 @@ from objslam.mapping.doubts.evidence import evidence_of
 from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
 from objslam.mapping.doubts.pairs import Pairs, find_pairs
 from objslam.mapping.doubts.splits import Splits, find_splits
+from objslam.mapping.doubts.unmapped import in_assessment, unmapped_labels
 from objslam.mapping.doubts.words import in_words
 
 _DOUBLE = 0.5
@@ -47,16 +48,18 @@ def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
     A map with objects that are more likely doubles than not is not called good. Neither is a map without an object where
-    many boxes of a label meet.
+    many boxes of a label meet. A label without an object is named, but its boxes may be false, so the level stays.
     """
     found = find_doubts(result)
-    doubts = in_words(result, found.pairs, found.splits, found.groups)
+    unmapped = unmapped_labels(result)
+    doubts = (*in_words(result, found.pairs, found.splits, found.groups), *unmapped)
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
     if "assessment" in summary:
         lost = _of_lost_things(found.groups, result)
-        summary["assessment"] = _assessed(summary["assessment"], _of_doubles(doubles), lost)
+        assessment = _assessed(summary["assessment"], _of_doubles(doubles), lost)
+        summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *in_assessment(unmapped)]}
     return replace(result, doubts=doubts, summary=summary)
 
 

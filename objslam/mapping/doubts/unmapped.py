@@ -1,0 +1,73 @@
+"""Labels that were seen, but have no object."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.core.arrays import Ints
+from objslam.core.geometry import widest_angle
+from objslam.core.result import Doubt, RunResult
+
+_FEWEST = 3
+"""The fewest frames with a label that is named. With a larger number, fewer labels of false boxes are named, but also fewer
+things that were seen only for a moment."""
+_NAMED = 3
+"""The most labels that the assessment names. A larger number makes it longer where a detector knows many labels."""
+
+
+def unmapped_labels(result: RunResult) -> list[Doubt]:
+    """Return a doubt for each label that was seen in `_FEWEST` frames, if none of its boxes belongs to an object.
+
+    Boxes that the image's edge cuts off count as seen. The label with the most boxes comes first.
+    """
+    rays, found = result.rays, result.association.object
+    labels = len(rays.label_names)
+    of_ray = result.keyframes.camera[rays.keyframe], result.keyframes.frame[rays.keyframe]
+    label, image = rays.label, np.stack(of_ray, axis=1)
+    cut = np.zeros(labels, dtype=np.int64)
+    if rays.cut is not None:
+        cut = np.bincount(rays.cut.label, minlength=labels)
+        label = np.append(label, rays.cut.label)
+        image = np.vstack([image, np.stack([rays.cut.camera, rays.cut.frame], axis=1)])
+    frames = np.bincount(np.unique(np.column_stack([label, image]), axis=0)[:, 0], minlength=labels)
+    mapped = np.bincount(rays.label[found >= 0], minlength=labels) > 0
+    lost = np.flatnonzero((frames >= _FEWEST) & ~mapped)
+    return [_doubt(result, i, int(frames[i]), int(cut[i])) for i in lost[np.argsort(-frames[lost], kind="stable")].tolist()]
+
+
+def in_assessment(doubts: list[Doubt]) -> list[str]:
+    """Return the sentences about the labels for the assessment."""
+    named, more = [one.text for one in doubts[:_NAMED]], len(doubts) - _NAMED
+    if more > 0:
+        named.append(f"{more} more label{'' if more == 1 else 's'} without an object: `objslam explain` names them.")
+    return named
+
+
+def _doubt(result: RunResult, label: int, frames: int, cut: int) -> Doubt:
+    mine = np.flatnonzero(result.rays.label == label)
+    name, parallax = result.rays.label_names[label], np.degrees(widest_angle(result.directions[mine])) if len(mine) else 0.0
+    reason, why = _why(result, mine, float(parallax), cut)
+    return Doubt(
+        "label",
+        reason,
+        name,
+        f"No object has the label {name!r}, which {frames} frames show: {why}.",
+        (),
+        None,
+        mine,
+        {"frames": frames, "boxes": len(mine), "boxes_cut_off": cut, "parallax_deg": float(parallax)},
+    )
+
+
+def _why(result: RunResult, mine: Ints, parallax: float, cut: int) -> tuple[str, str]:
+    """Return why the boxes `mine` (B,) of a label are no object: short, and as the end of a sentence. parallax: deg."""
+    settings, edge = result.settings, "the image's edge cuts off"
+    least = settings.association.min_rays
+    if not len(mine):
+        return "cut off", f"{edge} all of its {cut} boxes (rays.border, rays.border_share)"
+    if len(mine) < least:
+        also = f", and {edge} {cut} more" if cut else ""
+        return "few", f"{len(mine)} of its boxes can be used{also}, which is too few (association.min_rays {least})"
+    if parallax < settings.triangulation.min_parallax_deg:
+        return "no parallax", f"its {len(mine)} rays span {parallax:.1f} deg, too little to tell a distance"
+    return "nowhere", f"no thing at rest explains its {len(mine)} boxes"
