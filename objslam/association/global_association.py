@@ -19,7 +19,7 @@ from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
 from objslam.association.observations import observe
 from objslam.association.refinement import grouped_sums
-from objslam.association.visibility import CameraFrames, frames_of
+from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_quantile
@@ -37,9 +37,8 @@ _CLEAR_MOTION = 3.0
 """The log odds of a moving point over one at rest above which points at rest are tried for its rays. With smaller odds, they
 are tried more often, which takes time."""
 _EXPLAINED = 0.9
-"""The share of the rays of moving points that points at rest must explain to replace them, or leave to them. With a smaller
-share, parts of the path of a moving thing become objects. With a larger one, wrong boxes keep things at rest from being
-found."""
+"""The share of the rays of moving points that points at rest must explain to replace them. With a smaller share, parts of
+the path of a moving thing become objects. With a larger one, wrong boxes keep things at rest from being found."""
 _COOLING = (20.0, 10.0, 5.0, 3.0, 2.0)
 """The factors on the noise of the rays while an association is annealed. A larger first factor lets the appearance move more
 rays, and more factors take longer. In simulated clusters, a first factor of 20 mends more exchanges than 10, and 10 more
@@ -87,7 +86,7 @@ def associate_globally(
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
     view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
-    state = State(obs, replace(view, drift=None), nothing, np.full(len(ray), -1, dtype=np.int64))
+    state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
     if guess is not None:
         association, position = guess
@@ -97,7 +96,6 @@ def associate_globally(
     state, refuted, moving = _search(task, state, nothing)
     if moving.count and keyframes.localized_every:  # At poses that drift, things at rest seem to move.
         state, refuted = _at_rest(task, state, refuted, moving)
-    state = _within_drift(state, moving, view)
     state = _add_distant(task, state)
     for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
         merged = _merge_all(task, state)
@@ -180,18 +178,6 @@ def _at_rest(task: _Task, state: State, refuted: Bools, moving: State) -> tuple[
     better = held > _EXPLAINED * np.bincount(label, minlength=labels)
     state = state.keep(~better[state.label]).joined(other.keep(better[other.label]))
     return state, (refuted | more) & (state.matched < 0)
-
-
-def _within_drift(state: State, moving: State, view: CameraFrames) -> State:
-    """Return the state with those landmarks that seem to move, but only as far as the path drifts between their rays.
-
-    Where rays of several things cross by chance, a landmark seems to move too. So only landmarks count whose rays belong to
-    no landmark at rest. view: the frames with the drift of the path, if it drifts.
-    """
-    state, moving = replace(state, view=view), replace(moving, view=view)
-    free = np.bincount(moving.owner, state.matched[moving.assigned] < 0, moving.count)
-    rests = (free > _EXPLAINED * moving.ray_count) & (rest_odds(moving) > -_CLEAR_MOTION)
-    return state.joined(moving.keep(rests)) if rests.any() else state
 
 
 def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: Landmarks | None = None) -> State:
