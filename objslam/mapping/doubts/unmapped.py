@@ -67,7 +67,7 @@ def _why(result: RunResult, mine: Ints, parallax: float, cut: int) -> tuple[str,
         return "cut off", f"{edge} all of its {cut} boxes (rays.border, rays.border_share)"
     if len(mine) < least:
         also = f", and {edge} {cut} more" if cut else ""
-        return "few", f"{len(mine)} of its boxes can be used{also}, which is too few (association.min_rays {least})"
+        return "few", f"only {len(mine)} of its boxes can be used (association.min_rays {least}){also}"
     if parallax < settings.triangulation.min_parallax_deg:
         return "no parallax", f"its {len(mine)} rays span {parallax:.1f} deg, too little to tell a distance"
     return "nowhere", f"no thing at rest explains its {len(mine)} boxes"
