@@ -24,6 +24,8 @@ class Tags(Section):
 
     def scaled(self, ratio: float) -> Self:
         """Return the settings with all given sizes multiplied by a ratio."""
+        if ratio == 1:
+            return self
         size = None if self.size is None else self.size * ratio
         sizes = {key: None if side is None else side * ratio for key, side in self.sizes.items()}
         return self.model_copy(update={"size": size, "sizes": sizes})

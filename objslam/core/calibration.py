@@ -168,6 +168,10 @@ class CalibratedMeasurements(Protocol):
         """The rays as they were measured, with the nominal noise."""
 
     @property
+    def cameras(self) -> tuple[str, ...]:
+        """The names of the cameras, in the order of `Keyframes.camera`."""
+
+    @property
     def mean(self) -> Floats:
         """(P,) expected values of the parameters before the solve."""
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.rotation import (
+    cross,
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
@@ -94,8 +95,8 @@ def log_se3(pose: Floats) -> Floats:
     half = safe / 2
     share = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / safe**2)
     place = pose[..., :3, 3]
-    once = np.cross(omega, place)  # The inverse of the left Jacobian, times the place (Barfoot, eq. 8.35).
-    return np.concatenate([omega, place - once / 2 + share * np.cross(omega, once)], axis=-1)
+    once = cross(omega, place)  # The inverse of the left Jacobian, times the place (Barfoot, eq. 8.35).
+    return np.concatenate([omega, place - once / 2 + share * cross(omega, once)], axis=-1)
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
@@ -150,8 +151,8 @@ def exp_se3(twist: Floats) -> Floats:
     angle, small, safe = _angles(omega)
     a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    once = np.cross(omega, place)
-    return make_pose(rotation_from_vector(omega), place + a * once + b * np.cross(omega, once))
+    once = cross(omega, place)
+    return make_pose(rotation_from_vector(omega), place + a * once + b * cross(omega, once))
 
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:

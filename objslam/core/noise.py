@@ -34,6 +34,8 @@ class NoiseFactors:
     def settings(self, nominal: Settings) -> Settings:
         """Return the settings with the odometry noise multiplied by the factors. `rays_with_noise` multiplies the noise of
         rays and ranges."""
+        if self.along == self.across == self.turning == 1:
+            return nominal
         of = nominal.odometry
         odometry = {
             "x_per_m": of.x_per_m * self.along,
@@ -48,6 +50,8 @@ class NoiseFactors:
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
         """Return rays whose noise of directions and ranges is multiplied by the factors."""
+        if self.rays == self.ranges == self.range_bias == 1:
+            return nominal
         return replace(
             nominal,
             sigma=nominal.sigma * self.rays,

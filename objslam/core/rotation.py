@@ -28,6 +28,17 @@ def skew(v: Floats) -> Floats:
     return np.asarray(v @ _CROSS).reshape(*v.shape, 3)
 
 
+def cross(a: Floats, b: Floats) -> Floats:
+    """Return the cross products (..., 3) of vectors (..., 3).
+
+    `np.cross` returns the same numbers. For some hundred vectors it takes three times as long.
+    """
+    product = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.subtract(a[..., j] * b[..., k], a[..., k] * b[..., j], out=product[..., i])
+    return product
+
+
 def rotation_from_vector(omega: Floats) -> Floats:
     """Return the rotations (..., 3, 3) about vectors (..., 3) by their lengths, rad (Rodrigues' formula)."""
     squared = np.einsum("...i,...i->...", omega, omega)

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -159,9 +159,17 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
 
     name: the name of the camera. error: the turns (rad) and the moves (m) by name.
     """
-    turn = rotation_from_vector(np.array([error.get(f"{name}.{axis}", 0.0) for axis in AXES]))
+    turn = _turn(*(float(error.get(f"{name}.{axis}", 0.0)) for axis in AXES))
     move = np.array([error.get(f"{name}.{axis}", 0.0) for axis in "xyz"])
     return make_pose(turn @ base_T_camera[..., :3, :3], base_T_camera[..., :3, 3] + move)
+
+
+@lru_cache(maxsize=64)
+def _turn(roll: float, tilt: float, yaw: float) -> Floats:
+    """Return the rotation (3, 3) by the errors `AXES`. Derivatives by other errors ask for the same one many times."""
+    turn = rotation_from_vector(np.array([roll, tilt, yaw]))
+    turn.setflags(write=False)  # All callers get this array.
+    return turn
 
 
 def lens_errors(error: Mapping[str, float], name: str) -> tuple[float, float, float]:

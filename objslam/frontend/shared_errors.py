@@ -35,8 +35,6 @@ _MOST_SIGMAS = 6.0
 """The bound of a parameter is the absolute value of its prior mean, plus this many standard deviations of its prior.
 MOST_SCALE bounds scales further. Clocks have their own bound. A larger value lets a parameter move farther from its
 prior."""
-
-
 _KEPT = 9
 """For how many values of the errors the poses of the keyframes are kept. A larger number takes more memory. A round of
 derivatives needs seven."""
@@ -91,6 +89,11 @@ class SharedErrors:
         lengths = {"range_scale": np.isfinite(self.rays.range).any(), "tag_scale": self.sized_tags}
         scales = {"odometry.scale"} | {name for name, measured in lengths.items() if measured}
         return frozenset(scales) if scales <= set(self.names) else frozenset()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The names of the cameras, in the order of `Keyframes.camera`."""
+        return tuple(one.camera.name for one in self.log.cameras)
 
     @property
     def odometry_stamps(self) -> Floats:
@@ -168,10 +171,10 @@ class SharedErrors:
             wander=wander,
         )
         longer = (1 + error.get("range_scale", 0.0)) * (1 + self.noise.shrinkage)
-        ranged = replace(rays, direction=direction, sigma=sigma)
-        ranged = replace(ranged, range=rays.range * longer, range_sigma=rays.range_sigma * longer)
+        ranges = {"range": rays.range * longer, "range_sigma": rays.range_sigma * longer}
+        ranged = replace(rays, direction=direction, sigma=sigma, **ranges)
         tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))
-        return moved, ranged, settings.model_copy(update={"tags": tags})
+        return moved, ranged, settings if tags is settings.tags else settings.model_copy(update={"tags": tags})
 
     def corrected_log(self, values: Floats) -> Log:
         """Return the log corrected by the errors (P,): odometry, cameras and the stamps of frames."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,12 @@ def test_every_example_is_played_here() -> None:
     assert len(names) == 6
     for name in names:
         assert f'play("{name}"' in text
+
+
+def test_every_example_is_checked_as_strictly_as_a_user_may() -> None:
+    project = tomllib.loads((EXAMPLES.parent / "pyproject.toml").read_text("utf-8"))
+    (strict,) = project["tool"]["mypy"]["overrides"]
+    assert strict["module"] == sorted(file.stem for file in EXAMPLES.glob("*.py"))
 
 
 def test_a_folder_becomes_a_result_that_answers(play: Play, folder: Path) -> None:

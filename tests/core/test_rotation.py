@@ -8,6 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from objslam.core.rotation import (
+    cross,
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
@@ -59,3 +60,10 @@ def test_a_rotation_about_z_stays_about_z():
     assert (turn[2] == [0, 0, 1]).all()
     assert (turn[:, 2] == [0, 0, 1]).all()
     assert (rotation_vector(turn)[:2] == 0).all()
+
+
+@pytest.mark.parametrize(("a", "b"), [((3,), (3,)), ((5, 3), (5, 3)), ((4, 5, 3), (3,)), ((0, 3), (0, 3))])
+def test_cross_products_are_those_of_numpy(a, b):
+    rng = np.random.default_rng(0)
+    one, other = rng.standard_normal(a), rng.standard_normal(b)
+    np.testing.assert_array_equal(cross(one, other), np.cross(one, other))

@@ -180,8 +180,11 @@ def test_no_object_is_no_calibration():
         calibrate_at_poses(errors, association, np.full_like(start, np.nan), errors.mean, noise(errors))
 
 
-def test_the_vector_is_the_gradient_of_the_cost():
-    errors, association, start = parts(add_shared_errors(exact(), {"front.yaw": 0.003}))
+@pytest.mark.parametrize("yaws", [(0.0,), (0.0, 2.0)])
+def test_the_vector_is_the_gradient_of_the_cost(yaws):
+    """Also if the errors of two cameras move at once: an error of one moves no ray of the other."""
+    cameras = tuple(make_camera(name, yaw=yaw) for name, yaw in zip(("front", "left"), yaws, strict=False))
+    errors, association, start = parts(add_shared_errors(exact(cameras=cameras), {"front.yaw": 0.003}))
     theta = np.zeros(len(errors.names))
     held = association.object >= 0
 

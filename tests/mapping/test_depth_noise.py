@@ -24,7 +24,7 @@ IN_SETTINGS = tuple(f"depth.{name}={value}" for name, value in vars(NOISE).items
 
 def logs(**changes):
     """A log with depths, and the same log with a camera that tells their noise."""
-    drive = {"objects": 8, "classes": 8, "frames": 250, "depth": DepthNoise(), "odometry": Odometry(), **changes}
+    drive = {"objects": 8, "classes": 8, "frames": 120, "depth": DepthNoise(), "odometry": Odometry(), **changes}
     plain = simulate(preset("demo", **drive), 3)
     one = plain.cameras[0]
     return plain, replace(plain, cameras=(replace(one, camera=replace(one.camera, depth_noise=NOISE)),))

@@ -67,7 +67,7 @@ def test_noise_that_the_settings_leave_open_makes_no_second_object():
     noise = noise.model_copy(
         update={n: 3 * getattr(noise, n) for n in type(noise).model_fields if not n.startswith("floor")}
     )
-    log = drive(2, odometry=noise, pixel_sigma=9.0)
+    log = drive(2, odometry=noise, pixel_sigma=9.0, frames=200, laps=2)
     result, ledger = mapped(log)
     assert result.summary["rounds"] == []
     assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)

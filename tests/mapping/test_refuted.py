@@ -33,6 +33,24 @@ def clean():
     return simulate(preset("demo", frames=200, objects=8, classes=8, false=0.0, localization=None), 0)
 
 
+def solution_of(log):
+    frames = build_keyframes(log, SETTINGS, Ledger())
+    rays = build_rays(log, frames, SETTINGS, Ledger())
+    return solve(frames, rays, (log.cameras[0].camera,), SETTINGS, Ledger(), nothing)
+
+
+@pytest.fixture(scope="module")
+def solved(clean):
+    return solution_of(clean)
+
+
+@pytest.fixture(scope="module")
+def mirrored(clean):
+    """The log with mirrored images, and its solution."""
+    log = MISTAKES["image mirrored"](clean)
+    return log, solution_of(log)
+
+
 def no_boxes(log):
     camera = log.cameras[0]
     few = camera.detections.take(np.zeros(len(camera.detections), dtype=bool))
@@ -47,11 +65,8 @@ def no_boxes(log):
         (True, no_boxes, False),  # a hypothesis that leaves nothing to solve
     ],
 )
-def test_a_finding_stays_only_if_the_log_put_right_is_explained_better(clean, wrong, put_right, kept):
-    log = MISTAKES["image mirrored"](clean) if wrong else clean
-    frames = build_keyframes(log, SETTINGS, Ledger())
-    rays = build_rays(log, frames, SETTINGS, Ledger())
-    solution = solve(frames, rays, (log.cameras[0].camera,), SETTINGS, Ledger(), nothing)
+def test_a_finding_stays_only_if_the_log_put_right_is_explained_better(clean, mirrored, solved, wrong, put_right, kept):
+    log, solution = mirrored if wrong else (clean, solved)
     trial = Trial(Hypothesis("mirrored", "the boxes mirrored", "the images are mirrored", put_right), 1.0, 1.0, None)
     others = Finding("depth in mm", "the depths are in mm")
     found = Diagnosis((Finding("mirrored", "it is mirrored", basis="boxes"), others), (trial,))
@@ -66,15 +81,12 @@ def test_a_finding_stays_only_if_the_log_put_right_is_explained_better(clean, wr
         (no_boxes, False),  # it leaves nothing to solve
     ],
 )
-def test_boxes_that_fit_only_a_path_that_bends_refute_nothing(clean, put_right, kept):
-    frames = build_keyframes(clean, SETTINGS, Ledger())
-    rays = build_rays(clean, frames, SETTINGS, Ledger())
-    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
-    bent = replace(solution, estimate=replace(solution.estimate, noise=NoiseFactors(turning=10.0)))
+def test_boxes_that_fit_only_a_path_that_bends_refute_nothing(clean, solved, put_right, kept):
+    bent = replace(solved, estimate=replace(solved.estimate, noise=NoiseFactors(turning=10.0)))
     trial = Trial(Hypothesis("odd", "it put right", "it is odd", put_right), 1.0, 1.0, None)
     found = Diagnosis((Finding("odd", "it is odd", basis="boxes"),), (trial,))
     assert bool(without_refuted(found, bent, clean, SETTINGS, nothing).findings) == kept
-    assert not without_refuted(found, solution, clean, SETTINGS, nothing).findings
+    assert not without_refuted(found, solved, clean, SETTINGS, nothing).findings
 
 
 def names(log):
@@ -97,14 +109,11 @@ def room(seed, **changes):
         (NoiseFactors(rays=10.5, along=20.0), NoiseFactors(rays=3.0), False),  # boxes that do not fit either
     ],
 )
-def test_bad_wheels_do_not_refute_a_wrong_mount(clean, monkeypatch, noise, corrected, kept):
+def test_bad_wheels_do_not_refute_a_wrong_mount(clean, solved, monkeypatch, noise, corrected, kept):
     """The corrected log explains the boxes, but only with noisy odometry, because the robot has noisy odometry."""
-    frames = build_keyframes(clean, SETTINGS, Ledger())
-    rays = build_rays(clean, frames, SETTINGS, Ledger())
-    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
-    half = np.where(np.arange(len(rays)) % 2 == 0, solution.estimate.weight, 0.0)
-    wrong = replace(solution, estimate=replace(solution.estimate, weight=half, noise=noise))
-    other = replace(solution, estimate=replace(solution.estimate, noise=corrected))
+    half = np.where(np.arange(len(solved.rays)) % 2 == 0, solved.estimate.weight, 0.0)
+    wrong = replace(solved, estimate=replace(solved.estimate, weight=half, noise=noise))
+    other = replace(solved, estimate=replace(solved.estimate, noise=corrected))
     monkeypatch.setattr(refuted, "_solved", lambda *_: other)
     trial = Trial(Hypothesis("mount", "the mount set", "the mount is not set", lambda log: log), 1.0, 1.0, None)
     found = Diagnosis((Finding("mount", "the mount is not set", basis="boxes"),), (trial,))
@@ -119,13 +128,10 @@ def test_objects_that_one_half_sees_under_little_parallax_are_no_mistake():
 
 
 @pytest.mark.parametrize("basis", ["halves", "frames"])
-def test_a_solve_of_a_clean_log_refutes_what_a_quick_look_said(clean, basis):
-    frames = build_keyframes(clean, SETTINGS, Ledger())
-    rays = build_rays(clean, frames, SETTINGS, Ledger())
-    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
+def test_a_solve_of_a_clean_log_refutes_what_a_quick_look_said(clean, solved, basis):
     said = Finding("odd", "some boxes do not fit", basis=basis)
     kept = Finding("odd", "the input says so itself")
-    assert without_refuted(Diagnosis((said, kept)), solution, clean, SETTINGS, nothing).findings == (kept,)
+    assert without_refuted(Diagnosis((said, kept)), solved, clean, SETTINGS, nothing).findings == (kept,)
 
 
 @pytest.mark.parametrize(("depth", "unnamed"), [(None, False), (DepthNoise(), True)])

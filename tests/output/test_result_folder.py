@@ -10,6 +10,7 @@ import math
 import os
 import re
 import resource
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -332,8 +333,7 @@ def test_killed_at_any_moment_no_half_file_and_no_mix(tmp_path: Path) -> None:
 
     seen = set()
     for step in range(200):
-        out = tmp_path / f"out{step}"
-        write_result(old, out)
+        out = Path(shutil.copytree(tmp_path / "old", tmp_path / f"out{step}"))
         code = in_child(killed_at(step, lambda out=out: write_result(new, out)))  # type: ignore[misc]
         found = contents(out)
         from_old = all(was.get(name) == data for name, data in found.items())

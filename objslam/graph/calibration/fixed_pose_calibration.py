@@ -6,11 +6,13 @@ A Gauss-Newton step moves the errors and the objects together. Each object is el
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.calibration import CalibratedMeasurements, Calibration
+from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
+from objslam.core.rotation import cross
 from objslam.core.types import Association
 from objslam.errors import SolveError
 
@@ -136,14 +138,16 @@ def linearise_points(
     """
     target = points[owner]
 
-    def residual(values: Floats) -> tuple[Floats, Floats]:
+    def misses(values: Floats) -> _Misses:
         keyframes, rays, _ = errors.at(values, drift=False)
         origins, directions = rays.in_map(keyframes.map_T_camera)
-        return _across(origins[held], directions[held], target, np.hypot(rays.sigma[held], noise[0]), noise[1], trusted)
+        return _Misses.of(origins[held], directions[held], target, np.hypot(rays.sigma[held], noise[0]), noise[1])
 
-    e, by_point = residual(theta)
+    here = misses(theta)
+    e, by_point = here.deviation, here.by_point(trusted)
     weight = 1 / (1 + (np.linalg.norm(e, axis=1) / _CAUCHY) ** 2)
-    by_error = np.stack([_slope(residual, theta, i, step) for i, step in enumerate(errors.steps)], axis=2)
+    camera = errors.keyframes.camera[errors.rays.keyframe[held]]
+    by_error = _slopes(lambda values: misses(values).deviation, errors, theta, camera)
     n, p = len(points), len(theta)
     h_pp, h_pt, g_p = np.zeros((n, 3, 3)), np.zeros((n, 3, p)), np.zeros((n, 3))
     weighted = weight[:, None, None] * by_point
@@ -180,26 +184,62 @@ def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
     return max(1.0, float(((sums**2).sum(axis=0)[told] / np.diagonal(system.matrix)[told]).max()))
 
 
-def _slope(residual: Callable[[Floats], tuple[Floats, Floats]], theta: Floats, i: int, step: float) -> Floats:
-    move = step * np.eye(len(theta))[i]
-    return np.asarray((residual(theta + move)[0] - residual(theta - move)[0]) / (2 * step))
+def _slopes(residual: Callable[[Floats], Floats], errors: CalibratedMeasurements, theta: Floats, camera: Ints) -> Floats:
+    """Return the derivatives (n, 2, P) of the residuals by the errors, as central differences.
 
-
-def _across(
-    origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float, trusted: bool
-) -> tuple[Floats, Floats]:
-    """Return the angles (n, 2) between rays and points, in standard deviations, and their derivatives by the points.
-
-    angle: (n,) rad, the noise of directions. place: m, the noise of origins. The standard deviation depends on the distance.
-    If the noise is trusted, the derivatives contain those of the standard deviation. Without them, the noise would bias the
-    errors of the camera and the points, and more rays would not reduce this bias.
+    An error of a camera moves no ray of another camera. So the errors of one kind are moved at once for all cameras
+    (Curtis, Powell and Reid 1974), and each ray shows the error of its own camera. camera: (n,) the camera of each ray.
     """
-    to = target - origins
-    distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
-    to = to / distance[:, None]
-    level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)
-    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
-    basis = np.stack([level, np.cross(directions, level)], axis=1)
-    miss, sigma = np.einsum("nki,ni->nk", basis, to), np.hypot(angle, place / distance)
-    along = miss * (angle / sigma)[:, None] ** 2 * trusted
-    return miss / sigma[:, None], (basis - along[:, :, None] * to[:, None, :]) / (distance * sigma)[:, None, None]
+    owner = {f"{name}.{kind(one)}": i for one in errors.names for i, name in enumerate(errors.cameras)}
+    together: dict[str, list[int]] = {}
+    for k, name in enumerate(errors.names):
+        together.setdefault(f"of each camera: {kind(name)}" if name in owner else name, []).append(k)
+    slopes, steps = np.zeros((len(camera), 2, len(theta))), errors.steps
+    for group in together.values():
+        move = np.zeros(len(theta))
+        move[group] = steps[group]
+        change = residual(theta + move) - residual(theta - move)
+        for k in group:
+            number = owner.get(errors.names[k])
+            mine = slice(None) if number is None else camera == number
+            slopes[mine, :, k] = change[mine] / (2 * steps[k])
+    return slopes
+
+
+@dataclass(frozen=True)
+class _Misses:
+    """By how much n rays miss their points. The standard deviation of a miss depends on the distance.
+
+    deviation: (n, 2) the angles between rays and points, in standard deviations, along the axes `basis` (n, 2, 3). to:
+    (n, 3) the unit vectors to the points. distance: (n,) m. angle: (n,) rad, the noise of directions. sigma: (n,) rad, that
+    of misses.
+    """
+
+    deviation: Floats
+    basis: Floats
+    to: Floats
+    distance: Floats
+    angle: Floats
+    sigma: Floats
+
+    @classmethod
+    def of(cls, origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float) -> Self:
+        """Measure rays (n, 3) against points `target` (n, 3). place: m, the noise of origins."""
+        to = target - origins
+        distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
+        to = to / distance[:, None]
+        level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)
+        level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
+        basis = np.stack([level, cross(directions, level)], axis=1)
+        sigma = np.hypot(angle, place / distance)
+        return cls(np.einsum("nki,ni->nk", basis, to) / sigma[:, None], basis, to, distance, angle, sigma)
+
+    def by_point(self, trusted: bool) -> Floats:
+        """Return the derivatives (n, 2, 3) of the deviations by the points.
+
+        If the noise is trusted, they contain those of the standard deviation. Without them, the noise would bias the errors
+        of the camera and the points, and more rays would not reduce this bias.
+        """
+        along = self.deviation * self.sigma[:, None] * (self.angle / self.sigma)[:, None] ** 2 * trusted
+        across = self.basis - along[:, :, None] * self.to[:, None, :]
+        return np.asarray(across / (self.distance * self.sigma)[:, None, None])
