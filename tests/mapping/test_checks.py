@@ -124,7 +124,7 @@ def test_a_small_error_that_a_run_estimates_is_not_named_before_it(name):
 @pytest.mark.parametrize("mode", ["fixed", "joint"])
 def test_boxes_that_are_shares_of_the_image_are_refused_before_anything_else(mode):
     log = MISTAKES["frames' stamps in ms"](MISTAKES["boxes 0..1"](drive(mode)))
-    with pytest.raises(LogError, match=r"the boxes of front are shares of the image.*x times 640, y times 480"):
+    with pytest.raises(LogError, match=r"the boxes of camera front are shares of the image.*x times 640, y times 480"):
         findings(log, mode)
 
 
