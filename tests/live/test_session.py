@@ -630,3 +630,18 @@ def test_replay_at_a_speed_and_stopped(log):
     sink = Stopping()
     ReplayAdapter(sink, log, speed=20.0).run(stop)
     assert len(sink.detections) == 20
+
+
+def test_two_things_of_a_label_that_no_frame_shows_together_are_two_before_the_end():
+    log = make_log()
+    camera, true = log.cameras[0], {o.label: o.position for o in log.truth.objects}
+    found = camera.detections
+    one, other = (found.label_names.index(name) for name in ("ball", "vase"))
+    assert not set(found.frame[found.label == one]) & set(found.frame[found.label == other])
+    boxes = replace(found, label=np.where(found.label == other, one, found.label))
+    session = drive(replace(log, cameras=(replace(camera, detections=boxes),)))
+    balls = [o.position for o in session.snapshot().map.resolved() if o.label == "ball"]
+    session.abort()
+    off = [[np.linalg.norm(place - true[name]) for place in balls] for name in ("ball", "vase")]
+    assert len(balls) == 2
+    assert max(map(min, off)) < 0.15
