@@ -1,6 +1,6 @@
 """The command `objslam config`, which prints the settings."""
 
-from objslam.cli.console import say
+from objslam.cli.console import put
 from objslam.cli.options import Config, Set, settings_of
 
 
@@ -8,4 +8,4 @@ def config_dump(config: Config = None, set_: Set = None) -> None:
     """Print all settings as YAML. They include the changes by --config and --set."""
     from objslam.config import dump_settings
 
-    say(dump_settings(settings_of(None, config, set_)), end="")
+    put(dump_settings(settings_of(None, config, set_)))

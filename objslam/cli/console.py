@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import functools
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from objslam.errors import printable
@@ -68,7 +70,7 @@ def report(ledger: Ledger) -> None:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """Return the console of stdout or stderr, with the width of the terminal, or 120 columns if it is no terminal.
+    """Return the console of stdout or stderr. Its width is that of the terminal, or COLUMNS. Without both it is 120 columns.
 
     Each stream has one console, so that a line printed during a progress bar or status line does not mix with it. The
     console has no markup: it prints [red] and :smile: as they are. `printable` replaces characters that cannot be printed.
@@ -86,10 +88,30 @@ def console_of(stderr: bool, /) -> Console:
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str(printable(text), **options)
 
-    stream = sys.stderr if stderr else sys.stdout
-    return Plain(stderr=stderr, highlight=False, markup=False, emoji=False, width=None if stream.isatty() else 120)
+    return Plain(stderr=stderr, highlight=False, markup=False, emoji=False, width=None if _is_narrow(stderr) else 120)
 
 
-def say(text: str, *, stderr: bool = False, style: str | None = None, end: str = "\n") -> None:
-    """Print a text without wrapping. style: as rich names it, such as "bold"."""
-    console(stderr=stderr).print(text, style=style, end=end, soft_wrap=True)
+def width(*, stderr: bool = False) -> int | None:
+    """Return the characters of a line of stdout or stderr: those of the terminal, or COLUMNS. None for any other pipe."""
+    return console(stderr=stderr).width if _is_narrow(stderr) else None
+
+
+def say(text: str, *, stderr: bool = False, style: str | None = None) -> None:
+    """Print a sentence, wrapped between words if lines have a width (`width`).
+
+    A longer word, such as a path, stays whole, which rich cannot do. style: as rich names it, such as "bold".
+    """
+    most = width(stderr=stderr)
+    lines = text.split("\n")
+    if most is not None:
+        lines = [fill(line, most, break_long_words=False, break_on_hyphens=False) for line in lines]
+    put("\n".join([*lines, ""]), stderr=stderr, style=style)
+
+
+def put(text: str, *, stderr: bool = False, style: str | None = None) -> None:
+    """Print a text that is not wrapped: data for programs, or a command to copy. The text ends its own lines."""
+    console(stderr=stderr).print(text, style=style, end="", soft_wrap=True)
+
+
+def _is_narrow(stderr: bool) -> bool:
+    return (sys.stderr if stderr else sys.stdout).isatty() or os.environ.get("COLUMNS", "").isdigit()

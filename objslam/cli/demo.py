@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import objslam
-from objslam.cli.console import progress_bar, say
+from objslam.cli.console import progress_bar, put, say
 from objslam.cli.evaluate import print_evaluation
 from objslam.cli.options import settings_of
 from objslam.cli.run import run_log
@@ -57,7 +57,7 @@ def demo(
         changes = [f"poses.use={poses}", *(["rays.pixel_sigma=1.5"] if model else [])]
         settings = settings_of(mode, None, changes)
         shown = " ".join(["objslam run", str(log), "-o", str(out / mode), "--mode", mode, *(f"--set {c}" for c in changes)])
-        say(f"\n{shown}{f' --detector {model}' if model else ''}", style="bold")
+        put(f"\n{shown}{f' --detector {model}' if model else ''}\n", style="bold")
         run_log(read(log, ledger), settings, ledger, out / mode, model)
         print_evaluation(out / mode, None, "auto", 0.5)
     say(f"\nopen {out / 'joint' / 'map.png'}, or run: objslam view {out / 'joint'}")

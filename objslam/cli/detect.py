@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from objslam.cli.console import say
+from objslam.cli.console import put, say
 from objslam.cli.options import ClassNames, Config, EncoderModel, Json, Set, settings_of
 
 
@@ -54,7 +54,7 @@ def detect(
     if vectors is not None:
         rows = [{**row, "features": vector} for row, vector in zip(rows, vectors.tolist(), strict=True)]
     if json:
-        say(dump_json({"layout": recipe.layout, "image": [width, height], "boxes": rows}), end="")
+        put(dump_json({"layout": recipe.layout, "image": [width, height], "boxes": rows}))
         return
     say(f"{model}: outputs in the {recipe.layout} layout, boxes as {recipe.box_form} in {recipe.box_units}, {recipe.resize}")
     say(f"{image}: {width}x{height}, {len(rows)} boxes with a score of {settings.detector.min_score:g} or more")

@@ -83,11 +83,20 @@ def _solved(log: Log, settings: Settings, show: Progress) -> list[dict[str, Any]
 
 
 def _show_trials(found: Diagnosis) -> None:
-    """Print how well the boxes fit with the log as it is, and with the corrections (hypotheses) that make them fit best."""
+    """Print how well the boxes fit with the log as it is, and with the corrections (hypotheses) that make them fit best.
+
+    If nothing is wrong, one line is enough.
+    """
     from rich.table import Table
 
     if not found.trials:
         say("there are too few boxes to judge how well they agree")
+        return
+    if not found.findings:
+        first, *others = found.trials
+        better = " clearly" if any(trial.score > first.score for trial in others) else ""
+        share = f"{100 * first.share:.0f} % of the boxes fit the log as it is"
+        say(f"{share}; {len(others)} what-ifs were tried, and none fits{better} better")
         return
     table = Table(title="what the boxes say")
     for name in ("what if", "boxes that fit", "score", "drives where it heads"):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from objslam.cli.console import console, say
+from objslam.cli.console import console, put
 from objslam.cli.options import Align, Json, Quiet, Radius
 
 if TYPE_CHECKING:
@@ -45,6 +45,6 @@ def print_evaluation(
     if quiet:
         return
     if json:
-        say(dump_json(found.to_dict()), end="")
+        put(dump_json(found.to_dict()))
     else:
         console().print(evaluation_table(found))

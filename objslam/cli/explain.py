@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from objslam.cli.console import console, say
+from objslam.cli.console import console, put, say
 from objslam.cli.options import Json
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def explain(
         raise OutputError(f"this result has no {DOUBTS}", where=str(out), hint="an older version wrote it: run it again")
     chosen = [one for one in doubts if label is None or one.label == label]
     if json:
-        say(json_text.dumps([one.to_dict() for one in chosen], indent=2, ensure_ascii=False))
+        put(json_text.dumps([one.to_dict() for one in chosen], indent=2, ensure_ascii=False) + "\n")
         return
     if not chosen:
         say("no doubts" if label is None else f"no doubts about {label}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from objslam.cli.console import console, say
+from objslam.cli.console import console, put, say
 from objslam.cli.options import CalibrationFile, Config, DetectorModel, Json, Mode, Quiet, Set, settings_of, with_options
 from objslam.sources import SourceOptions
 
@@ -120,7 +120,7 @@ def fleet(
     if json:
         from objslam.results.files import dump_json
 
-        say(dump_json(summary), end="")
+        put(dump_json(summary))
     elif not quiet:
         _say(found, summary)
     if found.failures:

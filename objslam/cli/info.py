@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from objslam.cli.console import console, report, say
+from objslam.cli.console import put, report, say, width
 from objslam.cli.options import Json, with_options
 from objslam.sources import Source, SourceOptions, choose, read
 
@@ -43,7 +43,7 @@ def info(
     kind = choose(source, options.format)
     if kind.name == "ros":
         bag = describe(source, options)
-        say(dump_json(asdict(bag)), end="") if json else _show_bag(bag)
+        put(dump_json(asdict(bag))) if json else _show_bag(bag)
         return
     ledger = Ledger()
     log = read(source, ledger, options)
@@ -51,9 +51,7 @@ def info(
         if finding is not None:
             ledger.warn(finding.message)
     found = contents(log)
-    say(dump_json({"kind": kind.name, **asdict(found), "warnings": ledger.lines()}), end="") if json else _show_log(
-        found, kind
-    )
+    put(dump_json({"kind": kind.name, **asdict(found), "warnings": ledger.lines()})) if json else _show_log(found, kind)
     report(ledger)
 
 
@@ -130,18 +128,18 @@ def _span(start: float, end: float) -> str:
 
 
 def _table(names: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print rows of text in aligned columns. On a narrow terminal, `_SPARE` columns are left out. No text is cut."""
-    screen = console()
+    """Print rows of text in aligned columns. On narrow lines, `_SPARE` columns are left out. No text is cut."""
+    most = width()
     for spare in (None, *_SPARE):
         if spare in names:
             at = names.index(spare)
             names, *rows = ([*row[:at], *row[at + 1 :]] for row in (names, *rows))
         widths = [max(len(row[i]) for row in (names, *rows)) for i in range(len(names))]
-        if not screen.is_terminal or sum(widths) + 2 * (len(widths) - 1) <= screen.width:
+        if most is None or sum(widths) + 2 * (len(widths) - 1) <= most:
             break
     for row in (names, *rows):
         cells = (c.rjust(w) if name in _NUMERIC else c.ljust(w) for c, w, name in zip(row, widths, names, strict=True))
-        say("  ".join(cells).rstrip())
+        put("  ".join(cells).rstrip() + "\n")
 
 
 def _list(title: str, lines: Sequence[str], otherwise: str = "") -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from objslam.cli.console import say
+from objslam.cli.console import put, say
 from objslam.cli.options import Json, Out
 
 NOT_REGISTERED = 1
@@ -140,4 +140,4 @@ def _say_json(found: object) -> None:
         for one in found.changes
     ]
     said = {"registered": found.registration.accepted, "reason": found.reason, "a_T_b": found.a_T_b, "changes": changes}
-    say(dump_json(said), end="")
+    put(dump_json(said))

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from objslam.cli.console import progress_bar, say
+from objslam.cli.console import progress_bar, put, say
 from objslam.cli.options import Json, Quiet
 
 
@@ -28,6 +28,6 @@ def report_result(
     with progress_bar() as show:
         file = write_report(out, log=log, crops=crops, progress=show)
     if json and not quiet:
-        say(dump_json({"wrote": str(file)}), end="")
+        put(dump_json({"wrote": str(file)}))
     elif not quiet:
         say(f"wrote {file}")

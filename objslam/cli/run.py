@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from objslam.cli.console import console, progress_bar, report, say
+from objslam.cli.console import console, progress_bar, put, report, say
 from objslam.cli.options import (
     CalibrationFile,
     Config,
@@ -149,7 +149,7 @@ def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...])
     from objslam.results.files import dump_json
 
     objects = json.loads(dump_objects(result.map))["objects"]
-    say(dump_json({"out": str(out), "removed": removed, "objects": objects, "summary": result.summary}), end="")
+    put(dump_json({"out": str(out), "removed": removed, "objects": objects, "summary": result.summary}))
 
 
 def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]) -> None:

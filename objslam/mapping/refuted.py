@@ -20,6 +20,7 @@ from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.hypotheses.trials import clear
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
 from objslam.mapping.checks.parts.mixture import find_mixture
 from objslam.mapping.progress import Progress
@@ -52,6 +53,7 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
     of a finding. "boxes": the finding is wrong if the solution explains the boxes, or if a solution of the log without the
     fault explains them no better. If the solution needs noisy odometry, the log without the fault must need it too. If the
     log without the fault needs noisy odometry, the finding is right only if the solution needs far more noise, of any kind.
+    If neither of the two explains the boxes, the solves show nothing, and a finding stands if the quick look is clear.
     "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree on the objects.
     "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
     """
@@ -79,17 +81,20 @@ def _refuted(
     named = [t.hypothesis for t in diagnosis.trials if t.hypothesis is not None and t.hypothesis.name == finding.name]
     if not named:
         return explained
+    unclear = not clear(diagnosis.trials, finding.name)
     try:
         other = _solved(named[0].put_right(log), settings, progress)
     except ObjslamError:
-        return True
+        return unclear
     fits = _least_explained(other) >= _EXPLAINED and _noise(other, rays_only=True) <= _NOISE
+    if not fits:  # A solve may miss right boxes too, as when it takes two things for one. It is no evidence then.
+        return unclear
     quieter = _noise(other) <= _QUIETER * _noise(solution)
     if explained:  # A path that is free to bend explains boxes of a mirrored image too.
-        return not (fits and quieter)
+        return not quieter
     more = _explained(other).mean() >= _explained(solution).mean() + _MORE
     exact = _noise(other, rays_only=True) <= _QUIETER * _noise(solution, rays_only=True)
-    return not (fits and more and (exact or quieter or _noise(other) <= _NOISE))
+    return not (more and (exact or quieter or _noise(other) <= _NOISE))
 
 
 def _solved(log: Log, settings: Settings, progress: Progress) -> Solution:

@@ -59,9 +59,9 @@ class Tty(io.StringIO):
 
 
 @contextmanager
-def terminal_in_place_of_stderr(columns):
+def terminal_in_place_of_stderr(columns, screen=None):
     """A terminal of that width; no fixture, because pytest sets stderr anew between a fixture and its test."""
-    screen = Tty()
+    screen = Tty() if screen is None else screen
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stderr", screen)
         patch.setenv("COLUMNS", str(columns))
@@ -71,6 +71,33 @@ def terminal_in_place_of_stderr(columns):
             yield screen
         finally:
             terminal.console_of.cache_clear()
+
+
+WARNING = (
+    "the boxes agree only if the noise of the boxes is 20 times what the settings say, or more: unless it really is, the "
+    "input is wrong; see /home/somebody/recordings/of/a/robot/with/a/path/that/no/terminal/has/room/for/camera_front.yaml"
+)
+
+
+@pytest.mark.parametrize("kind", [Tty, io.StringIO])
+@pytest.mark.parametrize("columns", [40, 80])
+def test_a_sentence_is_wrapped_between_words_where_the_width_is_known(kind, columns):
+    """On a terminal, and in a pipe if COLUMNS gives a width. A path stays whole, so that it can be copied."""
+    with terminal_in_place_of_stderr(columns, kind()) as screen:
+        terminal.say(WARNING, stderr=True)
+        lines = screen.getvalue().splitlines()
+    assert " ".join(line.strip() for line in lines) == WARNING
+    assert len(lines) > 2
+    assert all(len(line.rstrip()) <= columns for line in lines if "/home" not in line)
+
+
+def test_a_sentence_in_a_pipe_is_one_line_and_data_are_never_wrapped():
+    with terminal_in_place_of_stderr(40) as screen:
+        terminal.put(WARNING, stderr=True)
+        assert screen.getvalue() == WARNING
+    with terminal_in_place_of_stderr("", io.StringIO()) as screen:
+        terminal.say(WARNING, stderr=True)
+        assert screen.getvalue() == f"{WARNING}\n"
 
 
 def test_the_status_line_is_one_line_and_gives_way_to_others():
@@ -171,12 +198,12 @@ def test_at_80_columns_the_status_line_shows_rates_lag_and_keyframes(monkeypatch
 
 
 def test_at_80_columns_the_topics_of_a_bag_lose_columns_and_nothing_wraps(monkeypatch):
-    """A pipe, which has no width, gets all columns."""
+    """A pipe without COLUMNS, which has no width, gets all columns."""
     names = ("topic", "role", "type", "messages", "Hz", "gap s", "from s", "to s", "frame", "what")
     rows = [("/camera/color/camera_info", "camera_info", "sensor_msgs/CameraInfo", "445", "5.0", "0.20", "0.50", "89.30")]
     rows = [(*rows[0], "camera_color_optical_frame", "640x480 plumb_bob")]
-    monkeypatch.setenv("COLUMNS", "80")
-    for screen, most in ((Tty(), 80), (io.StringIO(), 200)):
+    for screen, columns, most in ((Tty(), "80", 80), (io.StringIO(), "80", 80), (io.StringIO(), "", 200)):
+        monkeypatch.setenv("COLUMNS", columns)
         monkeypatch.setattr(sys, "stdout", screen)
         terminal.console_of.cache_clear()
         try:

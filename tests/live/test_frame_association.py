@@ -7,11 +7,11 @@ import pytest
 
 from objslam.association.observations import Observations
 from objslam.config import load_settings
-from objslam.core.geometry import adjoint, inverse
+from objslam.core.geometry import adjoint, inverse, make_pose
 from objslam.live.counters import Counters
 from objslam.live.mapper.frame_association import FrameRays, match
 from objslam.live.mapper.landmark_table import LandmarkTable, predict_landmarks
-from objslam.live.mapper.maintenance import _one, _two_of_a_label
+from objslam.live.mapper.maintenance import _one, _second_objects
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.track_promotion import prune_tracks, try_promote
 from objslam.live.mapper.tracks import Track
@@ -138,20 +138,50 @@ def lines(targets, sigma=0.004, reach=6.0):
     return Observations.of_lines(origin, unit, np.full(len(to), sigma), nothing, nothing)
 
 
-def two(s, support):
-    session = SimpleNamespace(landmarks=[0], settings=load_settings(None, ()), rng=np.random.default_rng(0))
-    return _two_of_a_label(session, s, np.zeros(len(support), dtype=np.int64), np.array(support))
+def two(s, support, at, drift=1.0):
+    """Whether rays, at a keyframe each, show two objects. support: which rays fit the object at `at`, (3,) m.
+
+    drift: the standard deviation, m, that the path accumulates from one keyframe to the next.
+    """
+    count = len(support)
+    number = np.arange(count)
+    keyframes = SimpleNamespace(
+        id=number,
+        stamp=number.astype(float),
+        drift=drift**2 * number[:, None, None] * np.diag([0.0, 0, 0, 1, 1, 1]),
+        camera_T_start=np.tile(np.eye(4), (count, 1, 1)),
+    )
+    session = SimpleNamespace(
+        landmarks=landmarks([at], [0]),
+        keyframes=keyframes,
+        rays=SimpleNamespace(keyframe=number),
+        graph=SimpleNamespace(pose=lambda k: make_pose(np.eye(3), s.origin[k])),
+        settings=load_settings(None, ()),
+        rng=np.random.default_rng(0),
+    )
+    found = _second_objects(session, s, number, np.zeros(count, dtype=np.int64), np.array(support))
+    for second in found:
+        assert second.row == 0
+        np.testing.assert_array_equal(second.rays, np.flatnonzero(~np.array(support)))
+    return bool(found)
 
 
 def test_a_label_has_two_objects_where_what_disagrees_makes_another_one():
     one, other = (3.0, 0.0, 0.5), (5.0, 2.0, 0.5)
     in_turns = np.arange(40) // 5 % 2 == 0
     turns = [one if here else other for here in in_turns]
-    assert two(lines(turns), in_turns)
-    assert not two(lines([one] * 20 + [other] * 20), np.arange(40) < 20)  # not in turns: the path may have drifted
-    assert not two(lines(turns, reach=0.1), in_turns)  # from one place it has no distance: the one of the label may be wrong
+    assert two(lines(turns), in_turns, one)
+    assert not two(lines([one] * 20 + [other] * 20), np.arange(40) < 20, one)  # not in turns: the path may have drifted
+    assert not two(lines(turns, reach=0.1), in_turns, one)  # from one place it has no distance: the first may be wrong
     strays = np.random.default_rng(1).uniform([1, -8, -8], [17, 8, 8], (40, 3))
-    assert not two(lines(np.where(in_turns[:, None], one, strays)), in_turns)
+    assert not two(lines(np.where(in_turns[:, None], one, strays)), in_turns, one)
+
+
+@pytest.mark.parametrize(("drift", "parts"), [(0.02, True), (0.1, True), (0.3, False)])
+def test_a_label_has_two_objects_where_no_drift_explains_their_distance(drift, parts):
+    """The objects are 2.8 m apart, and each is seen once. Five times 0.3 m explain that."""
+    one, other = (3.0, 0.0, 0.5), (5.0, 2.0, 0.5)
+    assert two(lines([one] * 20 + [other] * 20), np.arange(40) < 20, one, drift) == parts
 
 
 def test_a_crowd_of_candidates_leaves_room_for_those_of_other_labels():

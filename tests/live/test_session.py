@@ -454,15 +454,19 @@ def test_a_patient_session_makes_the_source_wait_and_drops_nothing(log):
         assert not [reason for reason in session.counters.dropped() if "frames" in reason]
 
 
-def test_two_objects_of_a_label_that_no_frame_shows_together_are_two_in_the_end():
-    """While the robot drives, each label is one object, and half of the rays do not fit."""
+@pytest.mark.parametrize("early", [False, True])
+def test_two_objects_of_a_label_that_no_frame_shows_together_are_two_in_the_end(monkeypatch, early):
+    """early: whether the session finds them while the robot drives. Else each label is one object, and half of the rays do
+    not fit."""
+    if not early:
+        monkeypatch.setattr("objslam.live.mapper.maintenance._second_objects", lambda *_: [])
     log = make_log(seed=1, classes=6)
     (camera,) = log.cameras
     boxes = camera.detections
     _, first = np.unique(np.stack([boxes.frame, boxes.label]), axis=1, return_index=True)
     log = replace(log, cameras=(replace(camera, detections=boxes.take(np.sort(first))),))
     session = drive(log)
-    assert session._mapper.state.by_label
+    assert session._mapper.state.by_label != early
     found = session.stop().map.resolved()
     assert sorted(o.label for o in found) == sorted(o.label for o in log.truth.objects)
     true = [
@@ -630,3 +634,18 @@ def test_replay_at_a_speed_and_stopped(log):
     sink = Stopping()
     ReplayAdapter(sink, log, speed=20.0).run(stop)
     assert len(sink.detections) == 20
+
+
+def test_two_things_of_a_label_that_no_frame_shows_together_are_two_before_the_end():
+    log = make_log()
+    camera, true = log.cameras[0], {o.label: o.position for o in log.truth.objects}
+    found = camera.detections
+    one, other = (found.label_names.index(name) for name in ("ball", "vase"))
+    assert not set(found.frame[found.label == one]) & set(found.frame[found.label == other])
+    boxes = replace(found, label=np.where(found.label == other, one, found.label))
+    session = drive(replace(log, cameras=(replace(camera, detections=boxes),)))
+    balls = [o.position for o in session.snapshot().map.resolved() if o.label == "ball"]
+    session.abort()
+    off = [[np.linalg.norm(place - true[name]) for place in balls] for name in ("ball", "vase")]
+    assert len(balls) == 2
+    assert max(map(min, off)) < 0.15

@@ -63,6 +63,28 @@ def lines(*messages):
     return b"".join(json.dumps(message).encode() + b"\n" for message in messages)
 
 
+@pytest.mark.parametrize(
+    ("second", "wait", "advice"),
+    [
+        (0.125, None, "the messages came 8 times as fast as their stamps: with --speed 0"),
+        (1.0, None, ""),  # a running robot
+        (0.125, lambda: None, ""),  # no frame is dropped
+    ],
+)
+def test_a_recording_in_a_pipe_is_told_from_a_robot(second, wait, advice):
+    """second: the time in s that passes for each second of the stamps."""
+    now = iter([0.0, *(second * np.arange(20))])
+    reading, writing = os.pipe()
+    poses = lines(*({"type": "odometry", "stamp": 1e9 + i, **POSE} for i in range(20)))
+    threading.Thread(target=_write, args=(writing, poses), daemon=True).start()
+    with os.fdopen(reading, "rb") as stream:
+        adapter = StdinAdapter(Recorder(), stream, wait=wait, clock=lambda: next(now))
+        assert adapter.late() == ""
+        adapter.run(threading.Event())
+    assert adapter.late().startswith(advice)
+    assert bool(adapter.late()) == bool(advice)
+
+
 def test_every_kind_of_message():
     sink, adapter = feed(
         lines(

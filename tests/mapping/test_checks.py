@@ -46,7 +46,6 @@ NAMED = {
     "base_T_camera identity": ("base_T_camera is not set",),
     "image mirrored": AMBIGUOUS,
     "image upside down": AMBIGUOUS,
-    "boxes 0..1": ("shares of the image",),
     "boxes xywh": ("x y width height",),
     "boxes cxcywh": ("centre, width, height",),
     "boxes yxyx": ("x and y of the boxes are swapped",),
@@ -120,6 +119,21 @@ def test_a_small_error_at_fixed_poses_is_named(name):
 def test_a_small_error_that_a_run_estimates_is_not_named_before_it(name):
     said = " ".join(finding.message for finding in findings(MISTAKES[name](drive("fixed")), "fixed"))
     assert all(words in said for words in SIZED[name]) if name in HELD else said == ""
+
+
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+def test_boxes_that_are_shares_of_the_image_are_refused_before_anything_else(mode):
+    log = MISTAKES["frames' stamps in ms"](MISTAKES["boxes 0..1"](drive(mode)))
+    with pytest.raises(LogError, match=r"the boxes of camera front are shares of the image.*x times 640, y times 480"):
+        findings(log, mode)
+
+
+def test_boxes_most_of_which_are_shares_of_the_image_are_found_fault_with():
+    log = MISTAKES["boxes 0..1"](drive("fixed"))
+    boxes = log.cameras[0].detections.boxes.copy()
+    boxes[0] *= 100
+    found = findings(with_cameras(log, lambda one: replace(one, detections=replace(one.detections, boxes=boxes))), "fixed")
+    assert any("probably shares of the image" in finding.message and finding.spoils for finding in found)
 
 
 @pytest.mark.parametrize("mode", ["fixed", "joint"])

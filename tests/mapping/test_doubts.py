@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from doubtful_drives import LEAN, boxes_of, camera_poses, mapped, reassociated, 
 from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
-from objslam.mapping.doubts import pairs
+from objslam.mapping.doubts import pairs, words
+from objslam.mapping.doubts.groups import REASONS
 from objslam.simulation import pair, preset, simulate
 from objslam.simulation.settings import DepthNoise
 
@@ -90,6 +92,19 @@ def test_a_thing_that_moves():
     rays = np.concatenate([one.rays for one in found])
     assert (result.rays.track_id[rays] == moving).mean() > 0.9
     assert len(rays) > 0.4 * (result.rays.track_id == moving).sum()
+
+
+@pytest.mark.parametrize(("every", "blames_drift"), [(0.0, True), (1.0, False)])
+def test_a_path_that_drifts_is_named_where_a_thing_seems_to_move(every, blames_drift):
+    """Between two visits of a thing at rest, odometry alone drifts, which no test of the rays can tell from a motion."""
+    number = np.zeros(1, dtype=int)
+    groups = SimpleNamespace(
+        reason=number + REASONS.index("moves"), label=number, miss=[0.02], sigma=[0.01], way=[0.23], odds=[-0.7]
+    )
+    result = SimpleNamespace(rays=SimpleNamespace(label_names=("mug",)), keyframes=SimpleNamespace(localized_every=every))
+    told = words._reason(result, groups, 0, number)
+    assert "moves by 23 cm" in told
+    assert ("the path drifted" in told) == blames_drift
 
 
 def test_a_ghost_at_one_place_of_the_image(rooms):

@@ -12,7 +12,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, interpolate, inverse, lift_se2
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
-from objslam.errors import SolveError
+from objslam.errors import LogError, SolveError
 from objslam.mapping import pipeline
 from objslam.simulation import DepthNoise, make_camera, pair, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
@@ -139,13 +139,13 @@ def test_no_usable_box_is_an_error_that_says_why(mode):
         run(log, mode, "rays.min_score=2")
 
 
-def test_few_boxes_between_0_and_1_are_called_shares_of_the_image():
+def test_few_boxes_between_0_and_1_are_refused_as_shares_of_the_image():
     log = small_log(frames=3)
     (camera_log,) = log.cameras
     boxes = camera_log.detections.boxes / np.tile(camera_log.camera.size, 2)
     assert 0 < len(boxes) < 20
     shares = replace(log, cameras=(replace(camera_log, detections=replace(camera_log.detections, boxes=boxes)),))
-    with pytest.raises(SolveError, match="between 0 and 1: they are probably shares of the image"):
+    with pytest.raises(LogError, match="are shares of the image, not px: all lie between 0 and 1"):
         run(shares, "fixed")
 
 

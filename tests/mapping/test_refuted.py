@@ -7,15 +7,17 @@ import pytest
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import make_pose
 from objslam.core.noise import NoiseFactors
+from objslam.core.rotation import rotation_from_vector
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import pipeline, refuted
 from objslam.mapping.alternation import solve
-from objslam.mapping.checks.diagnosis import Diagnosis
+from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis
-from objslam.mapping.checks.hypotheses.trials import Trial
+from objslam.mapping.checks.hypotheses.trials import Trial, clear
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
 from objslam.mapping.refuted import without_refuted
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
@@ -118,6 +120,57 @@ def test_bad_wheels_do_not_refute_a_wrong_mount(clean, solved, monkeypatch, nois
     trial = Trial(Hypothesis("mount", "the mount set", "the mount is not set", lambda log: log), 1.0, 1.0, None)
     found = Diagnosis((Finding("mount", "the mount is not set", basis="boxes"),), (trial,))
     assert bool(without_refuted(found, wrong, clean, SETTINGS, nothing).findings) == kept
+
+
+def trials_of(as_it_is, named, others):
+    """Trials of a log: as it is, with the named mount, and with other mounts."""
+    scores = {"mount": named, **{f"other {number}": score for number, score in enumerate(others)}}
+    hypotheses = [(Hypothesis(name, name, name, lambda log: log, of_mount=True), score) for name, score in scores.items()]
+    return (Trial(None, as_it_is, as_it_is, None), *(Trial(one, score, score, None) for one, score in hypotheses))
+
+
+@pytest.mark.parametrize(
+    ("as_it_is", "named", "kept"),
+    [
+        (0.3, 0.86, True),  # a camera turned by 90 degrees
+        (0.3, 0.44, False),  # no mount is clearly better than others
+        (0.6, 0.86, False),  # as the log is, its boxes agree nearly as well
+    ],
+)
+@pytest.mark.parametrize("fails", [False, True])
+def test_solves_that_explain_nothing_refute_no_clear_mount(clean, monkeypatch, as_it_is, named, kept, fails):
+    """A solve may take two things for one. Then it explains the boxes of no mount, and the quick look decides."""
+    frames = build_keyframes(clean, SETTINGS, Ledger())
+    rays = build_rays(clean, frames, SETTINGS, Ledger())
+    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
+    wrong = replace(solution, estimate=replace(solution.estimate, noise=NoiseFactors(rays=20.0)))
+    monkeypatch.setattr(refuted, "_solved", lambda *_: wrong)
+    trials = trials_of(as_it_is, named, np.linspace(0.1, 0.4, 40))
+    if fails:
+        nowhere = replace(trials[1].hypothesis, put_right=no_boxes)
+        monkeypatch.undo()
+        trials = (trials[0], replace(trials[1], hypothesis=nowhere), *trials[2:])
+    found = Diagnosis((Finding("mount", "the camera is turned", basis="boxes"),), trials)
+    assert bool(without_refuted(found, wrong, clean, SETTINGS, nothing).findings) == kept
+    assert not without_refuted(found, solution, clean, SETTINGS, nothing).findings
+
+
+@pytest.mark.parametrize(("axis", "of_camera"), [(2, False), (1, False), (0, False), (2, True)])
+def test_a_mount_turned_by_a_right_angle_is_clear_from_odometry_alone(axis, of_camera):
+    log, turn = room(3), make_pose(rotation_from_vector(np.eye(3)[axis] * np.pi / 2), np.zeros(3))
+    camera = log.cameras[0].camera
+    mount = camera.base_T_camera @ turn if of_camera else turn @ camera.base_T_camera
+    turned = replace(log, cameras=(replace(log.cameras[0], camera=replace(camera, base_T_camera=mount)),))
+    found = diagnose(turned, SETTINGS, Ledger(), thorough=True)
+    put_right = {t.hypothesis.name: t.hypothesis.put_right for t in found.trials if t.hypothesis is not None}
+    right = put_right[found.findings[0].name](turned).cameras[0].camera.base_T_camera
+    assert np.allclose(right[:3, :3], camera.base_T_camera[:3, :3], atol=1e-9)
+    assert clear(found.trials, found.findings[0].name)
+
+
+def test_a_right_mount_is_no_chance():
+    trials = diagnose(room(3), SETTINGS, Ledger(), thorough=True).trials
+    assert not any(clear(trials, trial.hypothesis.name) for trial in trials if trial.hypothesis is not None)
 
 
 def test_objects_that_one_half_sees_under_little_parallax_are_no_mistake():

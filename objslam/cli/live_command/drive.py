@@ -127,7 +127,7 @@ def finish(
     returned, if any. If there is no result, the last snapshot is written to objects.json.
     """
     from objslam.cli.run import say_result
-    from objslam.core.snapshot import CAME_BEFORE
+    from objslam.core.snapshot import CAME_BEFORE, TOO_SLOW
     from objslam.output.result_folder import write_result
 
     session.counters.ledger.add(feed.adapter.ledger)
@@ -142,6 +142,8 @@ def finish(
     removed = write_result(result, out, truth)
     last = session.snapshot()
     report(session.counters.ledger)
+    if TOO_SLOW in last.dropped and (advice := feed.late()):
+        say(f"warning: {advice}", stderr=True)
     if again := sum(n for kind, n in last.counters.items() if kind.endswith(CAME_BEFORE)):
         say(f"{again} poses and frames had come before and are in the map already, so nothing is lost", stderr=True)
     thinned = last.counters.get("keyframes left out", 0)

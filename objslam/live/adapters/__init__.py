@@ -79,7 +79,8 @@ class Feed:
 
     views: each receives every snapshot. close: called at the end. ticks: called ten times a second. image: returns the image
     of a camera, by its name, at a stamp, s. None if the adapter has no images. odom_frame: returns the name of the
-    odometry's frame, or None if --publish-tf must not publish where this frame is.
+    odometry's frame, or None if --publish-tf must not publish where this frame is. late: returns what to do if frames
+    came too late for the map, "" if the source does not know.
     """
 
     adapter: Adapter
@@ -88,6 +89,7 @@ class Feed:
     image: Callable[[str, float], NDArray[np.uint8] | None] | None = None
     odom_frame: Callable[[], str | None] = lambda: ODOM
     ticks: tuple[Callable[[], object], ...] = ()
+    late: Callable[[], str] = str
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,8 @@ def _stdin(sink: Sink, settings: Settings, options: object, wait: Wait | None) -
 
     if sys.stdin is None:
         raise ObjslamError("standard input is closed", hint="pipe JSON lines into it, or give a file: < messages.jsonl")
-    return Feed(StdinAdapter(sink, sys.stdin.buffer, wait=wait))
+    adapter = StdinAdapter(sink, sys.stdin.buffer, wait=wait)
+    return Feed(adapter, late=adapter.late)
 
 
 def _is_file() -> bool:

@@ -14,6 +14,7 @@ import json
 import os
 import select
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
@@ -32,6 +33,7 @@ from objslam.live.interface import Sink
 _CAMERA = "camera"
 _LONGEST = 1 << 20  # The longest line, bytes. Longer lines are dropped. A larger number costs memory.
 _CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
+_FASTER = 1.5  # Stamps are of a recording if they run this many times as fast as the clock. A larger number hints less.
 _WAIT = 0.1  # The longest time until a stop is noticed, s.
 
 
@@ -40,7 +42,7 @@ class StdinAdapter:
     """Pushes the messages of a stream. Malformed lines are counted with their line numbers.
 
     wait: the function that is called after each frame of a recorded stream. It returns once the map contains the frame. None
-    if a running robot writes the stream, which never waits for the map.
+    if a running robot writes the stream, which never waits for the map. clock: returns the time, s.
     """
 
     sink: Sink
@@ -48,6 +50,18 @@ class StdinAdapter:
     name: str = "stdin"
     wait: Callable[[], object] | None = None
     ledger: Ledger = field(default_factory=Ledger)
+    clock: Callable[[], float] = time.monotonic
+    _first: tuple[float, float] | None = field(default=None, init=False)
+    _faster: float = field(default=1.0, init=False)
+
+    def late(self) -> str:
+        """Return what to do against late frames if the stamps ran faster than the clock, as no robot's do. "" otherwise."""
+        if self.wait is not None or self._faster < _FASTER:
+            return ""
+        return (
+            f"the messages came {self._faster:.2g} times as fast as their stamps: with --speed 0, every frame of a "
+            "recording is mapped"
+        )
 
     def run(self, stop: threading.Event) -> None:
         """Push messages until the stream ends or `stop` is set."""
@@ -94,12 +108,19 @@ class StdinAdapter:
         elif kind in ("odometry", "localization"):
             push = self.sink.push_odometry if kind == "odometry" else self.sink.push_localization
             push(read_stamp(message), _pose(message), _covariance(message))
+            self._compare(read_stamp(message))
         elif kind == "mount":
             self.sink.push_mount(read_stamp(message), _name(message, _CAMERA), _pose(message))
         elif kind == "detections":
             self._push_detections(message, place)
         else:
             raise Malformed("type is none of camera, odometry, localization, mount, detections")
+
+    def _compare(self, stamp: float) -> None:
+        """Compare the time since the first pose by its stamp, s, and by the clock."""
+        if self._first is None:
+            self._first = stamp, self.clock()
+        self._faster = (stamp - self._first[0]) / max(self.clock() - self._first[1], 1e-3)
 
     def _push_detections(self, message: dict[str, Any], place: str) -> None:
         collector = BoxCollector()

@@ -1,12 +1,14 @@
 """The periodic maintenance of a map: solves, outlier rejection, merging of duplicates, loop closure, and bounded growth."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from objslam.association.duplicates import near_pairs, seen_as_two
 from objslam.association.observations import Observations
 from objslam.association.place_recognition import label_densities
 from objslam.association.refinement import normalised_residuals
-from objslam.association.single_object_fit import fit_point
+from objslam.association.single_object_fit import PointFit, fit_point
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint
 from objslam.core.statistics import MOST_NOISE_FACTOR, OUTLIER_RAY, SAME_POINT, noise_factors, quantile
@@ -17,7 +19,7 @@ from objslam.live.mapper.landmark_update import merge_landmarks, remove_landmark
 from objslam.live.mapper.loop_closure import close_loop
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
-from objslam.live.mapper.track_promotion import AGREE, SLACK, fit_if_observable
+from objslam.live.mapper.track_promotion import AGREE, SLACK, add_landmark, fit_if_observable
 from objslam.mapping.labels import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
@@ -33,9 +35,27 @@ _HALF = 0.5  # The share of inliers below which a landmark is triangulated again
 _VISITS = 6
 """The least number of changes between inliers and outliers, in time order, that shows two objects of a label. Drift makes
 one run of outliers, which has two changes. A larger number needs more visits to both objects."""
+_DRIFT = 5.0
+"""The largest drift of a path, as a multiple of that in the settings, that may move an object. Real robots need up to 3.3. A
+larger value needs objects that are farther apart, or more visits to both."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The camera may soon see this share of the image beyond its edge. A larger share prepares more landmarks.
 _USUAL = 0.75  # Every landmark may be seen up to this quantile of all `far`. A larger value prepares more landmarks.
+
+
+@dataclass(frozen=True)
+class _SecondObject:
+    """Another object of the label of a landmark.
+
+    row: of the landmark. rays: (n,) the rows of the rays that show it. fit: its position. obs: these rays in map. far: if
+    no drift of the path explains its distance.
+    """
+
+    row: int
+    rays: Ints
+    fit: PointFit
+    obs: Observations
+    far: bool
 
 
 def maintain(m: MapState) -> None:
@@ -83,24 +103,31 @@ def _polish_if_grown(m: MapState) -> None:
             m.graph.solve(_ITERATIONS)
     except SolveError:
         m.counters.accept("solves given up")
-    if _reconsider(m) or large:
+    changed, second = _reconsider(m)
+    if changed or large:
         m.rebuild_in_slices()
     else:
         m.read_positions()
+    apart = [one for one in second if one.far]
+    for one in apart:
+        _separate(m, one)
+    if apart:
+        m.graph.update()
 
 
-def _reconsider(m: MapState) -> bool:
-    """Reject rays that are outliers now, restore rejected rays that are inliers now, and return whether any ray changed.
+def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
+    """Reject rays that are outliers now, and restore rejected rays that are inliers now.
 
     While every label is one object (`by_label`), a landmark with few inliers is triangulated again. If the rays of a label
-    show two objects, `by_label` becomes False.
+    show two objects, `by_label` becomes False. Return whether any ray changed, and these second objects.
     """
+    second: list[_SecondObject] = []
     rays, landmarks = m.rays, m.landmarks
     m.graph.refresh()
     m.read_positions()
     held = np.flatnonzero(rays.owner >= 0)
     if not len(held):
-        return False
+        return False, second
     row = m.rows_of(rays.owner[held])
     obs = m.sight(held)
     off = normalised_residuals(obs, landmarks.position[row])
@@ -109,9 +136,11 @@ def _reconsider(m: MapState) -> bool:
     support: Bools = off <= OUTLIER_RAY * noise_factor[row]
     if m.by_label:
         number, fits = np.bincount(row, minlength=len(landmarks)), np.bincount(row[support], minlength=len(landmarks))
-        if m.settings.association.method == "auto" and _two_of_a_label(m, obs, row, support):
+        second = _second_objects(m, obs, held, row, support) if m.settings.association.method == "auto" else []
+        if second:
             m.tell_apart_within_labels()
-        for j in np.flatnonzero((fits < _HALF * number) & (number >= MANY)).tolist():
+        single = np.isin(np.arange(len(landmarks)), [one.row for one in second], invert=True)
+        for j in np.flatnonzero(single & (fits < _HALF * number) & (number >= MANY)).tolist():
             mine = np.flatnonzero(row == j)
             fit = fit_point(obs.take(mine), m.rng, SLACK)
             if fit is not None and fit.inlier.sum() > fits[j]:
@@ -123,24 +152,61 @@ def _reconsider(m: MapState) -> bool:
     m.graph.drop_rays(rays.number[out])
     if len(back):
         m.graph.add_rays(m.bearings(back))
-    return bool(len(out) or len(back))
+    return bool(len(out) or len(back)), second
 
 
-def _two_of_a_label(m: MapState, obs: Observations, row: Ints, support: Bools) -> bool:
-    """Return whether the rays (R,) of some landmark show two objects.
+def _second_objects(m: MapState, obs: Observations, held: Ints, row: Ints, support: Bools) -> list[_SecondObject]:
+    """Return the landmarks whose rays show two objects, each with its outliers (rows of `m.rays`) and their point.
 
-    They do if inliers and outliers alternate (_VISITS), and the outliers fit one point. obs: the rays, in time order. row:
-    (R,) the row of each ray's landmark. support: (R,) which rays are inliers.
+    The outliers of two objects fit one point. Then inliers and outliers alternate (_VISITS), or the point is farther away
+    than the path drifts. obs: the rays, in time order. held: (R,) their rows in `m.rays`. row: (R,) the row of each ray's
+    landmark. support: (R,) which rays are inliers.
     """
+    found: list[_SecondObject] = []
     against = np.bincount(row[~support], minlength=len(m.landmarks))
     number = np.bincount(row, minlength=len(m.landmarks))
     for j in np.flatnonzero((against >= MANY) & (against > SECOND * number)).tolist():
         mine = np.flatnonzero(row == j)
-        other = obs.take(mine[~support[mine]])
+        outliers = mine[~support[mine]]
+        fit = fit_if_observable(obs.take(outliers), MANY, AGREE, m.settings, m.rng)
+        if fit is None:
+            continue
         visits = (np.diff(support[mine].astype(np.int64)) != 0).sum()
-        if visits >= _VISITS and fit_if_observable(other, MANY, AGREE, m.settings, m.rng) is not None:
-            return True
-    return False
+        far = _farther_than_drift(m, j, fit, held[mine[support[mine]]], held[outliers])
+        if far or visits >= _VISITS:
+            found.append(_SecondObject(j, held[outliers], fit, obs.take(outliers), far))
+    return found
+
+
+def _farther_than_drift(m: MapState, j: int, fit: PointFit, inliers: Ints, outliers: Ints) -> bool:
+    """Return whether a point is so far from landmark j (row) that it is no duplicate, and no drift of the path explains it.
+
+    The drift counts between the inlier and the outlier, by rows of `m.rays`, that are nearest in time.
+    """
+    k = m.keyframes
+    way = fit.position - m.landmarks.position[j]
+    if not len(inliers) or np.linalg.norm(way) <= m.settings.association.duplicate_distance:
+        return False
+    one, other = (np.searchsorted(k.id, m.rays.keyframe[at]) for at in (inliers, outliers))
+    apart = np.abs(k.stamp[one][:, None] - k.stamp[other])
+    first, last = np.unravel_index(apart.argmin(), apart.shape)
+    earlier, later = sorted((int(one[first]), int(other[last])), key=lambda number: float(k.stamp[number]))
+    pose = m.graph.pose(int(k.id[later]))
+    unknown = np.full((6, 6), np.nan)
+    uncertainty = PoseUncertainty(k.drift[later], adjoint(k.camera_T_start[later]), unknown)
+    drifted = uncertainty.of_landmarks((fit.position - pose[:3, 3])[None], k.drift[earlier][None], pose)[0]
+    spread = fit.covariance + covariances(m.landmarks, np.array([j]))[0] + _DRIFT**2 * drifted
+    return bool(way @ np.linalg.solve(spread, way) > SAME_POINT)
+
+
+def _separate(m: MapState, second: _SecondObject) -> None:
+    """Make a landmark of the outliers of a landmark that show another object."""
+    k = m.keyframes
+    rows = np.searchsorted(k.id, m.rays.keyframe[second.rays])
+    last = rows[k.stamp[rows].argmax()]
+    seen = float(k.stamp[rows].min()), float(k.stamp[last])
+    add_landmark(m, second.rays, second.fit, second.obs, seen, k.drift[last])
+    m.landmarks.rejected[second.row] = 0
 
 
 def _forget_tracks(m: MapState) -> None:

@@ -10,6 +10,7 @@ from objslam.association.observations import Observations
 from objslam.association.refinement import information, normalised_residuals
 from objslam.association.single_object_fit import PointFit, fit_point
 from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import CLIPPED_RAY
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.mapper.state import MapState
@@ -35,30 +36,39 @@ def promote_tracks(m: MapState, tracks: Sequence[Track]) -> list[Track]:
         if fit is None:
             rest.append(track)
             continue
-        j = m.next_id.landmark
-        m.next_id.landmark += 1
         at = np.searchsorted(m.rays.number, track.numbers())
-        m.rays.owner[at] = j
-        m.rays.used[at] = fit.inlier
-        inner = track.sight(m.graph).take(fit.inlier)
-        m.landmarks.add(
-            id=[j],
-            position=fit.position[None],
-            information=information(inner, fit.position).sum(axis=0)[None],
-            label=[track.label],
-            drift=track.drift[None],
-            first=[track.first],
-            last=[track.last],
-            seen=[int(fit.inlier.sum())],
-            expected=[len(track.rays)],
-            far=[float(np.linalg.norm(fit.position - inner.origin, axis=1).max())],
-            squared=[float((normalised_residuals(inner, fit.position) ** 2).clip(max=CLIPPED_RAY**2).sum())],
-            rejected=[0],
-        )
-        m.graph.add_landmark(j, fit.position)
-        m.graph.add_rays(m.bearings(at[fit.inlier]))
+        add_landmark(m, at, fit, track.sight(m.graph), (track.first, track.last), track.drift)
         m.tracks.remove(track)
     return rest
+
+
+def add_landmark(m: MapState, at: Ints, fit: PointFit, obs: Observations, seen: tuple[float, float], drift: Floats) -> None:
+    """Make a landmark of rays. The graph adds it at its next update.
+
+    at: (n,) the rows of its rays, which the graph does not have. fit: its position. obs: the rays in map. seen: the stamps
+    (s) of its first and last observation. drift: (6, 6) odometry drift at the last observation.
+    """
+    j = m.next_id.landmark
+    m.next_id.landmark += 1
+    m.rays.owner[at] = j
+    m.rays.used[at] = fit.inlier
+    inner = obs.take(fit.inlier)
+    m.landmarks.add(
+        id=[j],
+        position=fit.position[None],
+        information=information(inner, fit.position).sum(axis=0)[None],
+        label=[int(m.rays.label[at[0]])],
+        drift=drift[None],
+        first=[seen[0]],
+        last=[seen[1]],
+        seen=[int(fit.inlier.sum())],
+        expected=[len(at)],
+        far=[float(np.linalg.norm(fit.position - inner.origin, axis=1).max())],
+        squared=[float((normalised_residuals(inner, fit.position) ** 2).clip(max=CLIPPED_RAY**2).sum())],
+        rejected=[0],
+    )
+    m.graph.add_landmark(j, fit.position)
+    m.graph.add_rays(m.bearings(at[fit.inlier]))
 
 
 def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: np.random.Generator) -> PointFit | None:

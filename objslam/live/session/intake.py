@@ -14,12 +14,12 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
-from objslam.core.geometry import inverse, motion_between
 from objslam.core.snapshot import CAME_BEFORE, LATE_FRAME, NOT_USED
 from objslam.core.validity import is_valid_position
 from objslam.live.counters import Counters
 from objslam.live.session import checks
 from objslam.live.session.clock import Clock, Lead
+from objslam.live.session.odometry_restarts import OdometryRestarts
 from objslam.live.session.stamp_leaps import StampLeaps
 from objslam.sources.journal.records import (
     CameraMessage,
@@ -31,11 +31,6 @@ from objslam.sources.journal.records import (
     PoseMessage,
 )
 
-_JUMP = 0.1  # A step is a restart if it exceeds live.max_speed by this, m. A larger value misses more restarts.
-_TURN = 0.3  # A turn is a restart if it exceeds _TURNS_PER_M by this, rad. A larger value misses more restarts.
-_TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
-_ZERO = 0.05  # After a gap, odometry nearer to 0 than this, m and rad, is a restart. A larger value finds more restarts.
-_FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or rad. A larger value finds fewer restarts.
 _MOST_CAMERAS = 256  # The most cameras of a session. A larger number costs memory if somebody makes up names.
 _MOST_LABELS = 10_000  # The most labels of a session. A larger number costs memory if somebody makes up labels.
 _STAMPS = 256  # The stamps per camera that are kept to detect duplicates. A larger number detects later duplicates.
@@ -78,7 +73,7 @@ class Intake:
         self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
         self._resumed: dict[str, float] = {}  # The stamp of the last frame of each camera in a resumed journal.
-        self._start_T_odom = np.eye(4)  # Moves poses from the odometry's present frame into its first one.
+        self._restarts = OdometryRestarts(settings, counters)
         self._last: dict[PathKind, PoseMessage] = {}
         self._heard: dict[PathKind, OrderedDict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
         self._lead = Lead(self._clock, settings.poses.max_gap)
@@ -167,7 +162,7 @@ class Intake:
                 self._lead.heard(message.path, message.stamp)
                 self._leaps.recall(message.path, message.stamp - self._clock.shift)
             elif isinstance(message, NoteMessage):
-                self._clock.shift, self._start_T_odom = message.clock, message.odometry
+                self._clock.shift, self._restarts.start_T_odom = message.clock, message.odometry
             elif isinstance(message, FrameMessage):
                 self._labels.update(message.labels)
                 self._remember(message.camera, message.stamp)
@@ -231,7 +226,10 @@ class Intake:
             if last is not None and at <= last.stamp:
                 return self._refuse(f"{path} that is late", where)
         if path == "odometry":
-            pose = self._continuous(at, pose)
+            since = (None, math.inf) if last is None else (last.pose, at - last.stamp)
+            pose, restarted = self._restarts.continued(pose, *since)
+            if restarted:
+                self._note()
             if not is_valid_position(*pose[:3, 3].tolist()):
                 return self._refuse("odometry with a position out of range", where)
         message = PoseMessage(path, at, pose)
@@ -272,7 +270,7 @@ class Intake:
         known = self._heard[path].get(at) if path in self._heard else None
         if known is None or at >= self._last[path].stamp:
             return False
-        pose = self._start_T_odom @ pose if path == "odometry" else pose
+        pose = self._restarts.start_T_odom @ pose if path == "odometry" else pose
         return bool(np.abs(known - pose).max() < _SAME_POSE)
 
     def _keep(self, message: PoseMessage) -> None:
@@ -284,27 +282,6 @@ class Intake:
     def _place(self, stamp: float) -> float:
         """Return the session time of a mount, of a frame, or of a pose on the path that does not set the clock."""
         return self._clock.place(stamp, self.newest - self._settings.live.max_late, self.newest + _WAIT)
-
-    def _continuous(self, at: float, odom_T_base: Floats) -> Floats:
-        """Return a pose in the coordinate frame of the first odometry, even if the robot's odometry has restarted."""
-        last = self._last.get("odometry")
-        pose = self._start_T_odom @ odom_T_base
-        if last is None:
-            return pose
-        gap = at - last.stamp
-        if gap > self._settings.poses.max_gap:
-            self.counters.accept("gaps of the odometry")
-        moved, fast = motion_between(last.pose, pose), self._settings.live.max_speed
-        way, turn = math.hypot(*moved.way), moved.angle
-        jumped = way > fast * gap + _JUMP or turn > _TURNS_PER_M * fast * gap + _TURN
-        if gap > self._settings.poses.max_gap and _reach(np.eye(4), odom_T_base) < _ZERO:
-            jumped |= _reach(self._start_T_odom, last.pose) > _FAR
-        if jumped:
-            self.counters.accept("restarts of the odometry")
-            self._start_T_odom = last.pose @ inverse(odom_T_base)
-            self._note()
-            return np.asarray(self._start_T_odom @ odom_T_base)
-        return np.asarray(pose)
 
     def _with_known_labels(self, frame: FrameMessage, where: str) -> FrameMessage:
         """Return a frame without the boxes whose labels are beyond the first _MOST_LABELS of the session."""
@@ -326,7 +303,7 @@ class Intake:
             del seen[next(iter(seen))]
 
     def _note(self) -> None:
-        self._hand_on(NoteMessage(self._clock.shift, self._start_T_odom))
+        self._hand_on(NoteMessage(self._clock.shift, self._restarts.start_T_odom))
 
     def _hand_on(self, message: Message, arrival: float | None = None) -> bool:
         """Deliver a message, count it if it is accepted, and return whether it is accepted. arrival: now, if None."""
@@ -342,9 +319,3 @@ class Intake:
 
 def _kind(message: Message) -> str:
     return message.path if isinstance(message, PoseMessage) else _KINDS[type(message)]
-
-
-def _reach(before: Floats, after: Floats) -> float:
-    """Return the angle (rad) or the length (m) of the motion between two poses (4, 4), whichever is the larger number."""
-    _, angle, way = motion_between(before, after)
-    return max(angle, math.hypot(*way))

@@ -8,6 +8,7 @@ from objslam.core.camera import Camera, spoken_name
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, Log
 from objslam.core.validity import NO_AREA
+from objslam.errors import LogError
 from objslam.mapping.checks.finding import Finding
 
 _FEWEST = 20
@@ -23,6 +24,21 @@ _LEAST_SPAN = 0.55
 """The least share of the image's width and height that the boxes of a long log cover. A larger share warns more often."""
 _LONG = 200
 """A log with at least this many boxes is long, so that its boxes should cover most of the image."""
+
+
+def refuse_shares(log: Log) -> None:
+    """Raise a LogError if all boxes of a camera lie between 0 and 1: they are shares of the image.
+
+    No detector finds boxes of less than a pixel in one corner of the image, so the fault is certain, and no box is of use.
+    """
+    for one in log.cameras:
+        found, size = one.detections, one.camera.size.astype(int).tolist()
+        if found is not None and len(found) and found.boxes.min() >= 0 and found.boxes.max() <= 1:
+            raise LogError(
+                f"the boxes of {spoken_name(one.camera.name)} are shares of the image, not px: all lie between 0 and 1",
+                where=log.name,
+                hint=f"write x1 y1 x2 y2 in px: x times {size[0]}, y times {size[1]}",
+            )
 
 
 def check_boxes(log: Log, ledger: Ledger) -> list[Finding]:

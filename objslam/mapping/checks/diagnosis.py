@@ -12,7 +12,7 @@ from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
-from objslam.mapping.checks.boxes import check_boxes
+from objslam.mapping.checks.boxes import check_boxes, refuse_shares
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.disagreement import disagree
 from objslam.mapping.checks.hypotheses.every import later
@@ -94,10 +94,11 @@ def diagnose(
 ) -> Diagnosis:
     """Return the diagnosis of a log. thorough: whether to try hypotheses even if all looks right.
 
-    ledger: of the reading of the log. LogError if stamps are not in s.
+    ledger: of the reading of the log. LogError if stamps are not in s, or boxes not in px.
     """
     if log.localization is None and log.odometry is None:
         return Diagnosis()
+    refuse_shares(log)
     stamps = check_stamps(log)
     if stamps is not None and stamps.spoils:
         raise LogError(stamps.message, where=log.name, hint="write all stamps in s")

@@ -175,9 +175,10 @@ def _reason(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> str:
             return f": the thing would be {size} large{known}"
         case "moves":
             way = _length(groups.way[g])
-            return (
-                f": a point that moves by {way} explains them better than one at rest: it moves, or its boxes wander over it"
-            )
+            causes = "it moves, or its boxes wander over it"
+            if not result.keyframes.localized_every:  # Drift between two visits looks like a motion of the thing.
+                causes = "it moves, its boxes wander over it, or the path drifted between its boxes"
+            return f": a point that moves by {way} explains them better than one at rest: {causes}"
         case "chance":
             return ": as many rays of other boxes of this label would meet there by chance"
         case _:

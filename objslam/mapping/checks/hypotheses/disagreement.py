@@ -6,14 +6,14 @@ from objslam.core.arrays import Bools
 from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.mounts import unset
-from objslam.mapping.checks.hypotheses.trials import Trial
+from objslam.mapping.checks.hypotheses.trials import Trial, chance
 
 _BAD_SCORE = 0.4
 """Boxes may disagree with the poses if their score is below this. Clean logs have at least 0.56, recorded or simulated. Logs
 with a camera that is turned in any way have at most 0.3. A larger score accuses more logs."""
-_CHANCE, _TIMES = 90.0, 2.0
-"""Boxes agree by chance if their score is below this multiple of what this percentage of all turned mounts does not reach.
-Clean logs have at least 2.9 times as much, logs with turned cameras at most 1.9. Larger values accuse more logs."""
+_TIMES = 2.0
+"""Boxes agree by chance if their score is below this multiple of that of chance (`trials.chance`). Clean logs have at least
+2.9 times as much, logs with turned cameras at most 1.9. A larger value accuses more logs."""
 _DISTANT = 0.9
 """The share of boxes that fit a point or a direction from which boxes are not said to disagree. It is at least 0.94 in logs
 without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
@@ -32,8 +32,8 @@ def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | Non
     found: after the usual errors of the cameras are corrected, as far as the boxes show them. Turned mounts show what chance
     does in this log. Things that are too far for parallax give no point, but each has one direction.
     """
-    turned = [trial.score for trial in trials if trial.hypothesis is not None and trial.hypothesis.of_mount]
-    if not turned or found.score >= min(_BAD_SCORE, _TIMES * float(np.percentile(turned, _CHANCE))):
+    by_chance = chance(trials)
+    if by_chance is None or found.score >= min(_BAD_SCORE, _TIMES * by_chance):
         return None
     if _at_rest(found).sum() >= _DISTANT * found.boxes:
         return None

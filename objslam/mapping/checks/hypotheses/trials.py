@@ -1,7 +1,9 @@
 """Try hypotheses about wrong input on a part of a log, and name the hypothesis that explains the log much better."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from objslam.config import Settings
 from objslam.core.types import Log
@@ -34,6 +36,14 @@ by chance: a right one lets 0.9 of the boxes fit. A larger share names fewer cau
 _RIVAL = 0.02
 """A mount explains the boxes as well as an unusual error if its score is at most this much smaller. Two fits of one log with
 different random pairs differ by as much. A larger value names more mounts."""
+
+_CHANCE = 90.0
+"""The percentage of all turned mounts that have at most the score of chance. A larger percentage takes more for chance."""
+_BEYOND, _FAR_BETTER = 1.3, 1.5
+"""A mount is clear if its score is at least the first multiple of chance, and the second of the score of the log as it is.
+In logs of five kinds of simulated robots and three real ones, with odometry alone and a turned camera, the right turn has
+1.2 to 3.7 times the score of chance, mostly more than 1.4. No mount has more than 1.34 times the score of a clean log.
+Larger multiples keep fewer findings that no solve supports."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +129,20 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     if taken:
         message += f". The run takes it for {unusual}, and corrects that"
     return Finding(best.hypothesis.name, message, spoils=not taken, basis="log" if _is_crooked(first) else "boxes")
+
+
+def chance(trials: Sequence[Trial]) -> float | None:
+    """Return the score that boxes reach by chance in this log: that of the best tenth of all turned mounts, of which at most
+    one is right. None if no mounts were tried."""
+    turned = [trial.score for trial in trials if trial.hypothesis is not None and trial.hypothesis.of_mount]
+    return float(np.percentile(turned, _CHANCE)) if turned else None
+
+
+def clear(trials: Sequence[Trial], name: str) -> bool:
+    """Return whether a mount, by the name of its hypothesis, is far better than the log as it is, and than chance."""
+    by_chance = chance(trials)
+    scores = [t.score for t in trials if t.hypothesis is not None and t.hypothesis.of_mount and t.hypothesis.name == name]
+    return by_chance is not None and max(scores, default=0.0) >= max(_BEYOND * by_chance, _FAR_BETTER * trials[0].score)
 
 
 def crooked(log: Log) -> bool:

@@ -1,0 +1,58 @@
+"""The odometry of a session in one coordinate frame, even if the robot's odometry restarts."""
+
+import math
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats
+from objslam.core.geometry import inverse, motion_between
+from objslam.live.counters import Counters
+
+_JUMP = 0.1  # A step is a restart if it exceeds live.max_speed by this, m. A larger value misses more restarts.
+_TURN = 0.3  # A turn is a restart if it exceeds _TURNS_PER_M by this, rad. A larger value misses more restarts.
+_TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
+_ZERO = 0.05  # After a gap, odometry nearer to 0 than this, m and rad, is a restart. A larger value finds more restarts.
+_FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or rad. A larger value finds fewer restarts.
+
+
+class OdometryRestarts:
+    """Finds restarts of the robot's odometry, and moves the poses after them so that they continue the old path.
+
+    start_T_odom: (4, 4), moves poses from the odometry's present frame into its first one.
+    """
+
+    def __init__(self, settings: Settings, counters: Counters) -> None:
+        self._max_gap, self._fast, self._counters = settings.poses.max_gap, settings.live.max_speed, counters
+        self.start_T_odom = np.eye(4)
+
+    def continued(self, odom_T_base: Floats, last: Floats | None, gap: float) -> tuple[Floats, bool]:
+        """Return a pose (4, 4) in the frame of the first odometry, and whether the odometry has restarted before it.
+
+        last: the pose before it, in the frame of the first odometry, None if there is none. gap: the time since then, s.
+        """
+        pose = np.asarray(self.start_T_odom @ odom_T_base)
+        if last is None:
+            return pose, False
+        if gap > self._max_gap:
+            self._counters.accept("gaps of the odometry")
+        if not self._jumped(odom_T_base, pose, last, gap):
+            return pose, False
+        self._counters.accept("restarts of the odometry")
+        self.start_T_odom = last @ inverse(odom_T_base)
+        return np.asarray(self.start_T_odom @ odom_T_base), True
+
+    def _jumped(self, odom_T_base: Floats, pose: Floats, last: Floats, gap: float) -> bool:
+        """Return whether no robot can move so, or the odometry counts from 0 again after a gap."""
+        moved = motion_between(last, pose)
+        way, turn = math.hypot(*moved.way), moved.angle
+        if way > self._fast * gap + _JUMP or turn > _TURNS_PER_M * self._fast * gap + _TURN:
+            return True
+        began = gap > self._max_gap and _reach(np.eye(4), odom_T_base) < _ZERO
+        return began and _reach(self.start_T_odom, last) > _FAR
+
+
+def _reach(before: Floats, after: Floats) -> float:
+    """Return the angle (rad) or the length (m) of the motion between two poses (4, 4), whichever is the larger number."""
+    _, angle, way = motion_between(before, after)
+    return max(angle, math.hypot(*way))
