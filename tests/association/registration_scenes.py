@@ -4,6 +4,7 @@ import numpy as np
 
 from objslam.association.place_recognition import Constellation
 from objslam.core.geometry import lift_se2
+from objslam.core.maps.shared_covariance import NUMBERS, jacobian
 
 SIGMA = 0.05  # m
 DENSITY = 0.25  # objects per m^2
@@ -11,6 +12,14 @@ DENSITY = 0.25  # objects per m^2
 
 def of(points, labels):
     return Constellation(points, np.tile(SIGMA**2 * np.eye(3), (len(points), 1, 1)), labels)
+
+
+def bent(rng, one, shared):
+    """A map with an error that all its objects share, drawn from its covariance (7, 7). The covariances contain it."""
+    lever = jacobian(one.position)
+    error = np.linalg.cholesky(shared + 1e-18 * np.eye(NUMBERS)) @ rng.normal(size=NUMBERS)
+    spread = one.covariance + lever @ shared @ np.swapaxes(lever, 1, 2)
+    return Constellation(one.position + lever @ error, spread, one.label)
 
 
 def place(rng, count, labels, density=DENSITY):

@@ -16,7 +16,6 @@ from scipy.special import gammaln
 from objslam.association.place_recognition import Constellation
 from objslam.association.registration.fitting import (
     Problem,
-    centred,
     covariances,
     fit,
     gate,
@@ -24,8 +23,10 @@ from objslam.association.registration.fitting import (
     move,
     one_each,
     robust_step,
+    transform_covariance,
 )
 from objslam.association.registration.proposals import around, propose
+from objslam.association.registration.shapes import shape_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import lift_se2
 from objslam.core.statistics import SAME_POINT
@@ -78,8 +79,13 @@ class Registration:
         return self.verdict == "accepted"
 
 
-def register_maps(a: Constellation, b: Constellation) -> Registration:
+def register_maps(
+    a: Constellation, b: Constellation, shared_a: Floats | None = None, shared_b: Floats | None = None
+) -> Registration:
     """Find the transform (yaw and translation) from the frame of a to the frame of b. Both maps use the same label numbers.
+
+    shared_a, shared_b: (7, 7) the covariances of the errors that all objects of a map share, None if they are not known. The
+    covariances of a and b contain them (`shapes` says what a registration makes of them).
 
     Both maps have z up. The log odds are -ln(T * P(X >= m - 2)) for T tried proposals and m matched objects. The two objects
     of the proposing pair do not count. X, the number of matches by chance, is Poisson distributed. Its mean is a sum over
@@ -89,8 +95,8 @@ def register_maps(a: Constellation, b: Constellation) -> Registration:
     keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
     if min(len(keep_a), len(keep_b)) < 2:
         return _nothing()
-    centre_a, centre_b = a.position[keep_a].mean(axis=0), b.position[keep_b].mean(axis=0)
-    problem = Problem(centred(a, keep_a, centre_a), centred(b, keep_b, centre_b))
+    problem = Problem(shape_of(a, keep_a, shared_a), shape_of(b, keep_b, shared_b))
+    centre_a, centre_b = problem.a.centre, problem.b.centre
     first, x, tried = propose(problem)
     if len(first) == 0:
         return _nothing()
@@ -181,7 +187,6 @@ def _finish(problem: Problem, x: Floats) -> tuple[Floats, Floats, Ints]:
     Return the transform, its covariance (4, 4), and the matches (P, 2).
     """
     a = b = np.zeros(0, dtype=np.int64)
-    hessian = np.eye(4)[None]
     for _ in range(_FITS):
         moved = move(x[None], problem.a.position[None])[0]
         near = KDTree(moved).sparse_distance_matrix(KDTree(problem.b.position), _reach(problem), output_type="coo_matrix")
@@ -200,7 +205,7 @@ def _finish(problem: Problem, x: Floats) -> tuple[Floats, Floats, Ints]:
         a, b = a[matched], b[matched]
         if len(a) < 2:
             break
-        fitted, hessian = robust_step(
+        fitted, _ = robust_step(
             x[None],
             (problem.b.position[b] - moved[a])[None],
             covariances(problem, x[None], a[None], b[None]),
@@ -208,7 +213,8 @@ def _finish(problem: Problem, x: Floats) -> tuple[Floats, Floats, Ints]:
             np.ones((1, len(a)), dtype=bool),
         )
         x = fitted[0]
-    return x, np.linalg.inv(hessian[0]), np.column_stack([a, b])
+    covariance = transform_covariance(problem, x, a, b) if len(a) > 1 else np.full((4, 4), np.nan)
+    return x, covariance, np.column_stack([a, b])
 
 
 def _reach(problem: Problem) -> float:
