@@ -60,6 +60,19 @@ def twins(rng, count, labels, overlap, changed=0.2):
     return a, b, b_T_a, np.column_stack([np.cumsum(in_a)[both] - 1, np.cumsum(in_b)[both] - 1])
 
 
+def groups(rng, count, each, labels, spacing=0.18, sigma=0.04):
+    """Rows of equal objects, such as chairs at tables, scattered in a plane: a chance match of one brings others along."""
+    side, points = np.sqrt(count / 0.2), []
+    for centre in rng.uniform(0, side, (count, 2)):
+        step, turn = spacing * (np.arange(each) - (each - 1) / 2), rng.uniform(0, np.pi)
+        row = centre + step[:, None] * [np.cos(turn), np.sin(turn)]
+        points.append(np.column_stack([row, np.zeros(each)]))
+    spread = np.array([sigma, sigma, 0.3 * sigma])
+    at = np.concatenate(points) + spread * rng.normal(size=(count * each, 3))
+    label = np.repeat(rng.integers(0, labels, count), each)
+    return Constellation(at, np.tile(np.diag(spread**2), (len(at), 1, 1)), label)
+
+
 def rooms(rng):
     """One room of twelve objects, and three rooms just like it in a row."""
     points, labels = place(rng, 12, 4, density=0.6)
