@@ -4,6 +4,7 @@ import numpy as np
 
 from objslam.association.place_recognition import Constellation
 from objslam.core.geometry import lift_se2
+from objslam.core.maps.shared_covariance import NUMBERS, jacobian
 
 SIGMA = 0.05  # m
 DENSITY = 0.25  # objects per m^2
@@ -11,6 +12,14 @@ DENSITY = 0.25  # objects per m^2
 
 def of(points, labels):
     return Constellation(points, np.tile(SIGMA**2 * np.eye(3), (len(points), 1, 1)), labels)
+
+
+def bent(rng, one, shared):
+    """A map with an error that all its objects share, drawn from its covariance (7, 7). The covariances contain it."""
+    lever = jacobian(one.position)
+    error = np.linalg.cholesky(shared + 1e-18 * np.eye(NUMBERS)) @ rng.normal(size=NUMBERS)
+    spread = one.covariance + lever @ shared @ np.swapaxes(lever, 1, 2)
+    return Constellation(one.position + lever @ error, spread, one.label)
 
 
 def place(rng, count, labels, density=DENSITY):
@@ -49,6 +58,19 @@ def twins(rng, count, labels, overlap, changed=0.2):
     b = of(new[in_b] + rng.normal(0, SIGMA, (in_b.sum(), 3)), new_kind[in_b])
     both = in_a & in_b & ~moved
     return a, b, b_T_a, np.column_stack([np.cumsum(in_a)[both] - 1, np.cumsum(in_b)[both] - 1])
+
+
+def groups(rng, count, each, labels, spacing=0.18, sigma=0.04):
+    """Rows of equal objects, such as chairs at tables, scattered in a plane: a chance match of one brings others along."""
+    side, points = np.sqrt(count / 0.2), []
+    for centre in rng.uniform(0, side, (count, 2)):
+        step, turn = spacing * (np.arange(each) - (each - 1) / 2), rng.uniform(0, np.pi)
+        row = centre + step[:, None] * [np.cos(turn), np.sin(turn)]
+        points.append(np.column_stack([row, np.zeros(each)]))
+    spread = np.array([sigma, sigma, 0.3 * sigma])
+    at = np.concatenate(points) + spread * rng.normal(size=(count * each, 3))
+    label = np.repeat(rng.integers(0, labels, count), each)
+    return Constellation(at, np.tile(np.diag(spread**2), (len(at), 1, 1)), label)
 
 
 def rooms(rng):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from association.registration_scenes import SIGMA, errors, of, place, rooms, twins
+from association.registration_scenes import SIGMA, errors, groups, of, place, rooms, twins
 
 from objslam.association.registration.map_registration import register_maps
 from objslam.core.geometry import align
@@ -33,6 +33,26 @@ def test_maps_of_different_places_are_refused():
     for _ in range(20):
         a, b = of(*place(rng, int(rng.integers(10, 80)), 3)), of(*place(rng, int(rng.integers(10, 80)), 3))
         assert not register_maps(a, b).accepted
+
+
+def test_groups_of_equal_objects_give_no_false_evidence():
+    """Log odds of x come by chance in at most exp(-x) of the pairs of different places, 13 % for 2."""
+    rng = np.random.default_rng(5)
+    odds = [register_maps(*(groups(rng, 10, 5, 6) for _ in range(2))).log_odds for _ in range(12)]
+    assert np.mean(np.array(odds) > 2) <= 0.135
+
+
+def test_objects_that_agree_closely_are_more_evidence():
+    """Fifteen objects without names, each off by 2.6 standard deviations, or by 1. Both are inside the gates."""
+    rng, odds = np.random.default_rng(6), []
+    for _ in range(6):
+        points, labels = place(rng, 15, 1)
+        off = rng.normal(size=points.shape)
+        off *= np.sqrt(2) * SIGMA / np.linalg.norm(off, axis=1)[:, None]
+        odds.append([register_maps(of(points, labels), of(points + part * off, labels)).log_odds for part in (2.6, 1.0)])
+    far, close = np.median(odds, axis=0)
+    assert far > 9.2
+    assert close > far + 6
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -1,10 +1,14 @@
 """UTIAS MRCLAM 6: the map of three real robots, poses and landmarks together from wheel odometry and a camera."""
 
+from dataclasses import replace
+from itertools import permutations
+
 import numpy as np
 import pytest
 from log_parts import part
 from mrclam import mapped
 
+from objslam.association.registration.object_maps import register
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align
@@ -96,3 +100,20 @@ def test_three_robots_without_a_common_frame_are_one_map(data_dir):
     assert np.sqrt((off**2).sum(axis=1).mean()) <= 0.05
     squared = np.einsum("ni,ni->n", off, np.linalg.solve(island.objects.covariances, off[..., None])[..., 0])
     assert (squared < 7.815).all()
+
+
+def test_three_robots_are_one_map_also_without_names(data_dir):
+    """The same maps, with one label for all landmarks. They stand in clusters 17 cm apart."""
+    sessions = []
+    for robot in (1, 3, 5):
+        named = mapped(data_dir, robot, True)[1].map
+        equal = tuple(replace(o, label="landmark", labels=None) for o in named)
+        sessions.append(Session(f"robot {robot}", replace(named, objects=equal)))
+    for a, b in permutations(sessions, 2):
+        found = register(a.objects, b.objects)
+        assert found.accepted
+        # The maps have their objects in the order of names.
+        np.testing.assert_array_equal(found.matches[:, 0], found.matches[:, 1])
+    (island,) = merge_sessions(sessions)
+    assert len(island.objects) == 15
+    assert all(o.life.sessions_seen == 3 for o in island.objects)

@@ -3,30 +3,37 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from objslam.association.place_recognition import Constellation
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.association.registration.shapes import Shape
+from objslam.core.arrays import Array, Bools, Floats, Ints
 from objslam.core.geometry import lift_se2
+from objslam.core.maps.shared_covariance import jacobian as shared_jacobian
 from objslam.core.statistics import HUBER_K, SAME_POINT
 
-_FLOOR = 0.01
-"""The standard deviation (m) added to each position, so that exact maps can be registered. A larger value matches more."""
+_DETERMINED = 1e12
+"""The largest condition number of the information of a transform that its matches determine. A larger number accepts worse
+ones."""
 _DENSITY_NEIGHBOURS = 8
 """The number of nearest objects from which the local density of objects is computed. A larger number smooths it more."""
+_ALIKE_NEIGHBOURS = 4
+"""The same for objects of one label, all of which count. It follows groups of equal objects. A smaller number gives these
+less evidence. With 4, false alarms in simulated places of groups of two, three and five are as rare as the log odds say."""
 
 
 class Problem:
     """Maps a and b, each relative to its centre, with values that are computed only once.
 
-    spread_a, spread_b: (N,) and (M,) m^2, the horizontal variance of each position. apart: m, more than any distance of two
-    objects.
+    spread_a, spread_b: (N,) and (M,) m^2, the horizontal variance of each object's own error. apart: m, more than any
+    distance of two objects.
     """
 
-    def __init__(self, a: Constellation, b: Constellation) -> None:
+    def __init__(self, a: Shape, b: Shape) -> None:
         self.a, self.b = a, b
-        self.spread_a, self.spread_b = (np.trace(m.covariance[:, :2, :2], axis1=1, axis2=2) / 2 for m in (a, b))
+        self.spread_a, self.spread_b = (np.trace(m.own[:, :2, :2], axis1=1, axis2=2) / 2 for m in (a, b))
         self.apart = 4 * max(float(np.abs(m.position).max()) for m in (a, b)) + 1.0
         self._labelled = KDTree(np.column_stack([b.position, b.label * self.apart]))
         self._level = KDTree(b.position[:, :2])
+        self._alike = KDTree(np.column_stack([b.position[:, :2], b.label * self.apart]))
+        self._count = np.bincount(b.label)
         order = np.lexsort((b.position[:, 2], b.label))
         self._heights = b.position[order, 2] + b.label[order] * 4 * self.apart
 
@@ -38,21 +45,36 @@ class Problem:
         at = np.concatenate([moved, self.a.label[index][..., None] * self.apart], axis=-1)
         return np.asarray(self._labelled.query(at.reshape(-1, 4))[1]).reshape(index.shape)
 
-    def chance(self, moved: Floats, index: Ints, covariance: Floats) -> Floats:
-        """Return the probability (H, P) that an object of a, moved to (H, P, 3), has a match in b by chance."""
-        k = min(_DENSITY_NEIGHBOURS, len(self.b.label))
-        radius = np.asarray(self._level.query(moved[..., :2].reshape(-1, 2), k=[k])[0]).reshape(index.shape)
-        area = np.pi * SAME_POINT * np.sqrt(np.linalg.det(covariance[..., :2, :2]))
-        reach = np.minimum(np.sqrt(SAME_POINT * covariance[..., 2, 2]), self.apart)
-        height = np.clip(moved[..., 2], -self.apart, self.apart) + self.a.label[index] * 4 * self.apart
-        like = np.searchsorted(self._heights, height + reach) - np.searchsorted(self._heights, height - reach)
-        mean = k / (np.pi * radius**2 + area) * area * np.maximum(like, 1) / len(self.b.label)
-        return -np.expm1(-mean)
+    def chance(self, moved: Floats, index: Ints, covariance: Floats, limits: tuple[float, ...]) -> Floats:
+        """Return the probability (L, H, P) that an object of a, moved to (H, P, 3), has a match in b by chance.
+
+        limits: the L largest squared Mahalanobis distances of a match. The local density of objects with the label is the
+        larger one of two: the density of all objects times the share of the label, and the density of this label alone.
+        Equal objects often stand in groups, such as chairs at a table. A chance match of one of them brings others along.
+        """
+        label = self.a.label[index]
+        everything, alike = moved[..., :2], np.concatenate([moved[..., :2], label[..., None] * self.apart], axis=-1)
+        area = np.pi * np.sqrt(np.linalg.det(covariance[..., :2, :2]))
+        height = np.clip(moved[..., 2], -self.apart, self.apart) + label * 4 * self.apart
+        found = []
+        nearest, nearest_alike = (min(k, len(self.b.label)) for k in (_DENSITY_NEIGHBOURS, _ALIKE_NEIGHBOURS))
+        others = max(nearest - 2, 1)  # Without the match and the farthest one, scattered objects have the right mean.
+        counted = (
+            (others / len(self.b.label), _farthest(self._level, everything, nearest)),
+            (nearest_alike / self._count[label], _farthest(self._alike, alike, nearest_alike)),
+        )
+        for limit in limits:
+            reach = np.minimum(np.sqrt(limit * covariance[..., 2, 2]), self.apart)
+            like = np.searchsorted(self._heights, height + reach) - np.searchsorted(self._heights, height - reach)
+            density = np.maximum(*(share / (np.pi * radius**2 + limit * area) for share, radius in counted))
+            found.append(-np.expm1(-density * limit * area * np.maximum(like, 1)))
+        return np.array(found)
 
 
-def centred(whole: Constellation, keep: Ints, centre: Floats) -> Constellation:
-    """Return the objects `keep` (N,) of a map, relative to a centre (3,) m, with `_FLOOR` added to their covariances."""
-    return Constellation(whole.position[keep] - centre, whole.covariance[keep] + _FLOOR**2 * np.eye(3), whole.label[keep])
+def _farthest(tree: KDTree, points: Floats, number: int) -> Floats:
+    """Return the distance (H, P) from points (H, P, d) to the last one of the `number` objects nearest to each, m."""
+    distance = np.asarray(tree.query(points.reshape(-1, points.shape[-1]), k=[number])[0])
+    return distance.reshape(points.shape[:-1])
 
 
 def move(x: Floats, points: Floats) -> Floats:
@@ -115,16 +137,46 @@ def robust_step(x: Floats, miss: Floats, covariance: Floats, jacobian: Floats, g
     miss, covariance, jacobian: (H, P, 3), (H, P, 3, 3) and (H, P, 3, 4) of the pairs. good: (H, P) which pairs match.
     """
     information = np.linalg.inv(covariance)
-    deviation = np.sqrt(np.einsum("hpi,hpij,hpj->hp", miss, information, miss))
-    weight = good * np.minimum(1.0, HUBER_K / np.maximum(deviation, 1e-12))
-    weighted = np.swapaxes(jacobian, -1, -2) @ (information * weight[..., None, None])
+    weighted = np.swapaxes(jacobian, -1, -2) @ (information * (good * _weights(miss, information))[..., None, None])
     hessian = (weighted @ jacobian).sum(axis=1)
     gradient = (weighted @ miss[..., None])[..., 0].sum(axis=1)
-    fixed = (good.sum(axis=1) >= 2) & (np.linalg.cond(hessian) < 1e12)
+    fixed = (good.sum(axis=1) >= 2) & (np.linalg.cond(hessian) < _DETERMINED)
     hessian[~fixed] = np.eye(4)
     step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
     hessian[~fixed] = np.nan
     return np.where(fixed[:, None], x + step, x), hessian
+
+
+def _weights(miss: Floats, information: Array) -> Floats:
+    """Return Huber's weights (..., P) of offsets (..., P, 3) m with information (..., P, 3, 3)."""
+    deviation = np.sqrt(np.einsum("...pi,...pij,...pj->...p", miss, information, miss))
+    return np.asarray(np.minimum(1.0, HUBER_K / np.maximum(deviation, 1e-12)))
+
+
+def transform_covariance(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
+    """Return the covariance (4, 4) of a transform x (4,) that was fitted to the pairs of objects a (P,) and b (P,).
+
+    The shared errors of both maps move the fit as `shapes` derives. So the covariance has their shift and yaw, undiminished
+    by the number of pairs, and what their tilt and size do to this fit. NaN if the pairs do not
+    determine the transform.
+    """
+    moved = move(x[None], problem.a.position[a][None])
+    offset = covariances(problem, x[None], a[None], b[None])[0]
+    information = np.linalg.inv(offset)
+    weight = _weights(problem.b.position[b] - moved[0], information)[:, None, None]
+    lever = jacobian_of(x[None], moved)[0]
+    pull = np.swapaxes(lever, 1, 2) @ (information * weight)
+    hessian = (pull @ lever).sum(axis=0)
+    if np.linalg.cond(hessian) > _DETERMINED:
+        return np.full((4, 4), np.nan)
+    gain = np.linalg.inv(hessian) @ pull
+    rotation = lift_se2(x[[0, 1, 3]])[:3, :3]
+    own = (rotation @ problem.a.own[a] @ rotation.T + problem.b.own[b]) / weight
+    total = (gain @ own @ np.swapaxes(gain, 1, 2)).sum(axis=0)
+    for shape, turn, at in ((problem.a, rotation, problem.a.position[a]), (problem.b, np.eye(3), moved[0])):
+        moves = (gain @ turn @ shared_jacobian(at)).sum(axis=0)
+        total += moves @ shape.shared @ moves.T
+    return np.asarray((total + total.T) / 2)
 
 
 def one_each(partner: Ints, good: Bools) -> Bools:

@@ -20,13 +20,13 @@ def register(a: ObjectMap, b: ObjectMap) -> Registration:
     names = sorted({o.label for m in (a, b) for o in m})
     number = {name: k for k, name in enumerate(names)}
     kept = [placed(a), placed(b)]
-    maps = (
+    one, other = (
         Constellation(
             m.positions[some], m.covariances[some], np.array([number[m.objects[i].label] for i in some], dtype=np.int64)
         )
         for m, some in zip((a, b), (np.array(k, dtype=np.int64) for k in kept), strict=True)
     )
-    found = register_maps(*maps)
+    found = register_maps(one, other, a.shared_covariance, b.shared_covariance)
     pairs = [(kept[0][i], kept[1][k]) for i, k in found.matches.tolist()]
     return replace(found, matches=np.array(pairs, dtype=np.int64).reshape(-1, 2))
 

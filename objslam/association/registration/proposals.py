@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial import KDTree
 
-from objslam.association.place_recognition import Constellation
 from objslam.association.registration.fitting import Problem, move
+from objslam.association.registration.shapes import Shape, Vectors
 from objslam.core.arrays import Array, Floats, Ints
 
 _PAIRS = 6000
@@ -25,7 +25,7 @@ _AT_ONCE = 1 << 20
 """The most differences of neighbours computed together. A larger number needs more memory."""
 
 
-def _pairs(m: Constellation, spread: Floats) -> tuple[Ints, Ints]:
+def _pairs(m: Shape, spread: Floats) -> tuple[Ints, Ints]:
     """Return the pairs (P,), (P,) of each object and its nearest partners that are far enough for a heading (`_MIN_BASE`).
 
     spread: (N,) m^2, the horizontal variance of each object.
@@ -45,14 +45,12 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
     """
     a, b = problem.a, problem.b
     (i, j), (k, n) = _pairs(a, problem.spread_a), _pairs(b, problem.spread_b)
-    base_a, base_b = a.position[j] - a.position[i], b.position[n] - b.position[k]
-    long_a, long_b = (np.hypot(base[:, 0], base[:, 1]) for base in (base_a, base_b))
-    var_a, var_b = problem.spread_a[i] + problem.spread_a[j], problem.spread_b[k] + problem.spread_b[n]
+    in_a, in_b = a.vectors(i, j), b.vectors(k, n)
     labels = int(a.label.max()) + 1
-    key = (b.label[k] * labels + b.label[n]) * 2 * problem.apart + long_b
+    key = (b.label[k] * labels + b.label[n]) * 2 * problem.apart + in_b.length
     order = np.argsort(key, kind="stable")
-    middle = (a.label[i] * labels + a.label[j]) * 2 * problem.apart + long_a
-    reach = np.minimum(_GATE * np.sqrt(var_a + var_b.max(initial=0.0)), problem.apart / 4)
+    middle = (a.label[i] * labels + a.label[j]) * 2 * problem.apart + in_a.length
+    reach = np.minimum(_reach(in_a, in_b, b.size_variance), problem.apart / 4)
     begin, end = np.searchsorted(key[order], middle - reach), np.searchsorted(key[order], middle + reach, side="right")
     number = end - begin
     rare = np.argsort(number, kind="stable")
@@ -60,21 +58,35 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
     p = np.repeat(rare, number[rare])
     step = np.arange(len(p)) - np.repeat(np.cumsum(number[rare]) - number[rare], number[rare])
     q = order[begin[p] + step]
-    tall_a, tall_b = (m.covariance[u, 2, 2] + m.covariance[v, 2, 2] for m, u, v in ((a, i, j), (b, k, n)))
-    fits = np.abs(long_a[p] - long_b[q]) <= _GATE * np.sqrt(var_a[p] + var_b[q])
-    fits &= np.abs(base_a[p, 2] - base_b[q, 2]) <= _GATE * np.sqrt(tall_a[p] + tall_b[q])
+    fits = np.abs(in_a.length[p] - in_b.length[q]) <= _GATE * np.sqrt(in_a.length_variance[p] + in_b.length_variance[q])
+    rise_variance = in_a.rise_variance[p] + in_b.rise_variance[q]
+    fits &= np.abs(in_a.base[p, 2] - in_b.base[q, 2]) <= _GATE * np.sqrt(rise_variance)
     share = fits.mean() if len(fits) else 0.0
     p, q = p[fits], q[fits]
-    yaw = np.arctan2(base_b[q, 1], base_b[q, 0]) - np.arctan2(base_a[p, 1], base_a[p, 0])
+    yaw = np.arctan2(in_b.base[q, 1], in_b.base[q, 0]) - np.arctan2(in_a.base[p, 1], in_a.base[p, 0])
     x = np.column_stack([np.zeros((len(p), 3)), yaw])
     ends_a, ends_b = a.position[i[p]] + a.position[j[p]], b.position[k[q]] + b.position[n[q]]
     x[:, :3] = (ends_b - move(x, ends_a[:, None])[:, 0]) / 2
-    support = _support(problem, i[p], k[q], yaw, (var_a[p] + var_b[q]) / long_a[p] ** 2)
+    across = problem.spread_a[i[p]] + problem.spread_a[j[p]] + problem.spread_b[k[q]] + problem.spread_b[n[q]]
+    support = _support(problem, i[p], k[q], yaw, across / in_a.length[p] ** 2)
     best = np.argsort(-support, kind="stable")
     # Proposals in one cell of a metre and 0.2 rad are one place. Only the best one remains.
     cell = np.round(np.column_stack([x[:, :2], np.mod(yaw, 2 * np.pi) / 0.2]))[best]
     best = best[np.sort(np.unique(cell, axis=0, return_index=True)[1])]
     return i[p[best]], x[best], max(1, round(float(number.sum() * share) / 2))  # Each pair is in the list in both orders.
+
+
+def _reach(a: Vectors, b: Vectors, size_variance: float) -> Floats:
+    """Return by how much (m) the lengths of similar vectors in map b may differ from those (P,) of vectors in map a.
+
+    It is at least `_GATE` standard deviations. size_variance: of map b. The error of a length in b grows with that length,
+    which is not known yet, but is hardly more than the length in a.
+    """
+    other = (b.length_variance - size_variance * b.length**2).max(initial=0.0)
+    reach = np.zeros_like(a.length)
+    for _ in range(2):
+        reach = _GATE * np.sqrt(a.length_variance + other + size_variance * (a.length + reach) ** 2)
+    return reach
 
 
 def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Floats) -> Floats:
@@ -86,33 +98,37 @@ def _support(problem: Problem, i: Ints, k: Ints, yaw: Floats, turn_variance: Flo
     (near_a, offset_a), (near_b, offset_b) = (_offsets(m) for m in (problem.a, problem.b))
     support = np.zeros(len(i))
     spread = float(np.median(problem.spread_b))
+    size_variance, tilt_variance = (
+        sum(of) for of in zip(*((m.size_variance, m.tilt_variance) for m in (problem.a, problem.b)), strict=True)
+    )
     size = max(1, _AT_ONCE // (near_a.shape[1] * near_b.shape[1]))
     for begin in range(0, len(i), size):
         h = slice(begin, begin + size)
         a, b = near_a[i[h]], near_b[k[h]]
         turned = offset_a[i[h]] * np.exp(1j * yaw[h])[:, None]
         own = problem.spread_a[i[h]] + problem.spread_b[k[h]]
-        variance = problem.spread_a[a] + spread + own[:, None] + np.abs(turned) ** 2 * turn_variance[h, None]
+        far = np.abs(turned) ** 2
+        variance = problem.spread_a[a] + spread + own[:, None] + far * (turn_variance[h, None] + size_variance)
         miss = turned[:, :, None] - offset_b[k[h]][:, None, :]
         close = miss.real**2 + miss.imag**2 <= _GATE**2 * variance[:, :, None]
         close &= problem.a.label[a][:, :, None] == problem.b.label[b][:, None, :]
         rise = problem.a.position[a, 2] - problem.a.position[i[h], 2][:, None]
         rise_b = problem.b.position[b, 2] - problem.b.position[k[h], 2][:, None]
-        tall = problem.a.covariance[a, 2, 2] + 2 * np.median(problem.b.covariance[:, 2, 2])
-        tall += problem.a.covariance[i[h], 2, 2][:, None]
+        tall = problem.a.own[a, 2, 2] + 2 * np.median(problem.b.own[:, 2, 2]) + far * tilt_variance
+        tall += problem.a.own[i[h], 2, 2][:, None]
         close &= (rise[:, :, None] - rise_b[:, None, :]) ** 2 <= _GATE**2 * tall[:, :, None]
         support[h] = close.any(axis=2).sum(axis=1)
     return support
 
 
-def _offsets(m: Constellation) -> tuple[Ints, Array]:
+def _offsets(m: Shape) -> tuple[Ints, Array]:
     """Return the neighbours (N, K) of each object, and their horizontal offsets (N, K) from it as x + iy, m."""
     plane = m.position[:, 0] + 1j * m.position[:, 1]
     near = around(m, np.arange(len(plane)), _NEIGHBOURS + 1)[:, 1:]
     return near, plane[near] - plane[:, None]
 
 
-def around(m: Constellation, index: Ints, size: int) -> Ints:
+def around(m: Shape, index: Ints, size: int) -> Ints:
     """Return for each object `index` (H,) the `size` objects nearest to it, itself first."""
     at = m.position[:, :2]
     return np.asarray(KDTree(at).query(at[index], k=np.arange(1, min(size, len(at)) + 1))[1])
