@@ -51,8 +51,8 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
 def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
     """Return the stamps (n, 2), s, of pairs of bearings of one label, and the bearings (n, 2, 3), unit, in base.
 
-    The last value is the number of independent pairs: pairs of the same images share the turn, and each image is in two.
-    Labels with several boxes in an image have no pairs there.
+    The last value is the number of independent pairs. It is smaller, because pairs of the same images share the turn, and
+    each image is compared with two others. Labels with several boxes in an image have no pairs there.
     """
     keyframes, rays = errors.keyframes, errors.rays
     mine = np.flatnonzero(keyframes.camera[rays.keyframe] == camera)

@@ -107,8 +107,9 @@ def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, e
 def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
     """Return the labels of which too few others (`_WITNESSES`) could show that they have a second object.
 
-    The rays of a label are divided at a moment, so that each part is large enough for an object of its own. Another label
-    is a witness if it has rays before and after this moment. A label is unchecked if it has such a moment with too few.
+    The rays of a label are divided at a moment, so that each part is large enough for an object of its own. Another label is
+    a witness if it has rays before and after this moment. A label is unchecked if it has such a moment with too few
+    witnesses.
 
     Args:
         rays: with their labels.

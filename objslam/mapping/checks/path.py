@@ -38,8 +38,8 @@ still, its boxes do not move in the image either. A larger value finds fewer fro
 _MOVING_PX = 12.0
 """The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves."""
 _LEAST_STEP = 0.01
-"""The noise (m) of a position. The direction of a motion is judged if it is more than three times as long. A larger value
-suits noisy poses."""
+"""The noise (m) of a position. The direction of a motion is judged if the motion is more than three times as long. A larger
+value suits noisy poses."""
 _PIECE = 1.0
 """The time (s) over which distances are compared. A longer time suits noisy poses."""
 _LEAST_PIECE = 0.3

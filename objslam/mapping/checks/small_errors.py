@@ -83,7 +83,8 @@ class SmallErrors:
         return self._words_of(self.harmful)
 
     def unusual(self, settings: Settings) -> str:
-        """Return the errors that the run estimates, but that are far larger than their priors, with sizes. "" without."""
+        """Return the errors that the run estimates, but that are far larger than their priors, with their sizes. "" if there
+        are none."""
         found = zip(self.names, self.values.tolist(), strict=True)
         far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings))
         return self._words_of(tuple(far))

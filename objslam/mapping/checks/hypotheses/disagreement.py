@@ -12,11 +12,12 @@ _BAD_SCORE = 0.4
 """Boxes may disagree with the poses if their score is below this. Clean logs have at least 0.56, recorded or simulated. Logs
 with a camera that is turned in any way have at most 0.3. A larger score accuses more logs."""
 _CHANCE, _TIMES = 90.0, 2.0
-"""Boxes agree by chance if their score is below this multiple of what this percentage of all turned mounts does not reach.
-Clean logs have at least 2.9 times as much, logs with turned cameras at most 1.9. Larger values accuse more logs."""
+"""Boxes agree by chance if their score is below `_TIMES` times the score that `_CHANCE` percent of all turned mounts do not
+reach. Clean logs have at least 2.9 times this score, logs with turned cameras at most 1.9 times. Larger values accuse more
+logs."""
 _DISTANT = 0.9
-"""The share of boxes that fit a point or a direction from which boxes are not said to disagree. It is at least 0.94 in logs
-without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
+"""If at least this share of the boxes fits a point or a direction, the boxes are not said to disagree. The share is at least
+0.94 in logs without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
 _CONE = np.radians(4.0)
 """The angle (rad) within which rays have one direction. Rays that differ by less give no point. A larger angle accuses fewer
 logs."""
