@@ -14,9 +14,9 @@ from ssd.data import Samples
 from ssd.model import Decoded, Ssd
 
 SCORE, OVERLAP, PER_CLASS = 0.05, 0.45, 50
-"""Lowest score, highest overlap of two boxes of one class, and boxes of a class in an image."""
+"""The least score of a box, the largest overlap of two boxes of one class, and the most boxes of a class in an image."""
 CANDIDATES = 400
-"""boxes of a class in an image that are looked at, the best ones."""
+"""The number of boxes of a class in an image that suppression compares, the best ones."""
 
 Boxes = tuple[Tensor, Tensor, Tensor]
 """Boxes (M, 4) px of the network's input, labels (M,), scores (M,) of one image."""
@@ -71,7 +71,8 @@ def detect(network: Ssd, images: NDArray[np.uint8], batch: int = 20) -> list[Box
 
 
 def measure(found: list[Boxes], samples: Samples, classes: int, scale: float = 1.0) -> Quality:
-    """Compare detections with the truth; scale: px of the camera's image to one of the network's, for the errors.
+    """Compare detections with the truth; scale: the number of px of the camera's image for one px of the network's, for the
+    errors.
 
     A detection on an object that does not count is neither right nor wrong.
     """

@@ -25,9 +25,9 @@ _JUMP_TURN = 20.0
 each m/s of live.max_speed."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
-_TIMES = 20.0
-"""The least speed of a jump, in quarters of the speed that the moving robot exceeds in a tenth of its steps. It also applies
-to turn rates. A larger number warns less often."""
+_TIMES = 5.0
+"""The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. The same
+holds for turn rates. A larger number warns less often."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
 _STILL = 1e-4
@@ -108,8 +108,8 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
         return
     fast = float(np.quantile(speed[moving], 0.9)), float(np.quantile(rate[moving], 0.9))
     # A gap in the poses is no jump. The speed over the gap is one that a robot can reach.
-    jumps = (speed > max(_JUMP, _TIMES * fast[0] / 4)) & (way > _JUMP_WAY)
-    jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1] / 4)) & (angle > _JUMP_ANGLE)
+    jumps = (speed > max(_JUMP, _TIMES * fast[0])) & (way > _JUMP_WAY)
+    jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1])) & (angle > _JUMP_ANGLE)
     if jumps.any():
         first = int(np.argmax(jumps))
         yield Finding(

@@ -72,7 +72,7 @@ def check_pose_noise(
         "localisation noise",
         f"all boxes of a frame miss their objects together: the poses err by {least}{np.degrees(yaw):.2g} deg and "
         f"{100 * place:.2g} cm, {turns:.1f} and {shifts:.1f} times what localization.yaw and localization.xy say. The map "
-        f"counts with these errors, so its sigmas are large; {cause}",
+        f"allows for these errors, so its sigmas are large; {cause}",
         spoils=False,
     )
 
