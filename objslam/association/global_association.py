@@ -224,7 +224,8 @@ def _merge_all(task: _Task, state: State) -> State:
 
 
 def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
-    """Drop landmarks until all others are likely enough to exist. Also return the probability (N,) that each exists."""
+    """Drop landmarks until all that are left are likely enough to exist. Also return the probability (N,) that each
+    exists."""
     while True:
         likely = existence(state, task.gate)
         left = _drop(task, state, likely)

@@ -15,8 +15,8 @@ bearing changes without a turn."""
 _MOST = 3000
 """The most pairs of bearings of a camera that are compared, spread over the log. A larger number is slower."""
 _SURE = 5.0
-"""The least log odds of an offset against the expected one. With a smaller value, robots that hardly turn begin at an offset
-by chance. With a larger value, short drives begin at a wrong clock."""
+"""The least log odds of a found offset against the expected one. With a smaller value, robots that hardly turn begin at an
+offset that fits by chance. With a larger value, short drives begin at a wrong clock."""
 
 
 def clocks_of_turns(errors: SharedErrors) -> Floats:

@@ -36,7 +36,8 @@ class Density:
     within: Floats
 
     def spread(self, label: Ints, one: Ints | float, other: Ints | float) -> Floats:
-        """Return the variance (E,) of the mean cosine between `one` and `other` boxes of labels (E,)."""
+        """Return the variance (E,) of the mean cosine between groups of `one` and of `other` boxes. label: (E,) of both
+        groups."""
         return np.asarray(self.between[label] + self.within[label] * (1 / one + 1 / other))
 
 

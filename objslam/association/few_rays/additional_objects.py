@@ -144,7 +144,7 @@ class _Few:
         return found.merge(own).keep(~taken[known:][own == np.arange(found.count)])
 
     def dropped(self, found: State, least: float) -> State:
-        """Drop landmarks until all others are likely enough to exist.
+        """Drop landmarks until all that are left are likely enough to exist.
 
         If two neighbours both fail, the one with more rays stays for one more turn. It may get rays of the other one.
         """

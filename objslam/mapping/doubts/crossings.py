@@ -27,7 +27,7 @@ _FLAT = 0.5
 """The largest angle (rad) of the surroundings, seen from a camera. Wider ones are not flat, so their area does not tell how
 many rays pass by chance. A larger angle counts places nearer to the path."""
 _PAIRS = 3000
-"""The number of tried pairs of rays of a label. More pairs find groups of fewer rays, and take longer."""
+"""The number of pairs of rays that are tried for a label. More pairs find groups of fewer rays, and take longer."""
 _NEXT = 30
 """Half of the pairs are at most this number of boxes apart in time, because a place is seen for a while. A smaller number
 finds small groups in long logs better, with less parallax."""

@@ -22,8 +22,8 @@ _BY_CHANCE = 0.1
 of a box: ((1 - 0.7) / (1 - 0.3))^4 is 0.03, and boxes of one detector have similar sizes. A larger share finds fewer
 groups."""
 _TRIED = 64
-"""The most boxes of a label and camera around which boxes at one place of the image are counted. More find smaller
-groups."""
+"""For each label and camera, boxes at one place of the image are counted around at most this number of boxes. A larger
+number finds smaller groups."""
 _TURNED = np.cos(np.radians(20.0))
 """The cosine of the least angle (rad) by which the camera must turn. A far thing ahead of a robot that drives straight on
 also stays at its place of the image. A smaller cosine finds fewer groups."""
