@@ -34,7 +34,7 @@ _NOISY_BOXES = 2.0
 """The factor on the noise of boxes, found by a solve with noisy odometry, above which all labels are doubted. If several
 labels have two objects each, they check one another in vain, but their boxes miss. The recorded wheel robots have 0.5 to 1.2
 with one thing for each label, and a simulated drive with two labels of two things had 4.4. A larger factor doubts fewer
-labels, and a smaller one explores more logs for nothing."""
+labels, and a smaller one explores more logs in vain."""
 _REJECTED = 0.1
 """A label is doubted if at least `MANY` of its rays, and at least this share, are rejected. A larger share doubts fewer
 labels. In a smaller share, wrong names and false boxes hide a second object."""

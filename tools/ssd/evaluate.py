@@ -104,7 +104,8 @@ def measure(found: list[Boxes], samples: Samples, classes: int, scale: float = 1
 
 
 def average_precision(score: NDArray[np.float64], right: NDArray[np.bool_], objects: int) -> float:
-    """Area under the precision envelope over the recall, for boxes (M,) with a score, some right, and so many objects."""
+    """Return the area under the precision envelope over the recall, for boxes (M,) with a `score` each. right: (M,) whether
+    a box finds an object. objects: the number of all."""
     order = np.argsort(-score, kind="stable")
     hits = np.cumsum(right[order])
     recall = np.concatenate([[0.0], hits / objects])
