@@ -37,7 +37,7 @@ _FRAME = "c_optical_frame"
 
 
 def small_rows(maker: Maker, count: int) -> list[tuple[str, int, object]]:
-    """Two of odometry and one each of tf and of one to three boxes in turn, 5 ms apart."""
+    """Return messages 5 ms apart: in turn two of odometry, one of tf, and one of detections with one to three boxes."""
     rows: list[tuple[str, int, object]] = [
         ("/c/camera_info", 0, maker.camera_info(0, _CAMERA, _FRAME)),
         ("/tf_static", 0, maker.tf(0, ("base_link", _FRAME, np.eye(4)))),

@@ -83,7 +83,7 @@ def beside(options: argparse.Namespace) -> None:
 
 
 def compare(options: argparse.Namespace) -> None:
-    """Run all three at once and print what came of it."""
+    """Run all three at once and print the losses and delays."""
     from objslam.live.adapters.dds import DdsAdapter
     from objslam.live.dds.network import open_network
     from objslam.live.ros.message_handler import RosMessages

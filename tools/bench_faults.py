@@ -49,7 +49,7 @@ def measure(case: Case, folder: Path, count: int, errors: bool) -> list[str]:
 
 
 def shares(cases: list[Case], total: int) -> list[int]:
-    """How many of the faults each case gets: as its calls, but each a fair part. Together they are `total`."""
+    """Return how many of the faults each case gets, `total` in all: in proportion to the square root of its calls."""
     ends = list(accumulate(case.steps**0.5 for case in cases))
     return [round(total * end / ends[-1]) - round(total * begin / ends[-1]) for begin, end in pairwise([0.0, *ends])]
 

@@ -35,7 +35,8 @@ PIXEL = 3.0 / 500
 
 
 def drive(rays_total: int, seed: int = 0) -> tuple[Keyframes, Rays, Association, np.ndarray]:
-    """A robot on laps of 60 m between objects, one per 200 rays, 5 rays a keyframe; truth in the last place."""
+    """Return a drive on laps of 60 m, with one object for 200 rays and 5 rays for a keyframe. The last value is the
+    truth."""
     rng = np.random.default_rng(seed)
     k = rays_total // RAYS_A_FRAME
     objects = max(20, rays_total // 200)
@@ -99,7 +100,8 @@ def drive(rays_total: int, seed: int = 0) -> tuple[Keyframes, Rays, Association,
 
 
 def against_custom(rays_total: int, iterations: int = 3) -> float:
-    """Seconds of the CustomFactor over those of the compiled factor: the same graph, start and number of LM iterations."""
+    """Return the seconds of the CustomFactor divided by those of the compiled factor. Graph, start and iterations are the
+    same."""
     keyframes, rays, association, points = drive(rays_total)
     noise = [gtsam.noiseModel.Isotropic.Sigma(2, 0.05)] * len(rays)
     every = np.arange(len(keyframes))

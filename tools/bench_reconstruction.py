@@ -58,13 +58,13 @@ def moved(surface: Surface, pose: Floats) -> Surface:
 
 
 def laid(path: Trajectory, truth: Trajectory) -> Floats:
-    """How a path's frame lies in the true one (4, 4), in the plane."""
+    """Return the pose (4, 4) of a path's frame in the true frame, from an alignment in the plane."""
     true, known = interpolate(truth.stamps, truth.poses, path.stamps, 1.0)
     return align(path.poses[known, :3, 3], true[known, :3, 3], "se2")[0]
 
 
 def surfaces(log: Log, demo: Path) -> dict[str, Surface]:
-    """The surface at each kind of poses, laid onto the room where its frame is its own."""
+    """Return the surface at each kind of poses. A surface in a frame of its own is moved onto the room."""
     assert log.truth is not None
     truth = log.truth.trajectory
     assert truth is not None
@@ -83,7 +83,7 @@ def surfaces(log: Log, demo: Path) -> dict[str, Surface]:
 
 
 def time_frames(log: Log, repeats: int) -> tuple[Floats, Floats, Floats]:
-    """Milliseconds of reading, of fusing, and of the processor for fusing (all cores together), (repeats, frames) each."""
+    """Return three times (repeats, frames), ms: of reading, of fusing, and the CPU time of all cores for fusing."""
     assert log.truth is not None
     assert log.truth.trajectory is not None
     settings, camera = Settings(), log.cameras[0].camera
@@ -104,7 +104,8 @@ def time_frames(log: Log, repeats: int) -> tuple[Floats, Floats, Floats]:
 
 
 def fill() -> None:
-    """Fill a grid up to its bound, take the surface out, and print MB: before, the grid full, the peak."""
+    """Fill a grid up to its bound, take the surface out, and print the memory, MB: before, with the full grid, and at the
+    peak."""
     settings = Settings()
     depth, colour = np.full((480, 640), 3.0, np.float32), np.full((480, 640, 3), 0.5, np.float32)
     matrix = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])

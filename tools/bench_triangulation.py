@@ -32,7 +32,7 @@ def scene(objects: int, rays: int, outliers: float, noise: float) -> tuple[np.nd
 
 
 def scipy_loop(origins: np.ndarray, directions: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Eq. 1 with scipy, one object after the other: rays (N, K, 3), start (N, 3); solutions (N, 3)."""
+    """Solve Eq. 1 with scipy, one object after the other. Return solutions (N, 3) for rays (N, K, 3) and starts (N, 3)."""
     unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
     solutions = np.empty_like(start)
     for i, (m, n) in enumerate(zip(origins, unit, strict=True)):
@@ -48,7 +48,8 @@ def scipy_loop(origins: np.ndarray, directions: np.ndarray, start: np.ndarray) -
 
 
 def adam_loop(origins: np.ndarray, directions: np.ndarray, start: np.ndarray, steps: int = 300) -> np.ndarray:
-    """Eq. 1 with torch's Adam, one object after the other: rays (N, K, 3), start (N, 3); solutions (N, 3)."""
+    """Solve Eq. 1 with torch's Adam, one object after the other. Return solutions (N, 3) for rays (N, K, 3), starts (N,
+    3)."""
     import torch
 
     torch.set_num_threads(1)

@@ -113,7 +113,7 @@ def one_by_one(result: RunResult, file: Path) -> None:
 
 
 def live(result: RunResult) -> None:
-    """Work like a session's, ten snapshots a second shown to a viewer that is well, frozen or killed, and to none."""
+    """Work like a session that shows ten snapshots a second to a viewer: one that works, is frozen or is killed, or none."""
     low_latency.configure()  # as `objslam live` is
     print(f"\nlive: {LIVE_SECONDS:g} s each, snapshots of {len(result.map)} objects ten times a second")
     path = Trajectory(
@@ -150,7 +150,7 @@ def live(result: RunResult) -> None:
 
 @dataclass(frozen=True)
 class Session:
-    """steps: a second. cpu: s of this process, all its threads, a step. took: (N,) s, each `show`."""
+    """steps: per second. cpu: s per step, of this process with all its threads. took: (N,) s, the time of each `show`."""
 
     steps: float
     cpu: float

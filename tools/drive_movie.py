@@ -66,7 +66,8 @@ class Moment:
 
 
 def moments(log: Log, settings: Settings, every: int) -> Iterator[Moment]:
-    """Map a log with a session, and return every so many frames what is known; at last, what the last solve says."""
+    """Map a log with a session, and yield what is known after each `every` frames. The last moment is after the last
+    solve."""
     assert log.odometry is not None
     session = Session(settings, patient=True).start()
     session.push_camera(log.cameras[0].camera)
@@ -155,7 +156,7 @@ def draw_room(base: Picture, moment: Moment, colours: Colours) -> np.ndarray:
 
 
 def name_places(view: View, moment: Moment) -> dict[int, Floats]:
-    """Where the name of each object goes, px from its dot, so that no name covers another. By id."""
+    """Return by id where the name of each object goes, px from its dot, so that no name covers another."""
     objects = moment.objects.resolved()
     scale = SIZE[0] / (2 * view.matrix[0, 2])
     dots = scale * view.project(moment.objects.positions)[0][[o.status == "ok" for o in moment.objects]]
@@ -166,7 +167,8 @@ def name_places(view: View, moment: Moment) -> dict[int, Floats]:
 
 
 def draw_names(image: Image.Image, view: View, moment: Moment, places: dict[int, Floats], colours: Colours) -> None:
-    """Write the names of the objects beside their dots. places: those of `name_places`; else above."""
+    """Write the names of the objects beside their dots. places: of `name_places`. A name without a place goes above its
+    dot."""
     pen, scale = ImageDraw.Draw(image), SIZE[0] / (2 * view.matrix[0, 2])
     for o in moment.objects.resolved():
         dot = scale * view.project(o.position[None])[0][0]

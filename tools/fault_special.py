@@ -29,7 +29,7 @@ _COMMANDS = ("run, older", "live replay", "convert", "export csv", "report")
 
 
 def small_disks(place: Path) -> list[str]:
-    """Every command on a disk of 2 MB on which so many kB are left."""
+    """Run every command on a disk of 2 MB that is nearly full."""
     disk, wrong = place / "disk", list[str]()
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", disk], check=False, capture_output=True).returncode:
@@ -46,7 +46,7 @@ def small_disks(place: Path) -> list[str]:
 
 
 def short_files(place: Path) -> list[str]:
-    """A run with all its files, in C and Rust too, where no file may be longer than so many bytes."""
+    """Run with a limit on the length of each file. The run writes all its files, also those that C and Rust code writes."""
     run = make_cases(place, ("run, older",))[0]
     whole = Case(run.name, run.words[: run.words.index("--set")], run.before, run.after, seal=run.seal)
     wrong = []
@@ -61,7 +61,7 @@ def short_files(place: Path) -> list[str]:
 
 
 def foreign_folders(place: Path) -> list[str]:
-    """Every command in folders that it may not write, and in folders that it may not even enter."""
+    """Run every command in folders that it may not write, and in folders that it may not even enter."""
     wrong = []
     place.parent.chmod(0o755)
     for case in make_cases(place, _COMMANDS):
@@ -76,7 +76,7 @@ def foreign_folders(place: Path) -> list[str]:
 
 
 def little_memory(place: Path) -> list[str]:
-    """A run and a session that may have so many MB more than they start with."""
+    """Start a run and a session that may take only some MB more than they start with."""
     wrong = []
     for case in make_cases(place, ("run, older", "live replay")):
         for more in (1, 8, 32, 64, 128):
@@ -92,7 +92,7 @@ def little_memory(place: Path) -> list[str]:
 
 
 def deleted_while_live(place: Path) -> list[str]:
-    """The folder of a session is deleted while the robot drives: the map is written all the same."""
+    """Delete the folder of a session while the robot drives. The map must be written all the same."""
     with _session(place, "--speed", "2") as (process, out):
         _until(lambda: (out / "objects.json").exists())
         shutil.rmtree(out)
@@ -102,7 +102,7 @@ def deleted_while_live(place: Path) -> list[str]:
 
 
 def two_in_one_folder(place: Path) -> list[str]:
-    """Two runs into one folder at the same time: one may refuse, and the result is one whole result."""
+    """Start two runs into one folder at the same time. One may refuse, and one whole result must be left."""
     log = _log(place)
     words = [sys.executable, "-m", "objslam", "run", str(log), "-o", str(place / "out"), *_QUIET]
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True}
@@ -114,7 +114,7 @@ def two_in_one_folder(place: Path) -> list[str]:
 
 
 def closed_pipes(place: Path) -> list[str]:
-    """The reader of stdout leaves after the first line: the files are whole."""
+    """Close the pipe of stdout after the first line. The files must be whole."""
     wrong = []
     for case in make_cases(place, _COMMANDS):
         case.lay(place / "work")
@@ -128,7 +128,7 @@ def closed_pipes(place: Path) -> list[str]:
 
 
 def signals(place: Path) -> list[str]:
-    """A session that is told to end, in any of three ways, ends with a whole result."""
+    """Tell a session to end, in each of three ways. It must end with a whole result."""
     wrong = []
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         with _session(place, "--speed", "1") as (process, out):
@@ -141,7 +141,8 @@ def signals(place: Path) -> list[str]:
 
 
 def _judged(what: str, case: Case, folder: Path, done: object, mend: Callable[[], object]) -> list[str]:
-    """What is wrong with what a command said and left, and with the next start after the fault was mended."""
+    """Return what is wrong: with the words of a command, with the files that it left, or with its next start without the
+    fault."""
     wrong = _said(what, case, done)
     try:
         state = case.judge(folder)
@@ -163,7 +164,7 @@ def _said(what: str, case: Case, done: object) -> list[str]:
 
 
 def _fill(disk: Path, left: int) -> None:
-    """Fill a disk up to so many kB."""
+    """Fill a disk until `left` kB are free."""
     free = os.statvfs(disk).f_bavail * os.statvfs(disk).f_frsize
     (disk / "filler").write_bytes(bytes(max(0, free - (left << 10))))
 

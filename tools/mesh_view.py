@@ -23,7 +23,7 @@ _FINE = 2  # times the pixels of the picture, for smooth edges
 
 
 def read_mesh(file: Path) -> Surface:
-    """The surface in a PLY file; the program ends where there is none."""
+    """Return the surface in a PLY file. The program ends if there is none."""
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         mesh = o3d.io.read_triangle_mesh(file)
     if not len(mesh.triangles):
@@ -54,7 +54,7 @@ class View:
 
     @property
     def matrix(self) -> Floats:
-        """(3, 3) px of the picture as it is drawn, finer than it is saved."""
+        """(3, 3) the camera matrix, px of the picture as it is drawn. It is finer than the saved picture."""
         focal = _FINE * self.width / 2 / np.tan(np.radians(self.angle) / 2)
         return np.array([[focal, 0, _FINE * self.width / 2], [0, focal, _FINE * self.height / 2], [0, 0, 1.0]])
 
@@ -68,7 +68,7 @@ class View:
 
 
 class Picture:
-    """A surface drawn from a view; what is added lies over it, fainter where the surface hides it."""
+    """A surface drawn from a view. What is added is drawn over it, but is fainter where the surface hides it."""
 
     def __init__(self, surface: Surface, view: View) -> None:
         self.view = view
@@ -139,7 +139,7 @@ def save(image: np.ndarray, file: Path) -> None:
 
 
 def _render(surface: Surface, view: View) -> tuple[np.ndarray, Floats]:
-    """Colours (H, W, 3) float and depths (H, W), m, inf where nothing; what faces away from the eye is seen through."""
+    """Return colours (H, W, 3), float, and depths (H, W), m, inf without a surface. Faces that point away are not drawn."""
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(o3d.core.Tensor(surface.vertices), o3d.core.Tensor(surface.triangles.astype(np.uint32)))
     size = _FINE * view.width, _FINE * view.height

@@ -203,7 +203,7 @@ def tie(f: Filter, one: Ints, two: Ints, sigma: float) -> None:
 
 
 def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
-    """Return the Jacobian (3P, D) by the state of the positions of `one` minus the positions of `two`."""
+    """Return the Jacobian (3P, D) by the state. It belongs to the offsets of landmarks `one` from landmarks `two`."""
     jacobian = np.zeros((len(one), 3, len(f.covariance)))
     for which, sign in ((one, 1.0), (two, -1.0)):
         jacobian[np.arange(len(one))[:, None], np.arange(3), f.columns(which)] = sign
@@ -211,7 +211,7 @@ def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
 
 
 def _carried(arm: Floats) -> Floats:
-    """Return the derivative (P, 3, 3) by yaw, x and y of the base of points at offsets `arm` (P, 3) m from it."""
+    """Return the derivative (P, 3, 3) of points by yaw, x and y of the base. arm: (P, 3) m, their offsets from the base."""
     moved = np.zeros((len(arm), 3, POSE))
     moved[:, 0, 0], moved[:, 1, 0], moved[:, 0, 1], moved[:, 1, 2] = -arm[:, 1], arm[:, 0], 1.0, 1.0
     return moved

@@ -135,7 +135,7 @@ def size_odds(state: State) -> Floats:
 
 
 def _no_stronger(number: Ints, label: Ints) -> Ints:
-    """Return for each landmark the number (N,) of rays of all landmarks of its class that have no more rays than it has."""
+    """For each landmark, count the rays (N,) of all landmarks of its class that have no more rays than it has."""
     rank = label * (int(number.max(initial=0)) + 1) + number
     order = np.argsort(rank)
     total = np.append(0, np.cumsum(number[order]))

@@ -273,8 +273,8 @@ def alternate(
 ) -> State:
     """Alternate between assignment and refinement until no ray changes its landmark, at most `times` times.
 
-    plausible: returns which landmarks (N,) stay. unmatched: returns the cost (E,) of a ray without a landmark, instead of
-    each match. Without it, this cost is the gate.
+    plausible: returns which landmarks (N,) stay. unmatched: returns for each match the cost (E,) of its ray if it had no
+    landmark. If not given, this cost is the gate.
     """
     for _ in range(times):
         obs, old, before = state.obs, state.landmarks, state.matched
@@ -295,7 +295,7 @@ def alternate(
 
 
 def explained(state: State, gate: float) -> Floats:
-    """Return for each label (L,) how much lower the cost of its rays is with its landmarks than without any landmark."""
+    """Return for each label (L,) by how much its landmarks lower the cost of its rays."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray] == edges.landmark
     gain = gate - edges.cost + _appearance_gain(state, edges)
@@ -303,5 +303,5 @@ def explained(state: State, gate: float) -> Floats:
 
 
 def near(state: State) -> Bools:
-    """Return which landmarks (N,) are not so far away that only parallel rays meet there."""
+    """Return which landmarks (N,) are near enough. Farther away, only parallel rays meet."""
     return np.asarray((np.abs(state.landmarks.position - state.obs.origin[:1]) < _FAR).all(axis=1))

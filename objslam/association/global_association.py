@@ -114,7 +114,7 @@ def associate_globally(
 
 
 def _learned(state: State) -> State:
-    """Return the state with the ratio of appearances that its present landmarks teach."""
+    """Return the state with a ratio of appearances that is learnt from its present landmarks."""
     obs = state.obs
     return replace(state, ratio=learn_ratio(obs, obs.frame, obs.track, state.matched, len(state.unassigned)))
 
@@ -226,7 +226,8 @@ def _alternate(task: _Task, state: State, times: int = 3) -> State:
 
 
 def _by_size(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats]:
-    """Assign the rays once more, by bearing and size. likely: (N,) is returned for the landmarks that keep enough rays.
+    """Assign the rays once more, by bearing and size. likely: (N,) of the landmarks. It is returned for those that keep
+    enough rays.
 
     Sizes count only here. While the existence of an often hidden landmark is judged, it needs every ray. sized: (R,) whether
     the camera of each ray sees sizes.
@@ -244,7 +245,7 @@ def _by_size(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[S
 
 
 def _plausible(task: _Task, state: State) -> Bools:
-    """Return which landmarks (N,) have enough rays and are not so far away that only parallel rays meet there."""
+    """Return which landmarks (N,) have enough rays and are near enough. Farther away, only parallel rays meet."""
     return (state.ray_count >= task.settings.min_rays) & near(state)
 
 
@@ -266,7 +267,8 @@ def _merge_all(task: _Task, state: State) -> State:
 
 
 def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
-    """Drop landmarks until all others are likely enough to exist. Also return the probability (N,) that each exists."""
+    """Drop landmarks until all that are left are likely enough to exist. Also return the probability (N,) that each
+    exists."""
     while True:
         likely = existence(state, task.gate)
         left = _drop(task, state, likely)

@@ -52,7 +52,8 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator, exclud
 
 
 def _best(scorer: "_Scorer", points: Floats, search: Search, excluded: Floats) -> Floats:
-    """Refine points (H, 3) m, and return the points (N, 3) m with enough support without the rays of better points."""
+    """Refine points (H, 3) m, and return the points (N, 3) m that have enough support even without the rays of better
+    points."""
     moved = scorer.load(points)
     xp = module_of(moved)
     for _ in range(_REFINEMENTS):

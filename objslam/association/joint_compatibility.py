@@ -22,9 +22,9 @@ def jointly_compatible(
 ) -> Bools:
     """Return which rays (n,) of one frame really belong to their landmarks (n,).
 
-    The least likely ray is removed until each is much more likely of its landmark than of an unknown object, given all rays
-    left. doubt: (6, 6) covariance of the camera's pose relative to the landmarks, in camera coordinates, rotation first.
-    unknown: (n,) expected number of unknown objects per steradian along each ray, with the label of the ray.
+    The least likely ray is removed until each ray left is much more likely to show its landmark than an unknown object.
+    doubt: (6, 6) covariance of the camera's pose relative to the landmarks, in camera coordinates, rotation first. unknown:
+    (n,) expected number of unknown objects per steradian along each ray, with the label of the ray.
     """
     to = landmarks.position - obs.origin
     distance = np.linalg.norm(to, axis=1)

@@ -167,7 +167,8 @@ def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
 
 
 def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
-    """Return hypotheses (H, 2, 2) of two pairs each: all two pairs with fitting distances, and each pair alone (twice)."""
+    """Return hypotheses (H, 2, 2) of two pairs each: any two pairs with fitting distances, and each single pair, listed
+    twice."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
     i, j = np.triu_indices(len(a), 1)
     differ = (a[i] != a[j]) & (b[i] != b[j])

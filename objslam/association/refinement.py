@@ -176,7 +176,7 @@ def _across(to: Floats) -> tuple[Floats, Floats]:
 
 
 def _standard(time: Floats, index: Ints, count: int) -> Floats:
-    """Standardise times (P,) within each point to mean 0 and standard deviation 1."""
+    """Standardise the times (P,) of each point to mean 0 and standard deviation 1."""
     number = np.maximum(np.bincount(index, minlength=count), 1)
     centred = time - (np.bincount(index, time, count) / number)[index]
     spread = np.sqrt(np.bincount(index, centred**2, count) / number)

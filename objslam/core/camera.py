@@ -134,7 +134,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
 
     A direction is valid if it is `in_field`. For plumb_bob and rational_polynomial it must also project to within 0.1 px of
     its pixel. cv2.undistortPoints, iterated to convergence, inverts these two models. Newton's method inverts the pixels
-    that OpenCV misses, and the model equidistant (Kannala-Brandt).
+    that OpenCV misses, and all pixels of the model equidistant (Kannala-Brandt).
     """
     import cv2
 

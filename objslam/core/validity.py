@@ -11,8 +11,8 @@ MAX_POSITION = 1e7
 """The bound of a coordinate or a depth, m. A larger bound accepts more wrong numbers. No place on earth is further from the
 origin of its UTM zone, and a float still resolves 2 nm there."""
 MAX_STAMP = 1e20
-"""The bound of a stamp in a file, s. A larger bound accepts more wrong numbers. A stamp in ns by mistake is below it, so the
-checks of a run can name this mistake."""
+"""The bound of a stamp in a file, s. A larger bound accepts more wrong numbers. A stamp that is in ns by mistake is below
+it, so the checks of a run can name this mistake."""
 MAX_LIVE_STAMP = 1e11
 """The bound of a stamp of a running robot, s. A larger bound accepts more wrong numbers. At this bound, a float
 resolves 15 us."""

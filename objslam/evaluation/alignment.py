@@ -219,7 +219,8 @@ def _cheapest(starts: list[Transform], source: Floats, target: Floats, same: Boo
 def _nearest_costs(starts: list[Transform], source: Floats, target: Floats, same: Bools, radius: float) -> Floats:
     """Return the cost (S,) of each start: the sum of min(distance, radius)^2 over the true objects, m^2.
 
-    The distance is from a true object to the nearest map object that may match it. At least one pair may match.
+    The distance is from a true object to the nearest map object that may match it. The caller ensures that at least one pair
+    may match.
     """
     k, i = np.nonzero(same.T)  # Sorted by true object.
     moved = np.stack([start.apply(source) for start in starts])

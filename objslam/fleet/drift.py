@@ -11,7 +11,7 @@ from objslam.core.arrays import Floats
 from objslam.fleet.driver import Mapped
 
 _MOST = 24
-"""The most curves of a page. A larger number shows robots whose calibration changes less."""
+"""The most curves of a page. A larger number also shows robots whose calibration changes less."""
 
 
 @dataclass(frozen=True)

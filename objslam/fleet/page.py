@@ -72,7 +72,7 @@ def duration(hours: float) -> str:
 
 
 def _told(mapped: Sequence[Mapped]) -> dict[str, object]:
-    """Return the columns of the table of sites that come from the sessions of a site in this run."""
+    """Return a part of a site's row in the table of sites: the columns that its sessions in this run give."""
     days = sorted({one.day for one in mapped})
     return {
         "robots": len({one.place.robot for one in mapped} - {""}),

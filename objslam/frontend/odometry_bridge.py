@@ -18,7 +18,7 @@ from objslam.core.types import Trajectory
 _SHARED = 1.0
 """In the estimate for a step, the mean change of velocity on the whole path weighs as much as this number of changes. With a
 larger number, all steps wander more alike. With 0, a robot would never turn inside a step whose neighbours have its
-velocity: on simulated drives, errors of six standard deviations were seen, and four with 1."""
+velocity. On simulated drives, errors reached six standard deviations with 0, and four with 1."""
 
 
 @dataclass(frozen=True)

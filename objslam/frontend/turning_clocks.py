@@ -15,8 +15,8 @@ bearing changes without a turn."""
 _MOST = 3000
 """The most pairs of bearings of a camera that are compared, spread over the log. A larger number is slower."""
 _SURE = 5.0
-"""The least log odds of an offset against the expected one. With a smaller value, robots that hardly turn begin at an offset
-by chance. With a larger value, short drives begin at a wrong clock."""
+"""The least log odds of a found offset against the expected one. With a smaller value, robots that hardly turn begin at an
+offset that fits by chance. With a larger value, short drives begin at a wrong clock."""
 
 
 def clocks_of_turns(errors: SharedErrors) -> Floats:
@@ -51,8 +51,8 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
 def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
     """Return the stamps (n, 2), s, of pairs of bearings of one label, and the bearings (n, 2, 3), unit, in base.
 
-    The last value is the number of independent pairs: pairs of the same images share the turn, and each image is in two.
-    Labels with several boxes in an image have no pairs there.
+    The last value is the number of independent pairs. It is smaller, because pairs of the same images share the turn, and
+    each image is compared with two others. Labels with several boxes in an image have no pairs there.
     """
     keyframes, rays = errors.keyframes, errors.rays
     mine = np.flatnonzero(keyframes.camera[rays.keyframe] == camera)

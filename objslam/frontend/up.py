@@ -16,7 +16,8 @@ _TILT = np.radians(45)
 """The angle, rad, between the mean of the up vectors and the map's z axis, above which the map lies on its side. Cameras on
 robots look up or down by less. With a larger angle, z is used more often."""
 _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
-"""The axes that point right and to the top of a view from above. With the axis to the viewer, they are right-handed."""
+"""For each axis that can point up: the two axes that point to the right and to the top of a view from above. Together with
+the axis that points up, they are a right-handed frame."""
 
 
 def up_axis(keyframes: Keyframes) -> Up:

@@ -130,7 +130,8 @@ class Measurements:
     def further_rows(self, rays: Rays, owner: Ints, landmarks: Ints) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
         """Return the kinds of factors that bring their own rows.
 
-        `JointGraph` has the rows of bearings, ranges, weak priors, motions and poses. Each further kind stands here.
+        `JointGraph` itself makes the rows of bearings, ranges, weak priors, motions and poses. All other kinds are returned
+        here.
 
         Args:
             rays: the n rays in the graph.

@@ -42,7 +42,8 @@ from objslam.triangulation.triangulate import Triangulation
 
 _TOLERANCE, _TOLERANCE_BEFORE = 1e-6, 1e-3
 """A joint solve ends if an iteration decreases the cost by less than this share. The first value is for a solve without
-shared errors. The second is for a solve with them, whose estimation moves everything again. Larger values end it sooner."""
+shared errors. The second is for a solve with shared errors, because their estimation moves everything again. Larger values
+end it sooner."""
 _ROUNDS_BEFORE = 2
 """The most rounds of solve and test before the shared errors are estimated. The estimation tests the inliers after each of
 its steps. A larger number is slower, and leads to the same inliers."""
@@ -121,16 +122,16 @@ def solve_joint(
     """Solve poses and objects together, from the poses of the localisation, or from a graph that grew along the odometry.
 
     Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
-    return. An object is added or moved if the poses now determine it better. Solve and test repeat until nothing changes.
-    If most rays of a stretch of the drive were rejected, and there is only odometry, the poses of the stretch may be wrong.
-    In this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose.
-    SolveError if the linear system is indeterminate, or if the cost is not finite.
-    start: (K, 4, 4) camera poses to start from instead. places: (N, 3) m, positions to start from, NaN where unknown, if
-    start and places solve nearly the same measurements. Stretches that this solution rejects are not tried again. errors:
-    the same keyframes and rays as a function of shared errors. The shared errors are estimated, starting from theta (P,) or
-    from their mean. Their covariance is added to the covariance of objects. hold: whether the shared errors stay at theta,
-    and the noise stays too. In this case, no covariance is added. progress(done, total) counts the keyframes in the growing
-    graph. The corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
+    return. An object is added or moved if the poses now determine it better. Solve and test repeat until nothing changes. If
+    most rays of a stretch of the drive were rejected, and there is only odometry, the poses of the stretch may be wrong. In
+    this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose.
+    SolveError if the linear system is indeterminate, or if the cost is not finite. start: (K, 4, 4) camera poses to start
+    from instead. places: (N, 3) m, positions to start from, NaN where unknown. They are given if start and places solve
+    nearly the same measurements. Stretches that this solution rejects are not tried again. errors: the same keyframes and
+    rays as a function of shared errors. The shared errors are estimated, starting from theta (P,) or from their mean. Their
+    covariance is added to the covariance of objects. hold: whether the shared errors stay at theta, and the noise stays too.
+    In this case, no covariance is added. progress(done, total) counts the keyframes in the growing graph. The corners of
+    fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
     """
     tags = TagCorners.of(rays, association, settings)
     if trace is not None:

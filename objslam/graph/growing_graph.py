@@ -126,7 +126,7 @@ class GrowingGraph(ABC):
         self._store.kinds["absolute"].clear()
 
     def move(self, new_T_old: Floats) -> None:
-        """Move the whole estimate by a pose (4, 4). The caller must remove the absolute poses before.
+        """Move the whole estimate by a pose (4, 4). The caller must first remove the absolute poses.
 
         A prior map does not move. So the pose F of the graph's frame in the prior map changes too.
         """

@@ -23,7 +23,7 @@ one goes on from there. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses of a step. Below `_HOLDS`, the next
 step is twice as long. Above `_FAILS`, a shorter step is tried. Larger limits take longer steps. On the MRCLAM logs, all
-limits from 1 and 3 to 5 and 15 degrees lead to the same map."""
+pairs of limits from (1, 3) to (5, 15) degrees lead to the same map."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
 median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both."""

@@ -22,7 +22,8 @@ from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
 """A rejected ray gets a second chance if at least the share `_MOST` of the rays from `_BESIDE` before it to `_BESIDE` after
-it are rejected. Perhaps the poses are wrong there. A few false boxes in a row get none. Larger values restore fewer rays."""
+it are rejected. Perhaps the poses are wrong there. A few false boxes in a row get no second chance. Larger values restore
+fewer rays."""
 ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and late rounds change few rays."""
 _COARSE = 1e-4
@@ -109,9 +110,9 @@ class _Solver:
     ) -> tuple[Floats, Floats, Optimum]:
         """Return poses (K, 4, 4), positions (N, 3) and the optimum for the inliers `used` (R,).
 
-        A solve on arrays takes a fraction of the time, because it has the normal equations already. GTSAM goes on where it
-        ends before an optimum, and names a variable that is not determined. last: the optimum of the same inliers, where
-        GTSAM goes on.
+        A solve on arrays takes a fraction of the time, because it has the normal equations already. If it ends before an
+        optimum, GTSAM goes on from there, and names a variable that is not determined. last: the optimum of the same
+        inliers, where GTSAM goes on.
         """
         steps, loss, settings = 0, self.measured.settings.joint.loss, self.measured.settings
         if self.near is not None and np.array_equal(self.near[0], known_landmarks(positions)):

@@ -74,8 +74,8 @@ def has_staging(folder: Path) -> bool:
 def write_file(file: Path, data: bytes, *, tidy: bool = True) -> None:
     """Write one file under a temporary name and rename it. Temporary files that killed processes left are deleted first.
 
-    tidy: whether to look for such files. This lists the folder, so it takes the longer, the more files are there.
-    Raises OutputError with the final file name for a disk error.
+    tidy: whether to look for such files. This lists the folder, so it takes longer if there are more files. Raises
+    OutputError with the final file name for a disk error.
     """
     with _replaced(file, tidy=tidy) as stream:
         stream.write(data)

@@ -132,10 +132,10 @@ def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
 
 
 def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict[int, Sides]:
-    """Return the sides of each object that has rays, by its index.
+    """Return the sides from which each object was seen, by the index of the object. An object without rays has no entry.
 
-    positions: (N, 3) m. plain: whether Eq. 1 gave them. In Eq. 1, a ray has the inverse of its standard deviation as its
-    weight. In all other solves, its weight is the inverse of its variance.
+    positions: (N, 3) m. plain: whether the positions are the solution of Eq. 1. In Eq. 1, a ray has the inverse of its
+    standard deviation as its weight. In all other solves, its weight is the inverse of its variance.
     """
     landmark, count = rays.landmark, len(positions)
     lattice = evenly_spread(SIDES)

@@ -34,13 +34,13 @@ _NOISY_BOXES = 2.0
 """The factor on the noise of boxes, found by a solve with noisy odometry, above which all labels are doubted. If several
 labels have two objects each, they check one another in vain, but their boxes miss. The recorded wheel robots have 0.5 to 1.2
 with one thing for each label, and a simulated drive with two labels of two things had 4.4. A larger factor doubts fewer
-labels, and a smaller one explores more logs for nothing."""
+labels, and a smaller one explores more logs in vain."""
 _REJECTED = 0.1
 """A label is doubted if at least `MANY` of its rays, and at least this share, are rejected. A larger share doubts fewer
 labels. In a smaller share, wrong names and false boxes hide a second object."""
 _NOISIER = 1.5
-"""The factor on the noise of boxes or depths, found with several objects for a label, above which the noise found with one
-object for each label does not count. A larger factor favours one object for each label."""
+"""One object for each label may need more noise of boxes or depths than several objects for a label, up to this factor. A
+larger factor favours one object for each label."""
 
 
 CLEAR_ODDS = 7.0
@@ -72,7 +72,8 @@ def has_labels_of(one: JointState, other: JointState) -> bool:
 def needs_noisy_boxes(named: JointState, other: JointState) -> bool:
     """Return whether a map with one object for each label needs far noisier boxes than another map of the same log.
 
-    Then its evidence is no reason to trust it: an exploration that misses a thing has less evidence too.
+    Then a lower evidence of the other map is no reason to trust this one, because the exploration of the other may only have
+    missed a thing.
     """
     assert named.errors is not None
     assert other.errors is not None
@@ -82,9 +83,10 @@ def needs_noisy_boxes(named: JointState, other: JointState) -> bool:
 def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, estimate: Estimate) -> Ints:
     """Return the labels that may name several objects, though the rays agree with a map of one object for each label.
 
-    They are the labels that too few others check (`unchecked_labels`), if the map needs noisy odometry, or rejects many of
-    their rays. If it needs noisy odometry and noisy boxes, they are all labels with enough rays for two objects. With a
-    localisation the path cannot bend, so no label is doubted.
+    With a localisation the path cannot bend, so no label is doubted. If the map needs noisy odometry and noisy boxes, all
+    labels with enough rays for two objects are doubted. If it needs noisy odometry alone, the labels that too few others
+    check (`unchecked_labels`) are doubted. If it needs neither, only those of these labels are doubted of which the map
+    rejects many rays.
 
     Args:
         rays: with their labels.
@@ -107,8 +109,9 @@ def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, e
 def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
     """Return the labels of which too few others (`_WITNESSES`) could show that they have a second object.
 
-    The rays of a label are divided at a moment, so that each part is large enough for an object of its own. Another label
-    is a witness if it has rays before and after this moment. A label is unchecked if it has such a moment with too few.
+    The rays of a label are divided at a moment, so that each part is large enough for an object of its own. Another label is
+    a witness if it has rays before and after this moment. A label is unchecked if it has such a moment with too few
+    witnesses.
 
     Args:
         rays: with their labels.
@@ -138,9 +141,9 @@ def evidence_against(named: JointState, other: JointState) -> float:
 
     Both maps have the noise of the odometry that `named` found, which suits `named` best. At the noise of the settings, the
     truth would lose in a log of a robot with worse odometry, because a second object costs less than the error of the path.
-    The noise of boxes and depths shows in each view, whatever the objects are. So if `other` found much less of it, at most
-    `_NOISIER` times that counts. A second box around one thing has no object in `named`, so here it has none in `other`.
-    Each map keeps its own shared errors, which count by their prior.
+    The noise of boxes and depths shows in each view, whatever the objects are. So if `other` found much less of this noise,
+    both maps have at most `_NOISIER` times what `other` found. A second box around one thing has no object in `named`, so
+    here it has none in `other`. Each map keeps its own shared errors, which count by their prior.
 
     Args:
         named: solved, with one object for each label.

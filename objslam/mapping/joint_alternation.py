@@ -160,7 +160,7 @@ class JointState:
         return state.solve("association", self.association, self.solved_poses).merged()
 
     def continued_from(self, chosen: Self) -> Self:
-        """Return a state of an earlier round, settled, with the rounds until now."""
+        """Return the state of an earlier round as settled, with the counts of all rounds until now."""
         if self.trace is not None and chosen.estimate is not self.estimate:
             assert chosen.association is not None
             assert chosen.estimate is not None

@@ -36,10 +36,10 @@ _MORE = 0.05
 """A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
 more."""
 _QUIETER = 0.5
-"""If a solve needs noise, a finding stands if its corrected log needs at most this share of the noise. A larger share
-refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with mirrored images, because with these the
-path must turn the other way. It has 0.15 of the noise that it has with the identity for base_T_camera, but 2.9 times the
-noise in the settings."""
+"""If a solve explains the boxes only with noise, a finding stands if its corrected log needs at most this share of the
+noise. A larger share refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with mirrored images,
+because with these the path must turn the other way. It has 0.15 of the noise that it has with the identity for
+base_T_camera, but 2.9 times the noise in the settings."""
 _IN_BOTH = 0.4
 """The least share of rays of common objects at which the halves of a log agree. Common objects are seen in both halves. The
 share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs

@@ -49,7 +49,7 @@ def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes,
 
 
 def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
-    """Return shared errors with the noise of an estimate, but no shrinkage.
+    """Return shared errors with the noise of an estimate, but without its shrinkage.
 
     The shrinkage is an effect of a solve on lengths (`NoiseFactors`). Outside a solve, lengths stay as measured.
     """

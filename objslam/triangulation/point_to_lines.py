@@ -110,7 +110,8 @@ def _places(bundle: Bundle) -> int:
 
 
 def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the points (3, B) of `least_squares` for a block, and which are unique (B,)."""
+    """Return the points (3, B) of `least_squares` for the B objects of a block of lines, and which points are unique
+    (B,)."""
     xp = module_of(origin)
     number = weight.sum(axis=0)
     base = (origin * weight).sum(axis=1) / number  # Large map coordinates would cost digits.

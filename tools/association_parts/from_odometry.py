@@ -31,7 +31,7 @@ STEP_DRIFT = {
 
 
 def drift(seeds: int, picture: Path | None) -> None:
-    """Print F1 and the path's error against dead reckoning's, of drives mapped from odometry alone."""
+    """Map drives from odometry alone. Print F1, and the path's error as a share of that of dead reckoning."""
     print(f"{'drift, seed':<14}{'F1':>7}{'ATE m':>9}{'dead reckoning m':>18}{'ratio':>7}{'s':>7}")
     scores, ratios = [], []
     for seed in range(seeds):
@@ -59,7 +59,7 @@ def drift(seeds: int, picture: Path | None) -> None:
 
 
 def unnamed() -> None:
-    """Print what is left of the names of landmarks after a run without them, and how far its path is from the named one.
+    """Print how well a run without names finds the landmarks again, and how far its path is from that of a run with names.
 
     F1 counts pairs of observations: a pair is right if the run and the names both say that it is one landmark.
     """

@@ -27,7 +27,7 @@ LOCALIZATION = {"xy": 0.02, "yaw": 0.005}
 
 @dataclass(frozen=True)
 class Scene:
-    """A drive without identities; whose: (R,) the true object of each ray, -1 none."""
+    """A drive without identities. whose: (R,) the true object of each ray, -1 for none."""
 
     log: Log
     keyframes: Keyframes
@@ -49,7 +49,7 @@ class Scene:
 
 
 def make(settings: DriveSettings, seed: int, pixel_sigma: float) -> Scene:
-    """A simulated drive, with the noise that the rays are taken to have."""
+    """Return a simulated drive, with the noise that the association assumes for its rays."""
     log = simulate(settings.model_copy(update={"tracks": "perfect"}), seed)
     chosen = Settings.model_validate({"rays": {"pixel_sigma": pixel_sigma}})
     keyframes = build_keyframes(log, chosen, Ledger())
@@ -75,7 +75,8 @@ def solve(scene: Scene, exact_poses: bool = True) -> Association:
 
 
 def score(scene: Scene, association: Association, radius: float) -> tuple[int, int, float, Floats]:
-    """Matched and false objects, recall of those seen by 10 rays and more under 10 degrees and more, errors in m."""
+    """Return the numbers of matched and of false objects, the recall, and the errors in m. The recall counts the objects
+    with at least 10 rays, which span at least 10 degrees."""
     origins, directions = scene.rays.in_map(scene.keyframes.map_T_camera)
     settings = Settings().triangulation
     placed = triangulate(origins, directions, association.object, association.count, scene.rays.sigma, settings)

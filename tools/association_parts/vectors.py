@@ -25,7 +25,8 @@ ROUGH = PoseNoise(xy=0.02, yaw=float(np.radians(0.6)))
 
 
 def appearance(seeds: int) -> None:
-    """Print the F1 of clusters of one label without and with appearance vectors, and the share of the missing F1 gained.
+    """Print the F1 of clusters of one label without and with appearance vectors, and the share of the missing F1 that the
+    vectors gain.
 
     Objects are found within 0.25 m. Joint runs take about ten times as long, so they get half of the seeds.
     """
@@ -50,7 +51,8 @@ def appearance(seeds: int) -> None:
 
 
 def clusters(seed: int, pixels: float, odometry: PoseNoise | None) -> DriveSettings:
-    """A drive around clusters along the walls. Each object has 20 boxes and more under 60 degrees and more."""
+    """Return a drive around clusters along the walls. Each object has at least 20 boxes, whose rays span at least 60
+    degrees."""
     rng = np.random.default_rng([seed, CLUSTERS])
     noise = {"pixel_sigma": pixels, "missed": 0.2, "false": 0.2, "appearance": AppearanceNoise()}
     if odometry is not None:

@@ -23,7 +23,7 @@ DRIVES = (
 
 
 def same() -> None:
-    """Live against offline."""
+    """Compare the maps of sessions with offline maps."""
     print("the same answer: live against offline joint; objects of both, of one alone, RMSE of those of both")
     print(
         f"{'drive':<28}{'both':>6}{'live':>6}{'offline':>9}{'RMSE m':>9}{'aligned':>9}{'before the end':>18}{'live s':>8}"

@@ -31,7 +31,8 @@ def replayed(log: Log, settings: Settings) -> Session:
 
 
 def compare(a: ObjectMap, b: ObjectMap, radius: float = 1.0) -> tuple[int, int, int, float, float]:
-    """Objects of both maps, those of either alone, and the RMSE, m, as the maps lie and after SE(2) alignment."""
+    """Return how many objects both maps have, and how many only the first and only the second. Also return the RMSE, m, of
+    the common ones before and after SE(2) alignment."""
     one, two = a.resolved(), b.resolved()
     gap = np.array([[np.linalg.norm(p.position - q.position) if p.label == q.label else 99.0 for q in two] for p in one])
     gap = gap.reshape(len(one), len(two))
@@ -48,7 +49,7 @@ def compare(a: ObjectMap, b: ObjectMap, radius: float = 1.0) -> tuple[int, int, 
 
 
 def against_truth(found: ObjectMap, log: Log) -> str:
-    """Objects found, missed, false, and RMSE after SE(2) alignment."""
+    """Return a text: the objects found, missed and false, and the RMSE after SE(2) alignment."""
     truth = log.truth.objects
     one = found.resolved()
     place = np.array([o.position for o in one]).reshape(-1, 3)

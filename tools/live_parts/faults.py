@@ -25,7 +25,8 @@ from objslam.sources.log_folder import write_log_folder
 
 
 def kill(times: int = 20) -> None:
-    """Killed at random moments, resumed each time; against a session that was left alone."""
+    """Kill a session at random moments, and resume it each time. Compare its map with that of a session that was left
+    alone."""
     log = simulate(preset("demo", **ONLY_ODOMETRY, classes=12, frames=400, false=0.0, odometry_rate=100.0), 0)
     rng = np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -69,7 +70,7 @@ def kill(times: int = 20) -> None:
 
 
 def disorder() -> None:
-    """Each kind of disorder, against the same drive in order."""
+    """Compare each kind of disorder with the same drive in order."""
     log = simulate(preset("demo", **ONLY_ODOMETRY, classes=12, frames=400, false=0.0, odometry_rate=100.0), 0)
     settings = settings_for("rays.pixel_sigma=2")
     session = replayed(log, settings)

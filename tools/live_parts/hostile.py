@@ -44,7 +44,7 @@ def boxes(frame: str) -> bytes:
 
 
 def unknown_frames() -> bytes:
-    """Transforms between frames that nobody knows, other ones each time."""
+    """Return transforms between frames that nobody knows. The frames are new in each message."""
     now = time.time_ns()
     return serialize(MAKER, MAKER.tf(now, *((f"a{now}{i}", f"b{now}{i}", EYE) for i in range(10))))
 
@@ -61,7 +61,8 @@ KINDS: dict[str, tuple[str, str, float, Callable[[], bytes]]] = {
     "flood-boxes": ("other/detections", FOUND, FAST, lambda data=boxes("nobody"): data),  # type: ignore[misc]
     "flood-tf": ("tf", TF, FAST, lambda data=unknown_frames(): data),  # type: ignore[misc]
 }
-"""What is sent: the topic, the type, the messages per second and the bytes of the next one. Also there is "topics"."""
+"""For each kind: the topic, the type, the messages per second, and a function that makes the bytes of the next one. `send`
+knows one more kind, "topics"."""
 
 
 def send(kind: str, domain: int, done: threading.Event) -> int:

@@ -29,7 +29,7 @@ def large(frames: int, rate: float, classes: int = 10) -> Log:
 
 
 def realtime(keyframes: int, classes: int) -> None:
-    """Pushed at the pace of the robot: how long until a frame is in the map."""
+    """Push at the pace of the robot, and print how long it takes until a frame is in the map."""
     log = large(int(1.25 * keyframes), 20.0, classes)
     settings = settings_for("rays.pixel_sigma=2")
     boxes = len(log.cameras[0].detections) / len(log.cameras[0].detections.frame_stamps)
@@ -64,7 +64,8 @@ def realtime(keyframes: int, classes: int) -> None:
 
 
 def overload() -> None:
-    """Frames five times as fast as they can be worked in: from a robot at its own speed, and from one that much faster."""
+    """Push frames five times as fast as a session can process them. They come from a robot at its own speed, and then from
+    one that is that much faster."""
     drive = {**ONLY_ODOMETRY, "classes": 12, "false": 0.0}
     log = simulate(preset("demo", **drive, frames=3000, frame_rate=10.0), 0)
     settings = settings_for("rays.pixel_sigma=2", "live.keyframe_distance=0", "live.keyframe_angle_deg=0")
@@ -94,7 +95,7 @@ def overload() -> None:
 
 
 def memory(minutes: int) -> None:
-    """An hour of driving, as fast as possible: resident size along the way."""
+    """Push an hour of driving as fast as possible, and print the resident size along the way."""
     lap = preset("demo", **ONLY_ODOMETRY, frames=600 * minutes, frame_rate=10.0, odometry_rate=200.0, classes=4)
     log = simulate(lap, 0)
     session = Session(settings_for("rays.pixel_sigma=2")).start()

@@ -93,7 +93,8 @@ def _woods(folder: Path) -> Drive:
 
 
 def _victoria(path: Path) -> Drive:
-    """Poses and trees share one numbering; the last three of six numbers after a step or a tree are its variances."""
+    """Read a file in which poses and trees share one numbering. The upper triangle of a covariance follows each
+    measurement."""
     steps, trees = [], []
     number = {0: 0}
     for line in path.read_text().splitlines():
@@ -172,7 +173,8 @@ def _simulated(rays: int) -> Drive:
 
 
 def _wheel_noise(poses: Floats) -> Floats:
-    """(F-1, 3) the noise of steps whose noise nobody told: of wheels, growing with way and turn."""
+    """Return the noise (F-1, 3) of steps if the data do not state it: that of wheels, which grows with the way and the
+    turn."""
     way, turn = np.hypot(*np.diff(poses[:, :2], axis=0).T), np.abs(np.diff(poses[:, 2]))
     return np.column_stack([0.02 + 0.05 * way, 0.01 + 0.02 * way, 0.01 + 0.05 * turn])
 

@@ -1,4 +1,5 @@
-"""Solve a drive: by a plain GTSAM script, by Python factors, by scipy, and by objslam. Each returns what it took."""
+"""Solve a drive: by a plain GTSAM script, by Python factors, by scipy, and by objslam. Each returns its times and its
+landmarks."""
 
 from __future__ import annotations
 
@@ -168,7 +169,7 @@ def scipy_sparse(drive: Drive) -> Solved:
 
 
 def objslam(drive: Drive) -> Solved:
-    """objslam in joint mode, with names known, and else with its defaults: it estimates shared errors and noise too."""
+    """Run objslam in joint mode, with known names and its defaults otherwise. It also estimates shared errors and noise."""
     return _objslam(drive, ())
 
 

@@ -23,9 +23,11 @@ class Level:
 LEVELS = (Level(8, 12.0, 19.0), Level(16, 28.0, 42.0), Level(32, 60.0, 90.0))
 PER_CELL = 6
 VARIANCES = (0.1, 0.2)
-"""by which offsets of the middle and of the size's logarithm are divided (Liu et al. 2016, the authors' code)."""
+"""The divisors of the offsets of the middle, and of those of the logarithm of the size (Liu et al. 2016, the authors'
+code)."""
 POSITIVE, NEGATIVE = 0.4, 0.3
-"""A default box that overlaps a true one by at least the first is to find it; below the second it is background."""
+"""A default box that overlaps a true box by at least the first share has to find it. Below the second share, it is
+background."""
 
 
 def grid(size: tuple[int, int], stride: int) -> tuple[int, int]:
@@ -76,7 +78,7 @@ def overlap(a: Tensor, b: Tensor) -> Tensor:
 
 
 def match(defaults: Tensor, boxes: Tensor, labels: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-    """What each default box is to learn from one image: class (A,) and offsets (A, 4).
+    """Return what each default box has to learn from one image: its class (A,) and its offsets (A, 4).
 
     defaults: (A, 4) centred. boxes (M, 4), labels (M,), counts (M,) bool as in `Samples`. Class 0 is background, 1 + label
     an object, -1 neither (a box between the two limits, or on an object that does not count). Every object that counts has
@@ -98,7 +100,8 @@ def match(defaults: Tensor, boxes: Tensor, labels: Tensor, counts: Tensor) -> tu
 
 
 def suppress(boxes: Tensor, scores: Tensor, limit: float) -> Tensor:
-    """Indices of the boxes (M, 4) that stay, best first: they overlap no better one that stays by more than `limit`."""
+    """Return the indices of the boxes (M, 4) that stay, best first. No box overlaps a better one that stays by more than
+    `limit`."""
     order = scores.argsort(descending=True, stable=True)
     share = overlap(boxes[order], boxes[order]) > limit
     stays = torch.ones(len(order), dtype=torch.bool)

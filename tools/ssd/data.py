@@ -21,11 +21,12 @@ from objslam.simulation.shapes import LABELS
 SIZE = (320, 240)
 """Width and height of the network's input, px: half of the rendered image."""
 RAW_SCALE = 2.0
-"""px of the rendered image to one of the network's input."""
+"""The number of px of the rendered image for one px of the network's input."""
 VIEWS = 8
-"""images taken in each room."""
+"""The number of images taken in each room."""
 COPIES = (1, 2, 3)
-"""of each object in a room: many show the detector objects, few leave room for things that are none."""
+"""How many copies of each object a room may have. More copies show the detector more objects, fewer leave room for other
+things."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Samples:
     """Images (N, H, W, 3) RGB with their boxes, one row a box, in the order of the images.
 
     image: (M,) index. boxes: (M, 4) x1, y1, x2, y2, px of these images. label: (M,) index into LABELS. counts: (M,) False
-    for objects too hidden or too small to ask for: neither to be learnt nor to be held against a detector.
+    for objects that are too hidden or too small. A detector need not learn or find them.
     """
 
     images: NDArray[np.uint8]
@@ -60,7 +61,7 @@ class Samples:
         return cls(image=image, **joined)
 
     def save(self, file: Path) -> None:
-        """Write to an .npz, which is there as a whole or not at all."""
+        """Write an .npz file, whole or not at all."""
         work = file.with_suffix(".part")
         with work.open("wb") as stream:
             np.savez(stream, images=self.images, image=self.image, boxes=self.boxes, label=self.label, counts=self.counts)
@@ -120,9 +121,10 @@ def render_room(seed: np.random.SeedSequence, views: int = VIEWS) -> Samples:
 
 
 def render_samples(folder: Path, kind: str, images: int, seed: int, shard: int = 240, views: int = VIEWS) -> None:
-    """Render so many images into `folder`/`kind`-*.npz; what is there already stays (a killed run goes on where it was).
+    """Render images into `folder`/`kind`-*.npz. Files that exist stay, so a killed run goes on where it was. images: their
+    number.
 
-    kind: "train" or "held_out": rooms and seeds of the two never coincide.
+    kind: "train" or "held_out". The two never share a room or a seed.
     """
     folder.mkdir(parents=True, exist_ok=True)
     root = np.random.SeedSequence([seed, {"train": 0, "held_out": 1}[kind]])

@@ -14,9 +14,9 @@ from ssd.data import Samples
 from ssd.model import Decoded, Ssd
 
 SCORE, OVERLAP, PER_CLASS = 0.05, 0.45, 50
-"""Lowest score, highest overlap of two boxes of one class, and boxes of a class in an image."""
+"""The least score of a box, the largest overlap of two boxes of one class, and the most boxes of a class in an image."""
 CANDIDATES = 400
-"""boxes of a class in an image that are looked at, the best ones."""
+"""The number of boxes of a class in an image that suppression compares, the best ones."""
 
 Boxes = tuple[Tensor, Tensor, Tensor]
 """Boxes (M, 4) px of the network's input, labels (M,), scores (M,) of one image."""
@@ -71,7 +71,8 @@ def detect(network: Ssd, images: NDArray[np.uint8], batch: int = 20) -> list[Box
 
 
 def measure(found: list[Boxes], samples: Samples, classes: int, scale: float = 1.0) -> Quality:
-    """Compare detections with the truth; scale: px of the camera's image to one of the network's, for the errors.
+    """Compare detections with the truth; scale: the number of px of the camera's image for one px of the network's, for the
+    errors.
 
     A detection on an object that does not count is neither right nor wrong.
     """
@@ -103,7 +104,8 @@ def measure(found: list[Boxes], samples: Samples, classes: int, scale: float = 1
 
 
 def average_precision(score: NDArray[np.float64], right: NDArray[np.bool_], objects: int) -> float:
-    """Area under the precision envelope over the recall, for boxes (M,) with a score, some right, and so many objects."""
+    """Return the area under the precision envelope over the recall, for boxes (M,) with a `score` each. right: (M,) whether
+    a box finds an object. objects: the number of all."""
     order = np.argsort(-score, kind="stable")
     hits = np.cumsum(right[order])
     recall = np.concatenate([[0.0], hits / objects])

@@ -25,7 +25,7 @@ OPSET = 17
 def export(network: Ssd, names: tuple[str, ...], file: Path, about: dict[str, str]) -> None:
     """Write the model: `images` (1, 3, H, W) RGB in [0, 1] to boxes (N, 4) px of the input, labels (N,), scores (N,).
 
-    The best come first. Labels count from 0; the metadata name the classes and say how images go in; about: more of it.
+    The best come first. Labels count from 0; the metadata name the classes and say how images go in. about: more metadata.
     """
     network.eval()
     stream = io.BytesIO()
@@ -124,7 +124,7 @@ def parity(network: Ssd, file: Path, images: NDArray[np.uint8], margin: float = 
 
 
 def _partners(first: Boxes, second: Boxes) -> tuple[Tensor, Tensor]:
-    """For each box of the first the one of the second, of the same label, that overlaps it most, and whether by 0.9."""
+    """Return for each box of the first the box of the second with its label that overlaps it most, and whether by 0.9."""
     if len(second[0]) == 0:
         return torch.zeros(len(first[0]), dtype=torch.int64), torch.zeros(len(first[0]), dtype=torch.bool)
     share = overlap(first[0], second[0]) * (first[1][:, None] == second[1][None])

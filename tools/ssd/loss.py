@@ -7,9 +7,9 @@ from torch import Tensor
 from torch.nn import functional
 
 HARD_NEGATIVES = 3
-"""background boxes for each box on an object (Liu et al. 2016, section 2.2)."""
+"""The number of background boxes for each box on an object (Liu et al. 2016, section 2.2)."""
 NEGATIVES_AT_LEAST = 30
-"""in each image, so that images without an object teach something too."""
+"""The least number of background boxes in an image, so that an image without an object teaches something too."""
 
 
 def hardest(background_loss: Tensor, target: Tensor) -> Tensor:

@@ -21,11 +21,11 @@ from ssd.model import Ssd
 
 BATCH = 16
 ROUND = 150
-"""steps between two checkpoints."""
+"""The number of steps between two checkpoints."""
 WARM_UP = 150
 RATE = 2e-3
 CHECKED = 160
-"""held-out images that are looked at after a round; all of them at the end."""
+"""The number of held-out images on which the model is measured after a round. At the end, it is all of them."""
 
 Sample = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64], NDArray[np.bool_]]
 
@@ -84,10 +84,10 @@ def rate_at(step: int, steps: int) -> float:
 
 
 def train(data: Path, out: Path, steps: int, seed: int) -> Ssd:
-    """Train for so many steps, from the checkpoint in `out` if there is one; the log goes to stdout.
+    """Train for `steps` steps, from the checkpoint in `out` if there is one. The log goes to stdout.
 
-    The batches of a round depend on the seed and on the round only: a run that was stopped and one that was not are the
-    same, as long as the images in `data` are. Images that appear there while it runs are taken up with the next round.
+    The batches of a round depend only on the seed and on the round. So a run that was stopped and continued gives the same
+    network, if the images in `data` are the same. New images there are used from the next round on.
     """
     held_out = load_samples(data, "held_out")
     shards = 0

@@ -17,9 +17,9 @@ _PRIOR = 20.0
 """The weight of the prior, as a number of pairs. In the prior, boxes of one object are as alike as boxes of two objects, and
 all labels are equal. A larger number needs a longer log to learn from."""
 _LEAST_APART = 0.3
-"""The least distance between the two mean cosines for vectors to be used, in standard deviations of the cosine of a box and
-an object with many boxes. A larger distance leaves more weak vectors unused. Random vectors are 0.1 apart in a log of a few
-hundred boxes."""
+"""Appearance vectors are used if the two mean cosines are at least this far apart. The unit is the standard deviation of the
+cosine between a box and an object with many boxes. A larger distance leaves more weak vectors unused. Random vectors are 0.1
+apart in a log of a few hundred boxes."""
 _LEAST_SHARE = 1e-3
 """The least share of `between` in the variance, and the least variance. It only keeps the ratio finite."""
 MOST_RATIO = 3.0
@@ -36,7 +36,8 @@ class Density:
     within: Floats
 
     def spread(self, label: Ints, one: Ints | float, other: Ints | float) -> Floats:
-        """Return the variance (E,) of the mean cosine between `one` and `other` boxes of labels (E,)."""
+        """Return the variance (E,) of the mean cosine between groups of `one` and of `other` boxes. label: (E,) of both
+        groups."""
         return np.asarray(self.between[label] + self.within[label] * (1 / one + 1 / other))
 
 

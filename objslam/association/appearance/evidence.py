@@ -15,8 +15,8 @@ from objslam.core.types import Rays
 Boxes = Observations | Rays
 """Boxes with labels, corners and appearance vectors."""
 _BESIDE = 8
-"""The number of boxes of a label, next in the order of a frame, that each box is compared with. A larger number gives more
-pairs of different objects where a frame has many boxes, and takes longer."""
+"""Each box is compared with this number of boxes of its label that follow it in its frame. A larger number gives more pairs
+of different objects where a frame has many boxes, and takes longer."""
 _DUPLICATE = 0.5
 """The intersection over union above which two boxes of one frame may show one object. A larger value learns from more."""
 _AT_ONCE = 1 << 24  # The most numbers of vectors that are multiplied at once. A larger value needs more memory.

@@ -28,9 +28,9 @@ _MOVING = 6
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
 _POWER = 0.4
-"""The factor on the log odds against strays in a probability. It is below 1, because boxes of near objects mix, so strays
-are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes the probabilities about 0.1 too large.
-A larger factor makes them larger."""
+"""The log odds against strays are multiplied by this factor, and then become a probability. It is below 1, because boxes of
+near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes the
+probabilities about 0.1 too large. A larger factor makes them larger."""
 _SAMPLE = 512  # The most rays of one label in a search, in whole frames. A larger number costs time squared.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
@@ -144,7 +144,7 @@ class _Few:
         return found.merge(own).keep(~taken[known:][own == np.arange(found.count)])
 
     def dropped(self, found: State, least: float) -> State:
-        """Drop landmarks until all others are likely enough to exist.
+        """Drop landmarks until all that are left are likely enough to exist.
 
         If two neighbours both fail, the one with more rays stays for one more turn. It may get rays of the other one.
         """

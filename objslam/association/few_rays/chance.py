@@ -44,8 +44,8 @@ _PRIOR = 0.5
 
 @dataclass(frozen=True)
 class _Density:
-    """The densities of the boxes of each label along one coordinate. low: where the first bin begins. width: the
-    width of a bin. value: (L, bins)."""
+    """The density of boxes along one coordinate, for each label. low: where the first bin begins. width: the width of a bin.
+    value: (L, bins)."""
 
     low: float
     width: float
@@ -173,7 +173,7 @@ def ray_odds(
 
 
 def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> Floats:
-    """Return the cost (E,) of a ray without a landmark, instead of each match.
+    """Return for each match the cost (E,) of its ray if it had no landmark.
 
     It is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most `gate`.
     So it matters only where strays are dense compared with the noise of the rays. Boxes within the gate of the landmark do
@@ -235,9 +235,10 @@ def _expected(state: State, rates: Rates) -> tuple[Ints, Floats]:
 def _likeliest(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: Floats) -> tuple[Floats, Floats]:
     """Return the share (L,) of the boxes of each label that are stray, and the factor (L,) on the density of its objects.
 
-    Strays and objects are Poisson distributed, with c n of the n boxes and m times the nominal number of objects. Then the
-    likelihood is c^n exp(-c n - m objects), times 1 + m o c^-k for each landmark with k rays and the odds o at c = m = 1.
-    odds, number, label: (N,). boxes, objects: (L,), the nominal numbers of boxes and objects.
+    The numbers of strays and objects are Poisson distributed. The mean number of strays is c n, for n boxes. The mean number
+    of objects is m times the nominal number. Then the likelihood is c^n exp(-c n - m objects), times 1 + m o c^-k for each
+    landmark with k rays and the odds o at c = m = 1. odds, number, label: (N,). boxes, objects: (L,), the nominal numbers of
+    boxes and objects.
     """
     log_share, log_density = np.log(np.geomspace(1e-4, 1.0, _TRIED)), np.log(np.geomspace(*_DENSITIES, _TRIED))
     grid = np.zeros((len(boxes), _TRIED, _TRIED))

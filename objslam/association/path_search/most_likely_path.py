@@ -29,8 +29,8 @@ reaches farther: the heading of a solved path errs by 14 degrees at most."""
 
 @dataclass(frozen=True)
 class LikelyPath:
-    """The most likely path. map_T_base: (K, 4, 4). turn, shift: rad and m, about the standard deviations of its poses,
-    because of the steps of the grid."""
+    """The most likely path. map_T_base: (K, 4, 4). turn, shift: rad and m, roughly the standard deviations of its poses that
+    come from the steps of the grid."""
 
     map_T_base: Floats
     turn: float
@@ -79,7 +79,8 @@ def most_likely_path(
 
 
 def _spacing(positions: Floats, label: Ints) -> float:
-    """Return the median distance (m) from a landmark to the nearest other one of its label, inf without any two."""
+    """Return the median distance (m) from a landmark to the nearest other one of its label, inf if no label has two
+    landmarks."""
     from scipy.spatial import cKDTree
 
     nearest = [np.zeros(0)]

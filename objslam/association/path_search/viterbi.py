@@ -69,8 +69,8 @@ class Motions:
 def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> Floats:
     """Return the states (G, 3) of x, y (m) and yaw (rad) with the least total cost. costs: (Y, X, X) of each stretch.
 
-    No state on the best path costs `_SLIP` more than the best state of its stretch, because a slip from there costs less. So
-    a byte stores the cost above the best one.
+    A state that costs `_SLIP` more than the best state of its stretch is on no best path, because a slip from the best state
+    costs less. So a byte is enough for the cost above that of the best state.
     """
     stored, total = list[NDArray[np.uint8]](), np.zeros(0, dtype=np.float32)
     for k, seen in enumerate(costs):

@@ -26,8 +26,8 @@ class ArrowSystem:
     """The normal equations of N objects and S maps with w unknowns each, from R measurements.
 
     objects: (N, 3, 3) and maps: (S, w, w), the blocks on the diagonal. pull: (R, 3, w) the block between object (R,) and map
-    (R,) of each measurement, with the sign of a positive derivative of the map's prediction: the matrix has -pull there. A
-    map measures an object once at most.
+    (R,) of each measurement, with the sign of the derivative of the map's prediction. The matrix has -pull there. A map
+    measures an object once at most.
     """
 
     objects: Floats
@@ -37,7 +37,8 @@ class ArrowSystem:
     map: Ints
 
     def step(self, gradient: Floats) -> Floats:
-        """Return the step (S, w) of the maps. gradient: (S, w) their right side. That of the objects is 0."""
+        """Return the step (S, w) of the maps. gradient: (S, w) the right side of the maps. The right side of the objects is
+        0."""
         count, width = gradient.shape
         if self._by_map():
             system, _ = self._of_maps()

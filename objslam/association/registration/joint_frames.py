@@ -30,8 +30,8 @@ _ROUNDS = 10
 _SAME_NOISE = 0.02
 """The noise is not estimated again if its relative change is smaller than this. A larger value ends sooner."""
 _FEWEST_MAPS = 3
-"""The least number of maps that have a noise each. With fewer, all have one noise, because the residuals of two maps do not
-tell which is worse. A larger number gives more maps one noise."""
+"""With at least this number of maps, each map has a noise of its own. With fewer, all have one noise, because the residuals
+of two maps do not tell which map is worse. A larger number gives more maps one noise."""
 _POOLED = 10.0
 """A map's given covariances weigh as much as this number of residuals. A larger number trusts them more. At 10, a map of a
 few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
@@ -43,7 +43,8 @@ _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 gives the expectation of a weighted squared residual. More steps give it more exactly."""
 _STILL = 1e-6
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner. With Cauchy's weights, each step is about
-half of the one before. So the positions then miss about as much, which is a thousandth of the errors of the best maps."""
+half of the one before. So at the end the positions are wrong by about this much, which is a thousandth of the errors of the
+best maps."""
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,8 @@ def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], No
 class _Rates:
     """The formatter of the status line. Message rates are averages since the previous status line.
 
-    A narrow terminal cuts the end of the line, so long reasons come last. What does not change how the user drives is left
-    out until the number of dropped data fits too.
+    A narrow terminal cuts the end of the line, so long reasons come last. The line leaves out what does not change how the
+    user drives, until the number of dropped data fits.
     """
 
     def __init__(self) -> None:
@@ -81,7 +81,8 @@ class _Rates:
 def _status(snapshot: Snapshot, ledger: Ledger, rates: dict[str, float], spare: int) -> tuple[str, int]:
     """Return a status line, and the length up to the number of dropped data.
 
-    spare: how much is left out: the unresolved objects from 1 on, the keyframes from 2, each path's rate from 3.
+    spare: how much is left out, from 0 (nothing) on. From 1 on, the unresolved objects are left out, from 2 on the
+    keyframes, and from 3 on each path's rate.
     """
     resolved = len(snapshot.map.resolved())
     found = f"{resolved} object{'' if resolved == 1 else 's'}"
@@ -107,7 +108,7 @@ def _status(snapshot: Snapshot, ledger: Ledger, rates: dict[str, float], spare: 
 
 
 def _lost(snapshot: Snapshot, ledger: Ledger) -> tuple[int, str]:
-    """Return the number of dropped data, and the most frequent reason and the numbers of unused data by kind in words."""
+    """Return the number of dropped data, and a text with the most frequent reason and the numbers of unused data by kind."""
     from objslam.core.snapshot import NOT_USED
     from objslam.frontend.bearings import CUT_OFF
 

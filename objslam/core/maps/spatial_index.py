@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
 _SLACK = 1e-9
-"""The length (m), and the share of a radius, by which the tree looks farther. Then the exact distances decide. A larger
-value covers more rounding, and asks for more points."""
+"""The tree looks farther than asked, by this length (m) and by this share of the radius. Then the exact distances decide. A
+larger value covers more rounding, and asks for more points."""
 
 
 class SpatialIndex:

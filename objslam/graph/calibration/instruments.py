@@ -77,7 +77,8 @@ class Motions:
 
 
 def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Floats) -> Floats:
-    """Return instruments (M, p): the sides without the noise of motions in the scales of the odometry and in the weights.
+    """Return instruments (M, p): the `LinearSystem.sides` without the noise of motions in the scales of the odometry and in
+    the weights.
 
     The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
     if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is independent

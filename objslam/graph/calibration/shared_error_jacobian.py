@@ -32,13 +32,13 @@ class LinearSystem:
 
     The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses. The
     corners of fiducials are last. jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns
-    each. normal: the normal equations of the Jacobian. sides: (M, P) by the shared errors. residual: (M,). first_range,
-    first_motion: the first rows of the ranges and of the motions. instruments: (M, P). At the optimum, the residuals do not
-    correlate with the instruments. The instruments equal the sides, except for clocks and the scales of the odometry: these
-    sides contain the noise of the odometry, and so do the residuals. motions: None if neither the odometry nor a clock is a
-    parameter. clocks: None without a clock. by_path: (M, C) instruments of the C clocks by the solved path. noise: (P,) the
-    shares of noise in the information, from `noise_shares`. longer: (P,) the ratio of the odometry's noise in the residuals
-    to that in the side of a scale, 0 for other parameters.
+    each. normal: the normal equations of the Jacobian. sides: (M, P) the derivatives of the rows by the shared errors.
+    residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions. instruments: (M, P). At the
+    optimum, the residuals do not correlate with the instruments. The instruments equal the sides, except for clocks and the
+    scales of the odometry: these sides contain the noise of the odometry, and so do the residuals. motions: None if neither
+    the odometry nor a clock is a parameter. clocks: None without a clock. by_path: (M, C) instruments of the C clocks by the
+    solved path. noise: (P,) the shares of noise in the information, from `noise_shares`. longer: (P,) the ratio of the
+    odometry's noise in the residuals to that in the side of a scale, 0 for other parameters.
     """
 
     jacobian: sparse.csr_matrix

@@ -32,8 +32,9 @@ factor has half of that. So a long log needs fewer probes than `_PROBES`. A larg
 _ITERATIONS = 20
 """The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 5 to 12."""
 _CONVERGED = 0.01
-"""The iteration ends if all factors change by less than this share. A factor that the log hardly determines changes slowly,
-so a larger share ends far from its value: with 0.02, one MRCLAM robot without ranges got 2.2 instead of 2.8."""
+"""The iteration ends if all factors change by less than this share. A factor that the log hardly determines changes slowly.
+With a larger share, the iteration ends before this factor has its value: with 0.02, one MRCLAM robot without ranges got 2.2
+instead of 2.8."""
 _LIMITS = (0.05, MOST_NOISE)
 """The smallest and largest factors on a nominal noise. Outside them, the settings do not describe the sensor at all."""
 _SHORTEST, _LONGEST = 3.0, 6.0
@@ -46,7 +47,7 @@ larger number shortens the windows of short logs."""
 _MOST_SHRINKAGE = 0.3
 """The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger limit hides."""
 _PRIOR_OBJECTS = 4
-"""The largest weight of the range bias in the settings, as a number of objects. With a larger number, the bias changes
+"""The range bias in the settings weighs at most as much as this number of objects. With a larger number, the bias changes
 less."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
 """The factor from the mean absolute value of Gaussian numbers to their standard deviation."""

@@ -31,7 +31,8 @@ false information there."""
 
 @dataclass(frozen=True)
 class OdometryMotions:
-    """M camera motions: first those between consecutive keyframes, then the ties.
+    """M camera motions: first those between consecutive keyframes, then the ties. The motions below a tie are those between
+    its two keyframes.
 
     before, after: (M,) the keyframes. motion: (M, 4, 4). noise: (M, 6, 6) of the odometry. wander: (M, 6, 6) of the
     interpolated path, which adds to the noise. loose: (T, 6, 6) for each of the T ties, the noise and wander of the
@@ -100,7 +101,8 @@ def _in_camera(keyframes: Keyframes, last: Ints, covariance: Floats) -> Floats:
 
 
 def below_ties(ties: Ints, count: int) -> Bools:
-    """Return which motions (count - 1,) between consecutive keyframes are below one of the ties (T, 2)."""
+    """Return which motions (count - 1,) between consecutive keyframes lie between the two keyframes of one of the ties (T,
+    2)."""
     ends = np.zeros(count, dtype=np.int64)
     np.add.at(ends, ties[:, 0], 1)
     np.add.at(ends, ties[:, 1], -1)
@@ -131,7 +133,8 @@ def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
 
 
 def _told(whole: Floats, loose: Floats) -> tuple[Floats, Floats]:
-    """Return the shares (T, 6) of the information 1 / `whole` that is not in 1 / `loose`, and the axes (T, 6, 6)."""
+    """Return the shares (T, 6) of the information 1 / `whole` that is not in 1 / `loose`, and the axes (T, 6, 6) of these
+    shares."""
     root = np.linalg.cholesky(whole)
     back = np.linalg.inv(root)
     size, axes = np.linalg.eigh(back @ loose @ np.swapaxes(back, 1, 2))

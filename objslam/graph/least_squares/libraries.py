@@ -19,7 +19,7 @@ def load_libraries() -> None:
 def _import_later(name: str) -> None:
     """Let a module load at its first use. Its parent must be imported already.
 
-    A module that only copies the names of the parent then does not load it. Nothing happens if the module is imported
+    Then a module that only copies the names of the parent does not load this one. Nothing happens if the module is imported
     already, or does not exist.
     """
     spec = None if name in sys.modules else find_spec(name)

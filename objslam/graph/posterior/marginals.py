@@ -31,7 +31,8 @@ _DIRECTIONS = 20
 """The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven.
 With a larger number, the bends of a long path count too, and the search takes longer."""
 _ITERATIONS = 3
-"""The number of steps of the search for these directions. More steps are more exact, and take longer."""
+"""The number of steps of the search for the directions in which correlations are kept. More steps are more exact, and take
+longer."""
 _COLUMNS = 48
 """The number of columns of the inverse that are computed at once. A larger number takes more memory."""
 _DENSE, _EACH = 2000, 8

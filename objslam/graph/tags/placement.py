@@ -127,7 +127,8 @@ def _nearest(seen: Corners, most: int) -> Ints:
 
 
 def _views_of_each(owner: Ints, judges: Corners, count: int) -> Corners:
-    """Return for each candidate the `judges` of its fiducial. owner: (C,) the fiducial of each candidate, of `count`."""
+    """Return for each candidate a copy of the views of its fiducial. judges: the views, of `count` fiducials. owner: (C,)
+    the fiducial of each candidate."""
     judges = judges.take(np.argsort(judges.square, kind="stable"))
     begin, number = np.searchsorted(judges.square, np.arange(count)), np.bincount(judges.square, minlength=count)
     candidate = np.repeat(np.arange(len(owner)), number[owner])

@@ -12,8 +12,9 @@ from objslam.core.statistics import CAUCHY_K
 from objslam.graph.factors.bearing import tangent_basis
 
 _BEHIND = 1e-3
-"""The least share of a corner's distance that must be ahead along its ray. A corner with a smaller share costs
-`_BEHIND_COST` and has no gradient. A larger share counts more corners as behind."""
+"""The least part of the way from the camera to a corner that must be along the corner's ray, as a share of the distance. A
+corner with a smaller share counts as behind the camera: it costs `_BEHIND_COST` and has no gradient. A larger share counts
+more corners as behind."""
 _BEHIND_COST = 1e6
 """The squared deviation of a corner behind its camera. A larger value excludes such poses more surely."""
 _DAMPING = 1e-3

@@ -115,7 +115,7 @@ class PathTable(GrowingTable):
         """Keep one pose per period, and the poses at gaps. The period doubles until few enough poses stay.
 
         A period above max_gap / 4 does not apply to poses near `asked` or near the end of the path. If such poses leave too
-        little room for others (_LEAST), the most poses of the table double instead.
+        little room for others (_LEAST), the limit on the number of poses doubles instead.
         """
         near = self._near(asked)
         self._spacing = self._spacing or min(2 * float(self.stamp[-1] - self.stamp[0]) / len(self), self._widest)

@@ -29,11 +29,11 @@ _CHI2 = 13.28
 """The largest squared deviation of a box from its predicted one, chi-squared of 4 degrees of freedom at 99 %. A larger value
 accepts boxes of other things."""
 _FEWEST = 2
-"""The least number of edges that are no bounds. With a larger number, fewer boxes are used. One edge alone agrees with too
-many bodies. In simulated drives, boxes with fewer such edges made centres a little worse."""
+"""A box is used if at least this number of its edges are no bounds. With a larger number, fewer boxes are used. One edge
+alone agrees with too many bodies. In simulated drives, boxes with fewer such edges made centres a little worse."""
 _WITHIN = 0.1
-"""An edge is a bound if the body touches it outside the image, or inside within this share of the box from the cut. A larger
-share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simulated drives."""
+"""An edge is a bound if the body touches it outside the image, or inside it, but at most this share of the box away from the
+cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simulated drives."""
 
 
 def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution) -> BoxEdges | None:

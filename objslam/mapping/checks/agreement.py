@@ -74,7 +74,7 @@ class Part:
 
     @property
     def crowd(self) -> float:
-        """The mean over the boxes of how many boxes of the same label are in the frame. In a crowd, rays meet by chance."""
+        """The number of boxes of one label in one frame, as the mean over all boxes. In a crowd, rays meet by chance."""
         counts = [np.zeros(0)]
         for one in self.log.cameras:
             if one.detections is not None and len(one.detections):

@@ -38,7 +38,8 @@ With a larger value, more runs take a few seconds longer."""
 _ALARM_CLOCKS = (-1.0, -0.5, 0.5, 1.0)
 """The clock offsets (s) that every run tries. A clock with a larger error also fits better with one of the offsets."""
 _CROWD = 5.0
-"""The crowd (`Part.crowd`) above which rays meet anywhere and show nothing. A larger value takes longer."""
+"""The boxes of a log with a larger crowd (`Part.crowd`) are not compared, because their rays meet anywhere and show nothing.
+With a larger value, more logs are compared, which takes longer."""
 _FEWEST = 60
 """The fewest boxes of a log that are judged by their agreement. Fewer boxes agree by chance."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)

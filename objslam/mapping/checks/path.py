@@ -25,9 +25,9 @@ _JUMP_TURN = 20.0
 each m/s of live.max_speed."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
-_TIMES = 20.0
-"""The least speed of a jump, in quarters of the speed that the moving robot exceeds in a tenth of its steps. It also applies
-to turn rates. A larger number warns less often."""
+_TIMES = 5.0
+"""The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. The same
+holds for turn rates. A larger number warns less often."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
 _STILL = 1e-4
@@ -38,8 +38,8 @@ still, its boxes do not move in the image either. A larger value finds fewer fro
 _MOVING_PX = 12.0
 """The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves."""
 _LEAST_STEP = 0.01
-"""The noise (m) of a position. The direction of a motion is judged if it is more than three times as long. A larger value
-suits noisy poses."""
+"""The noise (m) of a position. The direction of a motion is judged if the motion is more than three times as long. A larger
+value suits noisy poses."""
 _PIECE = 1.0
 """The time (s) over which distances are compared. A longer time suits noisy poses."""
 _LEAST_PIECE = 0.3
@@ -108,8 +108,8 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
         return
     fast = float(np.quantile(speed[moving], 0.9)), float(np.quantile(rate[moving], 0.9))
     # A gap in the poses is no jump. The speed over the gap is one that a robot can reach.
-    jumps = (speed > max(_JUMP, _TIMES * fast[0] / 4)) & (way > _JUMP_WAY)
-    jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1] / 4)) & (angle > _JUMP_ANGLE)
+    jumps = (speed > max(_JUMP, _TIMES * fast[0])) & (way > _JUMP_WAY)
+    jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1])) & (angle > _JUMP_ANGLE)
     if jumps.any():
         first = int(np.argmax(jumps))
         yield Finding(

@@ -19,14 +19,14 @@ points. The ratios of points at wrong positions differ."""
 _SPREAD_OF_UNITS = 0.3
 """`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`)."""
 _LEAST = 0.04
-"""The least error of the ranges, as a share. Smaller errors also come from the depth of things and from cameras that are
-turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share warns less
-often."""
+"""The least error of the ranges that is reported, as a share. Smaller errors also come from the depth of things and from
+cameras that are turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger
+share warns less often."""
 _SPOILING = 0.06
 """The error of the scale, as a share, above which positions are unreliable. With a larger share, fewer maps are
 unreliable."""
 _SIGMAS = 5.0
-"""The least error in standard deviations. A larger number warns less often."""
+"""The least error of the ranges that is reported, in standard deviations. A larger number warns less often."""
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
 """The name of each unit of length, by the number of units in a metre."""
 _CLOSE = 0.25

@@ -54,8 +54,8 @@ def check_pose_noise(
 ) -> Finding | None:
     """Return a finding if the noise of the poses that the log shows makes most rays far noisier than the settings say.
 
-    The map counts with this noise, so it is honest. With better poses it would be more exact. calibrated: whether the
-    cameras were calibrated against the poses.
+    The covariances of the map contain this noise, so they are honest. With better poses it would be more exact. calibrated:
+    whether the cameras were calibrated against the poses.
     """
     if keyframes.pose_noise == (1.0, 1.0) or not _held(objects, association).any():
         return None
@@ -72,7 +72,7 @@ def check_pose_noise(
         "localisation noise",
         f"all boxes of a frame miss their objects together: the poses err by {least}{np.degrees(yaw):.2g} deg and "
         f"{100 * place:.2g} cm, {turns:.1f} and {shifts:.1f} times what localization.yaw and localization.xy say. The map "
-        f"counts with these errors, so its sigmas are large; {cause}",
+        f"allows for these errors, so its sigmas are large; {cause}",
         spoils=False,
     )
 

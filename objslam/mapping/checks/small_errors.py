@@ -28,8 +28,8 @@ _KINDS = tuple(_HARMFUL)
 _LEAST_GAIN = 40.0
 """The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer."""
 _LEAST_SHARE = 0.04
-"""The least decrease as a share of all squared deviations. Rays of a real log are not independent, so the sum of many small
-deviations proves nothing. A larger value finds fewer errors."""
+"""The least decrease by an error, as a share of all squared deviations. Rays of a real log are not independent, so the sum
+of many small deviations proves nothing. A larger value finds fewer errors."""
 _UNUSUAL = 4.0
 """The number of prior standard deviations above which an error is no usual one. A larger number calls fewer unusual."""
 _ROUNDS = 6
@@ -83,7 +83,8 @@ class SmallErrors:
         return self._words_of(self.harmful)
 
     def unusual(self, settings: Settings) -> str:
-        """Return the errors that the run estimates, but that are far larger than their priors, with sizes. "" without."""
+        """Return the errors that the run estimates, but that are far larger than their priors, with their sizes. "" if there
+        are none."""
         found = zip(self.names, self.values.tolist(), strict=True)
         far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings))
         return self._words_of(tuple(far))

@@ -18,7 +18,7 @@ _SCALES = (1.0, 3.0)
 """The largest distance of a ray from its place, in gates. The first finds rays that meet, the second also rays that only
 pass nearby. Larger numbers find looser groups, and join different groups more often."""
 _LOOSE = 2.0
-"""If the second scale finds more than this many times the rays of the first, the rays only pass nearby, and do not meet.
+"""If the second scale finds more than this many times as many rays as the first, the rays only pass nearby, and do not meet.
 With a larger number, more loose groups count as narrow ones."""
 _AROUND = 4.0
 """The surroundings of a place end at this multiple of the distance up to which a ray passes it. A larger multiple gives a
@@ -27,7 +27,7 @@ _FLAT = 0.5
 """The largest angle (rad) of the surroundings, seen from a camera. Wider ones are not flat, so their area does not tell how
 many rays pass by chance. A larger angle counts places nearer to the path."""
 _PAIRS = 3000
-"""The number of tried pairs of rays of a label. More pairs find groups of fewer rays, and take longer."""
+"""The number of pairs of rays that are tried for a label. More pairs find groups of fewer rays, and take longer."""
 _NEXT = 30
 """Half of the pairs are at most this number of boxes apart in time, because a place is seen for a while. A smaller number
 finds small groups in long logs better, with less parallax."""

@@ -25,9 +25,9 @@ copies. A larger value reports more pairs."""
 _LEAST = 0.1
 """The least probability that a reported pair is one object. A larger value reports fewer pairs."""
 _BOTH = 0.5
-"""The share of the frames with two independent objects that really show both. One thing hides another, and a detector
-suppresses boxes that overlap. It is chosen, not measured. With a larger share, a frame without both is stronger evidence for
-one object."""
+"""Of the frames that should show both of two independent objects, this share really shows both. One thing hides another, and
+a detector suppresses boxes that overlap. It is chosen, not measured. With a larger share, a frame without both is stronger
+evidence for one object."""
 _BESIDES = 0.2
 """The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
 number, few frames tell less."""
@@ -68,7 +68,8 @@ def find_pairs(evidence: Evidence) -> Pairs:
 
     Two explanations are compared. If they are one object, the covariance of their offset is the sum of their covariances,
     and hardly any frame shows both (`TOGETHER`). If they are two, the second lies anywhere among the objects of its label,
-    and frames in view of both show both. Objects that fill one space are candidates too, because two things cannot do so.
+    and the frames that have both in view show both. Objects that fill one space are candidates too, because two things
+    cannot do so.
     """
     state, covariance = evidence.state, evidence.covariance
     position = state.landmarks.position

@@ -30,17 +30,17 @@ _ROUNDS = 12
 a round, so it needs ten to reach its bound. More rounds are slower if they do not settle."""
 _SAME = 0.05
 """An association is repeated only if ray directions, or their noise, differ from those of each earlier round by more than
-this share of the noise. Such a small change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A
-larger share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the
-association can swing between two states for ever."""
+this share of the noise. A smaller change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A larger
+share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the association
+can swing between two states for ever."""
 _FIRST = 0.05
 """The noise (rad) of ray directions, in addition to that of the settings, in an association that shows the noise of the
 poses. The priors of the shared errors of a camera allow about as much. With a larger value, near objects become one, and
 then their rays show nothing of the poses."""
 _EXPLAINED = 0.5
 """If an association with wide gates explains at most this share of the rays, one with narrow gates is tried as well. The
-narrow one is taken if the wide one explains less than this share of its number of rays. With a larger share, the narrow one
-is tried and taken more often."""
+narrow one is taken if the wide one explains less than this share of the rays that the narrow one explains. With a larger
+share, the narrow one is tried and taken more often."""
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,11 @@ _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
 """The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
 _CHANCE = 1e-3
 """The chance of a false alarm: that poses which are as good as the settings say are found noisier. With a larger value,
-shorter logs can show noisy poses, and more good logs seem to."""
+shorter logs can show noisy poses, and more good logs seem to have such poses."""
 _SIGNIFICANT = -2 * np.log(_CHANCE)
-"""The least fall of -2 ln of the posterior density with the two noises of poses free: the quantile of chi-squared with 2
-degrees of freedom that is exceeded by `_CHANCE`."""
+"""The poses count as noisier if this lowers -2 ln of the posterior density by at least this value. It is the quantile of
+chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are the noises of headings and of
+places."""
 _STRAY = 3.0
 """The deviation of a stray ray, in standard deviations of all noise together. A larger number lets false boxes raise the
 noise, a smaller one lowers the noise of true boxes: by 1.3 % at 3."""

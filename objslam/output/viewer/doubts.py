@@ -11,7 +11,8 @@ _COLOUR = (196, 88, 0)  # The RGB colour of doubts, which no label and no ray ha
 
 
 def log_doubts(recording: Any, result: RunResult) -> None:
-    """Log static points to `map/doubts`, with captions, and lines between objects that may be one to `map/doubts/pairs`."""
+    """Log doubts as static points with captions, `map/doubts`. Lines join two objects that may be one,
+    `map/doubts/pairs`."""
     placed = [(one, one.position) for one in result.doubts if one.position is not None]
     if placed:
         texts = [caption(one) for one, _ in placed]

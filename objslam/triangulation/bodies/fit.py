@@ -141,7 +141,8 @@ def _chosen(which: Bools, new: Residuals, old: Residuals) -> Residuals:
 
 
 def grouped(group: Ints, rows: Floats, count: int) -> Floats:
-    """Return the sums (count, ...) of rows (B, ...) of each group (B,). It is fastest if the groups are in order."""
+    """Add up the rows (B, ...) of each group, and return the sums (count, ...). It is fastest if the groups (B,) are in
+    order."""
     total = np.zeros((count, *rows.shape[1:]))
     if not len(group):
         return total

@@ -15,8 +15,8 @@ _TIMES = 2.0
 """Boxes agree by chance if their score is below this multiple of that of chance (`trials.chance`). Clean logs have at least
 2.9 times as much, logs with turned cameras at most 1.9. A larger value accuses more logs."""
 _DISTANT = 0.9
-"""The share of boxes that fit a point or a direction from which boxes are not said to disagree. It is at least 0.94 in logs
-without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
+"""If at least this share of the boxes fits a point or a direction, the boxes are not said to disagree. The share is at least
+0.94 in logs without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
 _CONE = np.radians(4.0)
 """The angle (rad) within which rays have one direction. Rays that differ by less give no point. A larger angle accuses fewer
 logs."""

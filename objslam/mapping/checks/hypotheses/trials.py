@@ -92,8 +92,8 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
 
     corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
     better than this: a mount with another order of its quaternion may look like one that is tilted a little. unusual: those
-    of the errors, in words, that are too large for a usual mount, "" if there are none. Then a mount that explains the boxes
-    as well is the more probable cause. It is named, but the run corrects it.
+    of the errors, in words, that are too large for a usual mount, "" if there are none. If there are such errors, a mount
+    that explains the boxes as well is the more probable cause. It is named, but the run corrects it.
     """
     first, rest = trials[0], trials[1:]
 

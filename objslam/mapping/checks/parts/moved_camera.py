@@ -73,7 +73,7 @@ def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Fi
 
 
 def _halves(part: Part, middle: float) -> Part:
-    """Return the part with two cameras for each one: that of the first half, and that of the second half.
+    """Return the part with two cameras in place of each camera: one with its first half, and one with its second half.
 
     The halves have windows of their own, and so points of their own.
     """
