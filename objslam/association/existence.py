@@ -170,7 +170,7 @@ def _drift_at(state: State) -> Floats:
     drift = state.view.drift
     if drift is None or not state.count:
         return np.zeros(state.count)
-    ends = grouped_quantiles(state.obs.frame[state.assigned], state.owner, state.count, (0.0, 1.0))
+    ends = grouped_quantiles(state.obs.frame[state.assigned].astype(np.float64), state.owner, state.count, (0.0, 1.0))
     first, last = (np.nan_to_num(frame).astype(np.int64) for frame in ends)
     p = state.landmarks.position
     turns = np.cross(np.eye(3), p[:, None])  # Row i is e_i x p, the way of p per angle about axis i.
