@@ -15,6 +15,10 @@ where up is, and z is used. With a larger value, z is used more often."""
 _TILT = np.radians(45)
 """The angle, rad, between the mean of the up vectors and the map's z axis, above which the map lies on its side. Cameras on
 robots look up or down by less. With a larger angle, z is used more often."""
+_CLIMB = 2.0
+"""An axis does not point up if the cameras move along it this many times as far as along the map's z axis. Robots move
+mostly on the floor. A camera that looks straight down has a level up vector, which says nothing. With a larger number, the
+up vectors count in more maps."""
 _FROM_ABOVE = {"z": (0, 1), "-z": (1, 0), "x": (1, 2), "-x": (2, 1), "y": (2, 0), "-y": (0, 2)}
 """For each axis that can point up: the two axes that point to the right and to the top of a view from above. Together with
 the axis that points up, they are a right-handed frame."""
@@ -24,7 +28,7 @@ def up_axis(keyframes: Keyframes) -> Up:
     """Return the axis of the map that points up. It is z, unless the map lies on its side.
 
     Then it is the axis that is nearest to the mean of the cameras' up vectors. The map of visual SLAM is often in the first
-    camera's frame, where y points down. If the path is planar, up is z.
+    camera's frame, where y points down. If the path is planar, or the cameras move mostly along that axis, up is z.
     """
     if not len(keyframes) or is_planar(keyframes.map_T_base):
         return "z"
@@ -33,6 +37,9 @@ def up_axis(keyframes: Keyframes) -> Up:
     if length < _STEADY or np.arccos(np.clip(up[2] / length, -1.0, 1.0)) <= _TILT:
         return "z"
     axis = int(np.argmax(np.abs(up)))
+    way = np.ptp(keyframes.map_T_camera[:, :3, 3], axis=0)
+    if way[axis] > _CLIMB * way[2]:
+        return "z"
     return get_args(Up)[axis + 3 * bool(up[axis] < 0)]
 
 

@@ -17,6 +17,10 @@ _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
 """The tried sizes of the images in which the boxes were found, as multiples of the image size in the calibration."""
 _SQUARES = (320, 416, 512, 640)
 """The sides (px) of square images that detectors often use."""
+_CLIPPED, _AT_EDGE = 0.05, 1.0
+"""Boxes are px of the calibration's images if at least this share of them ends within this distance (px) of the right or
+the lower edge, and hardly any beyond. A detector clips boxes there. In another unit, boxes end there by chance only. Larger
+shares let more wrong sizes be tried, larger distances fewer."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 """The tried clock offsets (s). `small_errors` finds smaller offsets."""
 
@@ -25,7 +29,9 @@ def hypotheses(log: Log) -> Iterator[Hypothesis]:
     """Yield each hypothesis that applies to a log."""
     yield from mounts(log)
     yield from _paths(log)
-    yield from _boxes(any(one.camera.sees_size for one in log.cameras))
+    yield from _images()
+    if not _clipped_at_the_edge(log):
+        yield from _boxes(any(one.camera.sees_size for one in log.cameras))
     yield from _clocks()
 
 
@@ -51,19 +57,36 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
         yield Hypothesis(name, what, cause, partial(with_poses, change=change))
 
 
+def _clipped_at_the_edge(log: Log) -> bool:
+    """Return whether a camera's boxes end at the right and lower edges of its image, as no other unit explains."""
+    for one in log.cameras:
+        if one.detections is not None and len(one.detections):
+            beyond = (one.detections.boxes[:, 2:] - one.camera.size).max(axis=1)
+            at, past = (np.abs(beyond) <= _AT_EDGE).mean(), (beyond > _AT_EDGE).mean()
+            if at >= _CLIPPED and past < at / 2:
+                return True
+    return False
+
+
+def _boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
+    def put_right(log: Log) -> Log:
+        return with_cameras(log, lambda one: _with_boxes(one, change))
+
+    return put_right
+
+
+def _images() -> Iterator[Hypothesis]:
+    """Yield the hypotheses about images that were turned before detection."""
+    what, cause = "the boxes mirrored", "the images were mirrored before detection"
+    yield Hypothesis("image mirrored", what, cause, _boxed(_mirrored))
+    what, cause = "the boxes turned by 180 degrees", "the camera or its images are upside down"
+    yield Hypothesis("image upside down", what, cause, _boxed(_upside_down))
+
+
 def _boxes(sized: bool) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about boxes. sized: whether the boxes have a size. Without it, the hypotheses about width and
-    height are left out."""
-
-    def boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
-        def put_right(log: Log) -> Log:
-            return with_cameras(log, lambda one: _with_boxes(one, change))
-
-        return put_right
-
+    """Yield the hypotheses about the unit and the order of boxes. sized: whether the boxes have a size. Without it, the
+    hypotheses about width and height are left out."""
     known: tuple[tuple[str, str, str, Callable[[Floats, Camera], Floats]], ...] = (
-        ("image mirrored", "the boxes mirrored", "the images were mirrored before detection", _mirrored),
-        ("image upside down", "the boxes turned by 180 degrees", "the camera or its images are upside down", _upside_down),
         ("boxes xywh", "boxes read as x y width height", "the boxes are x y width height, not x1 y1 x2 y2", _xywh),
         ("boxes cxcywh", "boxes read as centre, width, height", "the boxes are centre, width, height", _cxcywh),
         ("boxes yxyx", "boxes read as y1 x1 y2 x2", "x and y of the boxes are swapped", lambda b, c: b[:, [1, 0, 3, 2]]),
@@ -77,15 +100,15 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
     )
     for name, what, cause, change in known:
         if sized or change not in (_xywh, _cxcywh):
-            yield Hypothesis(name, what, cause, boxed(change))
+            yield Hypothesis(name, what, cause, _boxed(change))
     for size in _SIZES:
         cause = f"the boxes belong to images {size:.3g} times as large as the calibration says"
         change = partial(_divided, size=size)
-        yield Hypothesis(f"boxes of size {size:.3g}", f"the boxes divided by {size:.3g}", cause, boxed(change))
+        yield Hypothesis(f"boxes of size {size:.3g}", f"the boxes divided by {size:.3g}", cause, _boxed(change))
     for side in _SQUARES:
         what, cause = f"the boxes stretched from {side} x {side} px to the image", f"the detector's square of {side} px"
         yield Hypothesis(
-            f"boxes of a square of {side}", what, f"the boxes are in px of {cause}", boxed(partial(_stretched, side=side))
+            f"boxes of a square of {side}", what, f"the boxes are in px of {cause}", _boxed(partial(_stretched, side=side))
         )
 
 
