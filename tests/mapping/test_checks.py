@@ -17,6 +17,7 @@ from objslam.errors import LogError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.agreement import bounded_part
 from objslam.mapping.checks.diagnosis import diagnose
+from objslam.mapping.checks.hypotheses.every import hypotheses
 from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis
 from objslam.mapping.checks.hypotheses.trials import Trial, verdict
 from objslam.mapping.checks.path import check_path
@@ -502,3 +503,18 @@ def test_what_a_run_corrects_itself_is_no_reason_to_warn():
     found = diagnose(small_log(0, placed=things, frames=120), load_settings(None, ("mode=fixed",)), Ledger())
     assert not found.findings
     assert found.errors is None
+
+
+@pytest.mark.parametrize(("clipped", "tried"), [(True, False), (False, True)])
+def test_boxes_that_end_at_the_edge_of_the_image_belong_to_it(clipped, tried):
+    """Boxes in px of a larger image are tried as a cause only if no detector clipped the boxes at this image's edge."""
+    log = drive("fixed")
+    one = log.cameras[0]
+    boxes = one.detections.boxes.copy()
+    if clipped:
+        boxes[::8, 2] = one.camera.width - 0.4
+    changed = replace(one, detections=replace(one.detections, boxes=boxes))
+    names = [hypothesis.name for hypothesis in hypotheses(replace(log, cameras=(changed,)))]
+    assert ("boxes of size 1.5" in names) == tried
+    assert ("boxes xywh" in names) == tried
+    assert "image mirrored" in names
