@@ -42,6 +42,9 @@ _CLEAR = 0.95
 """The share of agreeing rays above which a log is not explored again, whatever its noise. A larger share explores more logs
 twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: the log
 of a real robot in a forest is explored twice without need."""
+_CLEARLY = 3.0
+"""A log is explored again with the shared errors of its odometry that the solve found, if one of them is this number of
+standard deviations from what the exploration assumed. A larger number explores fewer logs twice."""
 _LOOSE = 3.0
 """The factor on the noise of the odometry in the second exploration, if the solve found only the rays to be noisy. A larger
 factor suits worse odometry, and loses more objects of good odometry."""
@@ -188,19 +191,35 @@ def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
 
 
 def _with_loose_odometry(state: JointState) -> JointState | None:
-    """Return an attempt with the noise of the odometry that the last solve suggests.
+    """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
-    None if this noise is about nominal, if the settings fix it, or if nearly all rays agree. The solve finds this noise, but
-    the exploration needs it before. A wrong map can hide it in the noise of the rays.
+    None if both are about nominal, if the settings fix the noise, or if nearly all rays agree. The solve finds them, but the
+    exploration needs them before. A wrong map can hide the noise of the odometry in the noise of the rays.
     """
     if state.errors is None or "odometry" not in state.errors.unknown_noise or state.agree.mean() >= _CLEAR:
         return None
     found, values = state.errors.noise, state.theta
     if max(found.along, found.turning) <= _NOISIER:
-        if found.rays <= _NOISIER:
+        if found.rays > _NOISIER:
+            found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), None
+        elif not _drives_otherwise(state):
             return None
-        found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), None
     errors = state.errors.with_noise(replace(found, shrinkage=0.0))
     keyframes, rays, _ = errors.at(errors.mean if values is None else values)
     unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
     return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
+
+
+def _drives_otherwise(state: JointState) -> bool:
+    """Return whether the solve found that the robot turns or drives clearly less or more than its odometry says.
+
+    An exploration with this error may take neighbours of one label for one object. The map then bends between them.
+    """
+    assert state.errors is not None
+    assert state.estimate is not None
+    found = state.estimate.calibration
+    if found is None:
+        return False
+    of_odometry = np.array([name.startswith("odometry.") for name in found.names])
+    off = np.abs(found.values - state.errors.mean) > _CLEARLY * found.sigma
+    return bool((off & of_odometry).any())

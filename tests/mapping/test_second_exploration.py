@@ -1,0 +1,69 @@
+"""When a log is explored a second time: if its odometry is not what the first exploration took it for."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from objslam.core.calibration import Calibration
+from objslam.core.noise import NoiseFactors
+from objslam.mapping.joint_solve import _with_loose_odometry
+
+NAMES = ("odometry.scale", "odometry.turn_scale", "front.clock")
+
+
+class Errors(SimpleNamespace):
+    """Shared errors whose noise is open, and which were expected to be 0."""
+
+    def at(self, values):
+        return SimpleNamespace(values=values), "rays", "settings"
+
+    def with_noise(self, noise):
+        return Errors(**{**vars(self), "noise": noise})
+
+
+def state(turn: float, *, agree: float = 0.88, clock: float = 0.0, noise: NoiseFactors | None = None):
+    values = np.array([0.0, turn, clock])
+    found = Calibration(NAMES, values, np.diag([0.03, 0.007, 0.004]) ** 2, np.array([0.03, 0.05, 0.1]))
+    errors = Errors(noise=noise or NoiseFactors(), unknown_noise=("odometry",), mean=np.zeros(3))
+    weights = np.arange(100) < 100 * agree
+    estimate = SimpleNamespace(calibration=found)
+    return SimpleNamespace(
+        errors=errors, theta=values, estimate=estimate, agree=weights, attempt=lambda: Attempt(theta=None)
+    )
+
+
+class Attempt(SimpleNamespace):
+    """Takes what `dataclasses.replace` would change."""
+
+    def __replace__(self, **changes):
+        return Attempt(**{**vars(self), **changes})
+
+
+@pytest.fixture(autouse=True)
+def replace_any(monkeypatch):
+    from dataclasses import is_dataclass
+    from dataclasses import replace as of_dataclass
+
+    from objslam.mapping import joint_solve
+
+    def replace(one, **changes):
+        return of_dataclass(one, **changes) if is_dataclass(one) else one.__replace__(**changes)
+
+    monkeypatch.setattr(joint_solve, "replace", replace)
+
+
+@pytest.mark.parametrize(
+    ("given", "again"),
+    [
+        ({"turn": -0.05}, True),
+        ({"turn": -0.01}, False),
+        ({"turn": -0.05, "agree": 0.97}, False),
+        ({"turn": 0.0, "clock": 0.3}, False),
+    ],
+)
+def test_a_robot_that_turns_less_than_its_odometry_says_is_explored_again(given, again):
+    attempt = _with_loose_odometry(state(**given))
+    assert (attempt is not None) == again
+    if attempt is not None:
+        assert attempt.theta[1] == given["turn"]
