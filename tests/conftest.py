@@ -17,6 +17,9 @@ settings.register_profile(
 )
 settings.load_profile("objslam")
 
+# The plugin that runs tests in several processes sets a width of 80 columns, which commands obey even in a pipe.
+os.environ.pop("COLUMNS", None)
+
 # A suite in the background of a shell has SIGINT ignored. Commands that its tests start and interrupt would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
