@@ -51,8 +51,9 @@ def with_doubts(result: RunResult) -> RunResult:
     many boxes of a label meet. A label without an object is named, but its boxes may be false, so the level stays.
     """
     found = find_doubts(result)
-    unmapped = unmapped_labels(result)
-    doubts = (*in_words(result, found.pairs, found.splits, found.groups), *unmapped)
+    doubts = tuple(in_words(result, found.pairs, found.splits, found.groups))
+    unmapped, told = unmapped_labels(result), {one.label for one in doubts if one.kind == "boxes"}
+    doubts = (*doubts, *(one for one in unmapped if one.label not in told))  # One doubt says why its boxes are no object.
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
