@@ -161,7 +161,8 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
 
 def _seems_to_move(task: _Task, state: State, likely: Floats) -> Bools:
     """Return which landmarks (N,) are unlikely to exist, and a moving point explains their rays clearly better."""
-    return (likely < task.settings.min_existence) & (rest_odds(state) < -_CLEAR_MOTION)
+    unlikely = likely < task.settings.min_existence
+    return unlikely & (rest_odds(state) < -_CLEAR_MOTION) if unlikely.any() else unlikely
 
 
 def _at_rest(task: _Task, state: State, refuted: Bools, moving: State) -> tuple[State, Bools]:
