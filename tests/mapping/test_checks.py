@@ -505,16 +505,21 @@ def test_what_a_run_corrects_itself_is_no_reason_to_warn():
     assert found.errors is None
 
 
-@pytest.mark.parametrize(("clipped", "tried"), [(True, False), (False, True)])
-def test_boxes_that_end_at_the_edge_of_the_image_belong_to_it(clipped, tried):
-    """Boxes in px of a larger image are tried as a cause only if no detector clipped the boxes at this image's edge."""
+@pytest.mark.parametrize(("edge", "tried", "square"), [(None, True, True), ("right", False, True), ("lower", False, False)])
+def test_boxes_that_end_at_the_edge_of_the_image_belong_to_it(edge, tried, square):
+    """Boxes in px of a larger image are tried as a cause only if no detector clipped the boxes at this image's edge. The
+    image is 640 px wide, so boxes of a square of 640 px may end at its right edge, but not at its lower one."""
     log = drive("fixed")
     one = log.cameras[0]
+    assert one.camera.width == 640
     boxes = one.detections.boxes.copy()
-    if clipped:
-        boxes[::8, 2] = one.camera.width - 0.4
+    if edge is not None:
+        at = ("right", "lower").index(edge)
+        boxes[::8, 2 + at] = one.camera.size[at] - 0.4
     changed = replace(one, detections=replace(one.detections, boxes=boxes))
     names = [hypothesis.name for hypothesis in hypotheses(replace(log, cameras=(changed,)))]
     assert ("boxes of size 1.5" in names) == tried
     assert ("boxes xywh" in names) == tried
-    assert "image mirrored" in names
+    assert ("boxes of a square of 640" in names) == square
+    assert ("boxes of a square of 320" in names) == tried
+    assert {"image mirrored", "boxes yxyx"} <= set(names)

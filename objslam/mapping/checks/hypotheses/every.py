@@ -19,8 +19,8 @@ _SQUARES = (320, 416, 512, 640)
 """The sides (px) of square images that detectors often use."""
 _CLIPPED, _AT_EDGE = 0.05, 1.0
 """Boxes are px of the calibration's images if at least this share of them ends within this distance (px) of the right or
-the lower edge, and hardly any beyond. A detector clips boxes there. In another unit, boxes end there by chance only. Larger
-shares let more wrong sizes be tried, larger distances fewer."""
+the lower edge, and hardly any beyond. A detector clips boxes there. In another unit, boxes end there by chance only. With a
+larger share, more wrong sizes are tried. With a larger distance, fewer are tried."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 """The tried clock offsets (s). `small_errors` finds smaller offsets."""
 
@@ -30,8 +30,10 @@ def hypotheses(log: Log) -> Iterator[Hypothesis]:
     yield from mounts(log)
     yield from _paths(log)
     yield from _images()
-    if not _clipped_at_the_edge(log):
+    edges = _clipped_edges(log)
+    if not edges:
         yield from _boxes(any(one.camera.sees_size for one in log.cameras))
+    yield from _squares(edges)
     yield from _clocks()
 
 
@@ -57,15 +59,18 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
         yield Hypothesis(name, what, cause, partial(with_poses, change=change))
 
 
-def _clipped_at_the_edge(log: Log) -> bool:
-    """Return whether a camera's boxes end at the right and lower edges of its image, as no other unit explains."""
+def _clipped_edges(log: Log) -> set[int]:
+    """Return the widths and heights (px) of the cameras' images at whose right or lower edges boxes end.
+
+    Only boxes in px of these images end there, or of others that are as wide or as high.
+    """
+    found: set[int] = set()
     for one in log.cameras:
         if one.detections is not None and len(one.detections):
-            beyond = (one.detections.boxes[:, 2:] - one.camera.size).max(axis=1)
-            at, past = (np.abs(beyond) <= _AT_EDGE).mean(), (beyond > _AT_EDGE).mean()
-            if at >= _CLIPPED and past < at / 2:
-                return True
-    return False
+            beyond = one.detections.boxes[:, 2:] - one.camera.size
+            at, past = (np.abs(beyond) <= _AT_EDGE).mean(axis=0), (beyond > _AT_EDGE).mean(axis=0)
+            found |= set(one.camera.size[(at >= _CLIPPED) & (past < at / 2)].astype(int).tolist())
+    return found
 
 
 def _boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
@@ -76,11 +81,13 @@ def _boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
 
 
 def _images() -> Iterator[Hypothesis]:
-    """Yield the hypotheses about images that were turned before detection."""
+    """Yield the hypotheses that keep the unit of boxes: the images were turned before detection, or x and y are swapped."""
     what, cause = "the boxes mirrored", "the images were mirrored before detection"
     yield Hypothesis("image mirrored", what, cause, _boxed(_mirrored))
     what, cause = "the boxes turned by 180 degrees", "the camera or its images are upside down"
     yield Hypothesis("image upside down", what, cause, _boxed(_upside_down))
+    what, cause = "boxes read as y1 x1 y2 x2", "x and y of the boxes are swapped"
+    yield Hypothesis("boxes yxyx", what, cause, _boxed(lambda b, c: b[:, [1, 0, 3, 2]]))
 
 
 def _boxes(sized: bool) -> Iterator[Hypothesis]:
@@ -89,7 +96,6 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
     known: tuple[tuple[str, str, str, Callable[[Floats, Camera], Floats]], ...] = (
         ("boxes xywh", "boxes read as x y width height", "the boxes are x y width height, not x1 y1 x2 y2", _xywh),
         ("boxes cxcywh", "boxes read as centre, width, height", "the boxes are centre, width, height", _cxcywh),
-        ("boxes yxyx", "boxes read as y1 x1 y2 x2", "x and y of the boxes are swapped", lambda b, c: b[:, [1, 0, 3, 2]]),
         ("boxes 0..1", "boxes times the image size", "the boxes are shares of the image, not px", _from_shares),
         (
             "boxes 0..1 cxcywh",
@@ -105,7 +111,14 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
         cause = f"the boxes belong to images {size:.3g} times as large as the calibration says"
         change = partial(_divided, size=size)
         yield Hypothesis(f"boxes of size {size:.3g}", f"the boxes divided by {size:.3g}", cause, _boxed(change))
+
+
+def _squares(edges: set[int]) -> Iterator[Hypothesis]:
+    """Yield the hypotheses about boxes in px of a detector's square. edges: (px), as returned by `_clipped_edges`. A square
+    of another side does not explain boxes that end there."""
     for side in _SQUARES:
+        if edges - {side}:
+            continue
         what, cause = f"the boxes stretched from {side} x {side} px to the image", f"the detector's square of {side} px"
         yield Hypothesis(
             f"boxes of a square of {side}", what, f"the boxes are in px of {cause}", _boxed(partial(_stretched, side=side))
