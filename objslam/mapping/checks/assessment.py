@@ -11,6 +11,9 @@ from objslam.frontend.bearings import CUT_OFF
 
 Level = Literal["good", "check", "bad"]
 
+HEADLINES: dict[Level, str] = {"good": "Good.", "check": "Look closer.", "bad": "Do not use this map."}
+"""What the report and the picture of a map say for each level, before the reasons."""
+
 _MISSES = 1.5
 """A result needs a look if its residuals exceed this multiple of their expected noise. At 1.5, more than half of their
 variance is unexplained. A larger value gives fewer warnings."""

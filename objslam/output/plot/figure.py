@@ -78,7 +78,7 @@ class Figure:
 
     axes: the names of the axes to the right and up. low, high: (2,) m, the corners of the shown area. scale: px/m.
     shapes: what is drawn, the lowest first. legend: more entries, besides those of the shapes with a name. note: a remark at
-    the upper right.
+    the upper right. warning: why the map should not be trusted, under the title.
     """
 
     title: str
@@ -90,6 +90,7 @@ class Figure:
     legend: tuple[Line | Marks, ...] = ()
     labels: tuple[Label, ...] = ()
     note: str = ""
+    warning: str = ""
 
     @property
     def size(self) -> tuple[int, int]:

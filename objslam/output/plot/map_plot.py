@@ -11,6 +11,7 @@ from objslam.core.object_map import MapObject
 from objslam.core.result import RunResult
 from objslam.core.types import Truth
 from objslam.frontend.up import from_above, up_axis
+from objslam.mapping.checks.assessment import HEADLINES
 from objslam.output.plot.figure import Area, Figure, Label, Line, Marks, Segments, Shape
 from objslam.output.plot.labels import make_labels, shortened
 from objslam.output.plot.page import render
@@ -78,7 +79,8 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     path = result.map_T_base[sample(np.ones(len(result.map_T_base), dtype=bool), _PATH_POINTS)][:, plane, 3]
     labels = _labels(figure, result, points, shown | far, names, (path, crosses, outlines))
     left_out = int((shown | far).sum()) - len(labels)
-    return replace(figure, labels=labels, note=f"{left_out} labels have no room" if left_out else "")
+    note = f"{left_out} labels have no room" if left_out else ""
+    return replace(figure, labels=labels, note=note, warning=_warning(result))
 
 
 def _frame(result: RunResult, plane: list[int], points: Floats, crosses: Floats) -> tuple[Bools, Floats, Floats]:
@@ -200,6 +202,13 @@ def _title(result: RunResult) -> str:
     text += f" from {rays:,} rays of {len(result.keyframes):,} keyframes, {result.settings.mode} mode"
     lost = int((~np.isfinite(result.map.positions).all(axis=1)).sum())
     return text + (f"\n{lost} of them without a position" if lost else "")
+
+
+def _warning(result: RunResult) -> str:
+    """Return why the map should not be trusted, "" for a good map or one without an assessment."""
+    judged = result.summary.get("assessment", {"level": "good"})
+    said = HEADLINES[judged["level"]]
+    return "" if judged["level"] == "good" else " ".join([said, *judged["reasons"]])
 
 
 def _labels(

@@ -24,11 +24,12 @@ _TITLE = 21.0  # The title has this font size, px.
 _NOTE = 15.0  # The remark has this font size, px.
 _MARGIN = 16  # The white, px, around the picture and between its parts.
 _MOST_TICKS = 8  # At most this many steps of the grid fit the longer side of the map.
+_WARNING_LINES = 3  # The warning has at most this many lines. An ellipsis replaces the rest, which the terminal shows.
 _COLUMNS = 4  # The legend has at most this many columns.
 _HANDLE = 34  # The width, px, of an entry's sample in the legend.
 _DASH, _GAP = 8.0, 4.0  # The lengths, px, of a dash and of the gap behind it.
 _TICK = 6  # The length, px, of a tick.
-_BLACK, _GREY = (0.0, 0.0, 0.0), (0.47, 0.47, 0.47)
+_BLACK, _GREY, _RED = (0.0, 0.0, 0.0), (0.47, 0.47, 0.47), (0.65, 0.1, 0.07)
 _GRID, _FRAME = (0.925, 0.925, 0.925), (0.77, 0.77, 0.77)
 
 
@@ -36,10 +37,12 @@ def render(figure: Figure) -> bytes:
     """Return a figure as the content of a PNG file."""
     area = _area(figure)
     lines = figure.title.split("\n")
-    top = _MARGIN + round(len(lines) * LINE * _TITLE) + _MARGIN // 2
+    height, width = area.shape[:2]
+    titled = _MARGIN + round(len(lines) * LINE * _TITLE)
+    warnings = wrapped(figure.warning, width, FONT, _WARNING_LINES)
+    top = titled + round(len(warnings) * LINE * FONT) + _MARGIN // 2
     ticks = _ticks(figure)
     left = 2 * _MARGIN + round(LINE * _TITLE) + max((text_width(text, FONT) for _, text in ticks[1]), default=0) + _TICK
-    height, width = area.shape[:2]
     legend = _legend(figure)
     below = _TICK + round(2 * LINE * FONT) + 2 * _MARGIN
     wide = max(left + width + _MARGIN, *(left + text_width(line, _TITLE) + _MARGIN for line in lines), legend.shape[1])
@@ -50,8 +53,12 @@ def render(figure: Figure) -> bytes:
     draw_line(page, frame, _FRAME, 1)
     for i, line in enumerate(lines):
         draw_text(page, line, (left, _MARGIN + i * LINE * _TITLE), _TITLE, _BLACK)
+    for i, line in enumerate(warnings):
+        draw_text(page, line, (left, titled + i * LINE * FONT), FONT, _RED)
     if figure.note:
-        draw_text(page, figure.note, (left + width - text_width(figure.note, _NOTE), top - LINE * _NOTE - 3), _NOTE, _GREY)
+        draw_text(
+            page, figure.note, (left + width - text_width(figure.note, _NOTE), titled - LINE * _NOTE + 5), _NOTE, _GREY
+        )
     _draw_ticks(page, ticks, left, top, top + height)
     right, up = (f"{name} (m)" for name in figure.axes)
     across = left + (width - text_width(right, FONT)) / 2
@@ -64,6 +71,23 @@ def render(figure: Figure) -> bytes:
     page[from_top : from_top + len(shown), _MARGIN : _MARGIN + turned.shape[1]] = shown
     page[page.shape[0] - legend.shape[0] :, : legend.shape[1]] = legend
     return encode_png(page)
+
+
+def wrapped(text: str, width: float, font: float, most: int) -> list[str]:
+    """Return a text as at most `most` lines that are no wider than `width` px where words allow it. An ellipsis replaces the
+    words that have no room."""
+    lines: list[str] = []
+    for word in text.split():
+        if lines and text_width(f"{lines[-1]} {word}", font) <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    if len(lines) <= most:
+        return lines
+    words = lines[most - 1].split()
+    while len(words) > 1 and text_width(" ".join(words) + " …", font) > width:
+        words.pop()
+    return [*lines[: most - 1], " ".join(words) + " …"]
 
 
 def _area(figure: Figure) -> Image:

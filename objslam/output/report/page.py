@@ -19,6 +19,7 @@ from objslam.evaluation.alignment import lay_truth
 from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
+from objslam.mapping.checks.assessment import HEADLINES
 from objslam.output.report.cards import make_cards
 from objslam.output.report.charts import histogram
 from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of, spread_over_time
@@ -124,6 +125,7 @@ def write_report(
         trends=trends(rays),
         calibration=summary.get("calibration"),
         assessment=summary.get("assessment"),
+        headlines=HEADLINES,
         localisation=summary.get("localisation"),
         scores=scores,
         no_images=no_images,

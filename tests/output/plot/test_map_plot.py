@@ -11,10 +11,10 @@ import pytest
 from synthetic_result import clusters, synthetic_result
 
 from objslam.core.arrays import Floats
-from objslam.output.plot.canvas import blank, draw_line, draw_segments, draw_text
+from objslam.output.plot.canvas import blank, draw_line, draw_segments, draw_text, text_width
 from objslam.output.plot.figure import Area, Figure, Line, Marks, Segments
 from objslam.output.plot.map_plot import draw_map, map_figure
-from objslam.output.plot.page import FONT
+from objslam.output.plot.page import FONT, wrapped
 
 
 def lines(figure: Figure) -> dict[str, Floats]:
@@ -240,6 +240,30 @@ def test_in_fixed_mode_there_is_one_path() -> None:
     named = lines(map_figure(dataclasses.replace(result, map_T_base=result.keyframes.map_T_base)))
     assert "path" in named
     assert "path before" not in named
+
+
+@pytest.mark.parametrize(("level", "headline"), [("good", ""), ("check", "Look closer."), ("bad", "Do not use this map.")])
+def test_the_picture_of_a_doubtful_map_says_so(tmp_path: Path, level: str, headline: str) -> None:
+    result, _ = synthetic_result(*clusters(), keyframes=20)
+    reasons = ["12 % of the boxes belong to no object." for _ in range(12)]
+    judged = dataclasses.replace(result, summary={**result.summary, "assessment": {"level": level, "reasons": reasons}})
+    figure = map_figure(judged)
+    assert figure.warning == (f"{headline} {' '.join(reasons)}" if headline else "")
+    draw_map(judged, tmp_path / "map.png")
+    above = picture(tmp_path / "map.png")[:120].astype(int)
+    red = above[..., 2] - above[..., :2].max(axis=-1) > 100
+    assert red.any() == bool(headline)
+
+
+def test_a_warning_is_wrapped_at_words() -> None:
+    words = " ".join(["measured"] * 40)
+    lines = wrapped(words, 300, FONT, 3)
+    assert len(lines) == 3
+    assert all(text_width(line, FONT) <= 300 for line in lines)
+    assert lines[2].endswith(" …")
+    assert wrapped("two words", 300, FONT, 3) == ["two words"]
+    assert wrapped("", 300, FONT, 3) == []
+    assert wrapped("x" * 200, 300, FONT, 3) == ["x" * 200]
 
 
 def test_few_of_many_rays_are_drawn() -> None:
