@@ -87,7 +87,8 @@ class Session(LiveSession):
     def result(self) -> Result:
         """End the session, solve the whole map once more, and return the result. SolveError if no box could be mapped.
 
-        The summary has a warning if frames were pushed after poses that are much newer, because these are not mapped.
+        A frame is not mapped if a much newer pose was pushed before it. The summary has a warning with the number of such
+        frames.
         """
         late = self.counters.dropped().get(LATE_FRAME, 0)
         if self._patient and late:

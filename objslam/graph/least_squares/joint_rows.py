@@ -42,9 +42,10 @@ class JointRows:
 class JointGraph:
     """The measurements of a joint solve with Huber's loss.
 
-    which: (n,) the indices of the rays in the graph among the rays of `measured`. rays: these rays. landmarks: (m,) the
-    landmarks in the graph. landmark: (n,) the row of each ray's landmark in `landmarks`. weak: (m, 3) m, the means of the
-    landmarks' weak priors. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each row.
+    measured: all measurements. which: (n,) the rays of `measured` that are in the graph. rays: these n rays. landmarks: (m,)
+    the landmarks in the graph. landmark: (n,) the row of each ray's landmark in `landmarks`. weak: (m, 3) m, the means of
+    the landmarks' weak priors. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each
+    row.
     """
 
     measured: Measurements

@@ -55,7 +55,10 @@ class StdinAdapter:
     _faster: float = field(default=1.0, init=False)
 
     def late(self) -> str:
-        """Return what to do against late frames if the stamps ran faster than the clock, as no robot's do. "" otherwise."""
+        """Return advice against late frames if the stamps ran faster than the clock, "" otherwise.
+
+        The stamps of a robot run as fast as the clock. Those of a recording may run faster.
+        """
         if self.wait is not None or self._faster < _FASTER:
             return ""
         return (

@@ -125,7 +125,10 @@ def _shift_times(m: MapState, times: Floats) -> None:
 
 
 def _move_start(m: MapState, before: Floats) -> None:
-    """Move the whole map as the correction moved the first keyframe, and fix that keyframe. before: (4, 4) its old pose."""
+    """Move the whole map, and fix its first keyframe. The map moves as far as the correction moved this keyframe.
+
+    before: (4, 4) map_T_camera of this keyframe before the correction.
+    """
     now = m.keyframe_arrays(np.zeros(1, dtype=np.int64)).map_T_camera[0]
     m.graph.drop_absolute()
     m.move(now @ inverse(before))

@@ -25,7 +25,11 @@ OUTCOMES: tuple[Outcome, ...] = ("confirmed", "moved", "gone", "new", "unseen")
 
 @dataclass(frozen=True)
 class Change:
-    """What became of one object. probability: that it is gone if the outcome is `gone`, else that it is where `item` is."""
+    """What became of one object.
+
+    probability: of the outcome. If the outcome is `gone`, the object is gone with this probability. With any other outcome,
+    it is where `item` is with this probability.
+    """
 
     outcome: Outcome
     item: MapObject

@@ -24,8 +24,8 @@ _LATER = ", second half"  # What the name of a camera of the second half ends wi
 _TURN = 0.2
 """The prior standard deviation (rad) of a turn. With a larger value, larger turns are found."""
 _SAME = 1e-3
-"""The prior standard deviation of the change of all other errors, as a share of their own. It is not 0, because a prior has
-an inverse. A larger value lets the other errors change too."""
+"""The prior standard deviation of the change of all other errors, as a share of their own. The graph divides by
+it, so it is not 0. A larger value lets the other errors change too."""
 _MOVED = 0.05
 """If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
 less often."""
