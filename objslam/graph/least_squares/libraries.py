@@ -1,4 +1,4 @@
-"""Load the libraries of every solve, and nothing that they load without need."""
+"""Load the libraries of every solve. What a library loads for other purposes is not loaded."""
 
 import sys
 from importlib import import_module

@@ -179,7 +179,8 @@ def _turns(poses: Floats) -> Floats:
 
 
 def _turn_rates(path: Trajectory) -> Floats:
-    """Return the turn rate (N-1,), rad/s, from each pose but the last on, over at least `_TURN_TIME`.
+    """Return the turn rate (N-1,), rad/s, that begins at each pose except the last one. It is a mean over at least
+    `_TURN_TIME`.
 
     Steps are added with their directions, so the noise of headings averages out.
     """

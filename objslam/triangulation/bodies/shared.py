@@ -31,7 +31,7 @@ _SHARES = 41
 _WIDEST = 6.0
 """The largest share that `share_of` tries, in standard deviations of its prior. A larger value admits worse outlines."""
 _AT_ONCE = 64
-"""The number of bodies whose likelihood of a share is computed at once. A larger number needs more memory."""
+"""`share_of` computes the likelihoods of at most this number of bodies at once. A larger number needs more memory."""
 _NOMINAL = 20.0
 """With this many residuals, their scatter weighs as much as the nominal noise of the settings. A larger number gives the
 nominal noise more weight."""
