@@ -40,7 +40,13 @@ def test_a_usual_result_is_good() -> None:
         ),
         ({"frames": 445, "late": 78}, "check", "18 % of the camera frames were dropped, because they came too late."),
         ({"unexplained": 450}, "check", "50 % of the used boxes belong to no object."),
-        ({"rejected": 180}, "check", "20 % of the used boxes miss their object. An object may be two."),
+        (
+            {"rejected": 180},
+            "check",
+            "10 % of the used boxes belong to no object, and 20 % miss their object. An object may be two.",
+        ),
+        ({"unexplained": 220, "rejected": 10}, "check", "24 % of the used boxes belong to no object, and 1 % miss their"),
+        ({"odometry": 10.8}, "check", "The boxes agree only if the odometry is 11 times as noisy as the settings say"),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
         ({"fixed": True, "odometry_frame": True}, "check", "The poses are those of the odometry, so its drift is in"),
         (

@@ -7,13 +7,12 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse, motion_between
+from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.live.counters import Counters
 
 _JUMP = 0.1  # A step is a restart if it exceeds live.max_speed by this, m. A larger value misses more restarts.
 _TURN = 0.3  # A turn is a restart if it exceeds _TURNS_PER_M by this, rad. A larger value misses more restarts.
 _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A larger value misses more restarts.
-_ZERO = 0.05  # After a gap, odometry nearer to 0 than this, m and rad, is a restart. A larger value finds more restarts.
-_FAR = 0.1  # For _ZERO, the pose before the gap must be this far from 0, m or rad. A larger value finds fewer restarts.
 
 
 class OdometryRestarts:
@@ -48,11 +47,4 @@ class OdometryRestarts:
         way, turn = math.hypot(*moved.way), moved.angle
         if way > self._fast * gap + _JUMP or turn > _TURNS_PER_M * self._fast * gap + _TURN:
             return True
-        began = gap > self._max_gap and _reach(np.eye(4), odom_T_base) < _ZERO
-        return began and _reach(self.start_T_odom, last) > _FAR
-
-
-def _reach(before: Floats, after: Floats) -> float:
-    """Return the angle (rad) or the length (m) of the motion between two poses (4, 4), whichever is the larger number."""
-    _, angle, way = motion_between(before, after)
-    return max(angle, math.hypot(*way))
+        return gap > self._max_gap and bool(counts_from_zero(inverse(self.start_T_odom) @ last, odom_T_base))

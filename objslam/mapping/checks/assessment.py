@@ -23,6 +23,10 @@ rooms. A larger value gives fewer warnings."""
 _UNEXPLAINED = 0.25
 """A result needs a look if more than this share of the rays belong to no object or miss their object. A tenth is usual, from
 false boxes and moving things. A larger value gives fewer warnings."""
+_LOOSE = 9.0
+"""A result needs a look if the noise of the odometry is this multiple of the settings, or more. Right maps of recorded
+robots have up to 8.1. If it is more, the odometry is often not what is wrong: a camera that turns on the robot looks the
+same. A larger value gives fewer warnings."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
 gives more warnings."""
@@ -44,7 +48,7 @@ class Evidence:
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
     frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
     journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
-    whether they name one object or several.
+    whether they name one object or several. odometry: the largest factor on a noise of the odometry that the log shows.
     """
 
     resolved: int
@@ -63,6 +67,7 @@ class Evidence:
     late: int = 0
     journal: str = ""
     doubted: tuple[str, ...] = ()
+    odometry: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -103,6 +108,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         late=sum(summary["dropped"].get(reason, 0) for reason in (TOO_SLOW, RARE_POSES)),
         journal=summary["log_path"] or "",
         doubted=tuple(summary["doubted_labels"]),
+        odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
     )
 
 
@@ -140,6 +146,11 @@ def _check(e: Evidence) -> list[str]:
             f"The rays miss their objects {e.misses:.1f} times as far as the settings say, so poses, clock, calibration or "
             "boxes are worse than that."
         )
+    elif e.odometry >= _LOOSE:
+        found.append(
+            f"The boxes agree only if the odometry is {e.odometry:.0f} times as noisy as the settings say: it may slip, or "
+            "the camera may turn on the robot (camera_poses)."
+        )
     if e.doubted:
         found.append(
             f"It is not clear whether {', '.join(e.doubted)} name one object each, or several. Drive past them and others "
@@ -153,7 +164,11 @@ def _check(e: Evidence) -> list[str]:
     if e.unexplained > _UNEXPLAINED * e.rays:
         found.append(f"{100 * e.unexplained / e.rays:.0f} % of the used boxes belong to no object.")
     elif e.unexplained + e.rejected > _UNEXPLAINED * e.rays:
-        found.append(f"{100 * e.rejected / e.rays:.0f} % of the used boxes miss their object. An object may be two.")
+        share, more = (100 * part / e.rays for part in (e.unexplained, e.rejected))
+        found.append(
+            f"{share:.0f} % of the used boxes belong to no object, and {more:.0f} % miss their object."
+            + (" An object may be two." if e.rejected > e.unexplained else "")
+        )
     if e.unresolved > e.resolved:
         found.append(f"Only {e.resolved} of {e.resolved + e.unresolved} objects have a place. Drive around the others.")
     if e.rays < _FEW:

@@ -5,9 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.geometry import interpolate
+from objslam.core.geometry import interpolate, inverse
 from objslam.core.rotation import rotation_vector
 from objslam.core.types import Log, Trajectory
+from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
 
 FASTEST = 40.0
@@ -25,9 +26,16 @@ _JUMP_TURN = 20.0
 each m/s of live.max_speed."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
+_ACCELERATION = 5.0
+"""The acceleration (m/s^2) that a slow robot does not exceed from one step to the next and back. Wheels on a floor slip at
+4 to 8. A larger value warns less often."""
 _TIMES = 5.0
 """The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. The same
 holds for turn rates. A larger number warns less often."""
+_TIMES_ODD = 3.5
+"""The least oddness of a jump, as a multiple of what a tenth of the steps exceeds. The oddness is how far a step differs
+from the steps beside it, or from that of the odometry. For normal noise in a plane, 3.5 is 7.5 standard deviations. A larger
+number warns less often."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
 _STILL = 1e-4
@@ -51,16 +59,64 @@ _BEFORE = 0.3
 """The time (s) over which the direction of motion is measured. A longer time suits noisy poses and slow turns."""
 
 
-def check_path(log: Log) -> list[Finding]:
-    """Return the findings about the poses of a log, from the poses and from the motion of the boxes."""
+def check_path(log: Log, max_gap: float) -> list[Finding]:
+    """Return the findings about the poses of a log, from the poses and from the motion of the boxes.
+
+    max_gap: s, as in `poses.max_gap`.
+    """
     found: list[Finding] = []
     for name, path in (("localisation", log.localization), ("odometry", log.odometry)):
         if path is not None and len(path) > _FEWEST_STEPS:
             found += _judge_speed(path, name)
             found += _judge_stops(path, name, log)
+    if log.odometry is not None and log.localization is None:
+        found += _find_restarts(log.odometry, max_gap)
     if log.localization is not None and log.odometry is not None:
         found += _compare_ways(log.localization, log.odometry)
+        if not any(one.name.endswith("jumps") for one in found):
+            found += _compare_steps(log.localization, log.odometry, max_gap)
     return found
+
+
+def _find_restarts(odometry: Trajectory, max_gap: float) -> Iterator[Finding]:
+    """Find gaps after which the odometry counts from zero again."""
+    seconds = np.diff(odometry.stamps)
+    restarts = np.flatnonzero((seconds > max_gap) & counts_from_zero(odometry.poses[:-1], odometry.poses[1:]))
+    if len(restarts):
+        first = int(restarts[0])
+        yield Finding(
+            "odometry restarts",
+            f"the odometry counts from zero again after a gap of {seconds[first]:.1f} s, at stamp "
+            f"{odometry.stamps[first + 1]:.3f}{_and_more(len(restarts) - 1)}: poses before and after it do not belong "
+            "together; cut the log there, and join the two maps with objslam merge",
+        )
+
+
+def _and_more(count: int) -> str:
+    return f" and {count} more time{'' if count == 1 else 's'}" if count else ""
+
+
+def _compare_steps(localization: Trajectory, odometry: Trajectory, max_gap: float) -> Iterator[Finding]:
+    """Find steps of the localisation that the odometry does not show."""
+    wheels, known = interpolate(odometry.stamps, odometry.poses, localization.stamps, max_gap)
+    pair = np.flatnonzero(known[:-1] & known[1:] & (np.diff(localization.stamps) <= max_gap))
+    if len(pair) < _FEWEST_STEPS:
+        return
+    by_map, by_wheels = (inverse(poses[pair]) @ poses[pair + 1] for poses in (localization.poses, wheels))
+    way = np.linalg.norm(by_map[:, :3, 3] - by_wheels[:, :3, 3], axis=1)
+    angle = np.linalg.norm(rotation_vector(np.swapaxes(by_wheels[:, :3, :3], 1, 2) @ by_map[:, :3, :3]), axis=1)
+    jumps = (way > max(_JUMP_WAY, _TIMES_ODD * float(np.quantile(way, 0.9)))) | (
+        angle > max(_JUMP_ANGLE, _TIMES_ODD * float(np.quantile(angle, 0.9)))
+    )
+    if jumps.any():
+        first = int(np.argmax(jumps))
+        yield Finding(
+            "localisation jumps",
+            f"the localisation moves by {way[first]:.2f} m and {np.degrees(angle[first]):.0f} deg in one step which the "
+            f"odometry does not show, at stamp {localization.stamps[pair[first] + 1]:.3f}"
+            f"{_and_more(int(jumps.sum()) - 1)}: poses before and after a jump do not belong together",
+            spoils=log_is_split(way, jumps),
+        )
 
 
 def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Finding]:
@@ -110,6 +166,7 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
     # A gap in the poses is no jump. The speed over the gap is one that a robot can reach.
     jumps = (speed > max(_JUMP, _TIMES * fast[0])) & (way > _JUMP_WAY)
     jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1])) & (angle > _JUMP_ANGLE)
+    jumps |= _pulses(path, moving)
     if jumps.any():
         first = int(np.argmax(jumps))
         yield Finding(
@@ -119,6 +176,22 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
             "poses before and after a jump do not belong together",
             spoils=name == "odometry" or log_is_split(way, jumps),
         )
+
+
+def _pulses(path: Trajectory, moving: Bools) -> Bools:
+    """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
+
+    moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose until the next one is known.
+    """
+    seconds = np.diff(path.stamps)
+    velocity = np.diff(path.poses[:, :3, 3], axis=0) / seconds[:, None]
+    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
+    beside = np.minimum(np.append(change, np.inf), np.append(np.inf, change))
+    beside[[0, -1]] = 0.0  # The first and the last step have one neighbour only, as a start and a stop have.
+    steady = seconds <= 2 * np.median(seconds)  # In a gap of the poses, a robot can do anything.
+    off = np.where(steady, beside * seconds, 0.0)
+    least = np.maximum(_JUMP_WAY + _ACCELERATION * seconds**2, _TIMES_ODD * np.quantile(off[moving], 0.9))
+    return np.asarray(off > least)
 
 
 def log_is_split(way: Floats, jumps: Bools) -> bool:
@@ -154,7 +227,7 @@ def _boxes_move(log: Log, start: float, end: float) -> bool:
     moving, still = 0, 0
     for one in log.cameras:
         found = one.detections
-        if found is None:
+        if found is None or one.mount is not None:  # An arm moves a camera while the base stands still.
             continue
         inside = (found.stamps >= start + 1) & (found.stamps <= end - 1)
         centre = (found.boxes[inside, :2] + found.boxes[inside, 2:]) / 2

@@ -12,6 +12,7 @@ from objslam.mapping.doubts.evidence import evidence_of
 from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
 from objslam.mapping.doubts.pairs import Pairs, find_pairs
 from objslam.mapping.doubts.splits import Splits, find_splits
+from objslam.mapping.doubts.twice import find_twice
 from objslam.mapping.doubts.unmapped import in_assessment, unmapped_labels
 from objslam.mapping.doubts.words import in_words
 
@@ -47,8 +48,9 @@ def find_doubts(result: RunResult) -> Doubts:
 def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
-    A map with objects that are more likely doubles than not is not called good. Neither is a map without an object where
-    many boxes of a label meet. A label without an object is named, but its boxes may be false, so the level stays.
+    A map with objects that are more likely doubles than not is not called good. Neither is a map that holds a place twice,
+    nor one without an object where many boxes of a label meet. A label without an object is named, but its boxes may be
+    false, so the level stays.
     """
     found = find_doubts(result)
     doubts = tuple(in_words(result, found.pairs, found.splits, found.groups))
@@ -59,13 +61,16 @@ def with_doubts(result: RunResult) -> RunResult:
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
     if "assessment" in summary:
         lost = _of_lost_things(found.groups, result)
-        assessment = _assessed(summary["assessment"], _of_doubles(doubles), lost)
+        twice = find_twice(result.map)
+        doubled = [*([twice.in_words()] if twice else []), *_of_doubles(doubles)]
+        assessment = _assessed(summary["assessment"], doubled, lost)
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *in_assessment(unmapped)]}
     return replace(result, doubts=doubts, summary=summary)
 
 
 def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -> dict[str, Any]:
-    """Return the assessment with more reasons for a look at the map: possible doubles come first, lost things last."""
+    """Return the assessment with more reasons for a look at the map: what may be there twice comes first, lost things
+    last."""
     if assessment["level"] == "bad" or not (doubles or lost):
         return assessment
     others = assessment["reasons"][assessment["level"] == "good" :]  # The first reason of a good map praises it.

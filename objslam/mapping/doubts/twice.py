@@ -1,0 +1,77 @@
+"""Find a place that a map holds twice: the robot lost it, was carried, or its odometry restarted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.association.registration.map_registration import Registration
+from objslam.association.registration.object_maps import placed, register
+from objslam.core.arrays import Floats
+from objslam.core.object_map import ObjectMap
+
+_FEWEST = 4
+"""The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number does
+less work."""
+_SPANNING = 0.5
+"""The largest share of objects that both parts of the drive show. After a loss, these are objects whose place another one
+has by chance. A larger share searches more maps."""
+_FEWEST_MATCHES = 0.5
+"""The least share of the objects of the smaller part that the other part has too. Rooms of a building have some furniture in
+common. A larger share finds fewer losses."""
+
+
+@dataclass(frozen=True)
+class Twice:
+    """A place that is twice in a map. stamp: s, when it was lost. first, second: the numbers of objects in both parts.
+    registration: of the first part to the second."""
+
+    stamp: float
+    first: int
+    second: int
+    registration: Registration
+
+    def in_words(self) -> str:
+        """Return a reason of the assessment."""
+        matches = len(self.registration.matches)
+        return (
+            f"The {self.first} objects seen before stamp {self.stamp:.3f} and the {self.second} objects seen after it look "
+            f"like one place mapped twice ({matches} match): the odometry or the localisation was lost there, or the robot "
+            "was carried. Cut the log there, and join both maps with `objslam merge`."
+        )
+
+
+def find_twice(objects: ObjectMap) -> Twice | None:
+    """Return the place that a map holds twice, None if there is none.
+
+    A robot that loses its place sees all objects again as new ones. So there is a time at which nearly all known objects are
+    seen for the last time, and after which all are new. If the parts before and after it register to each other, they are
+    one place.
+    """
+    usable = placed(objects)
+    first = np.array([objects.objects[i].first_seen for i in usable])
+    last = np.array([objects.objects[i].last_seen for i in usable])
+    stamp = _cut(first, last)
+    if stamp is None:
+        return None
+    before = [objects.objects[i] for i, end in zip(usable, last, strict=True) if end <= stamp]
+    after = [objects.objects[i] for i, begin in zip(usable, first, strict=True) if begin > stamp]
+    found = register(*(replace(objects, objects=tuple(part), gone=()) for part in (before, after)))
+    if not found.accepted or len(found.matches) < _FEWEST_MATCHES * min(len(before), len(after)):
+        return None
+    return Twice(stamp, len(before), len(after), found)
+
+
+def _cut(first: Floats, last: Floats) -> float | None:
+    """Return the time that divides objects best, None if none does. first, last: (N,) s, when each was seen."""
+    times = np.unique(last)
+    before = np.searchsorted(np.sort(last), times, side="right")
+    after = len(first) - np.searchsorted(np.sort(first), times, side="right")
+    spanning = len(first) - before - after
+    smaller = np.minimum(before, after)
+    good = np.flatnonzero((smaller >= _FEWEST) & (spanning <= _SPANNING * len(first)))
+    if not len(good):
+        return None
+    # An object that both parts show is evidence against the cut, as much as one more of the smaller part is for it.
+    return float(times[good[np.argmax((smaller - spanning)[good])]])

@@ -1,0 +1,97 @@
+"""Jumps and restarts of paths, on drives of which it is known where they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from objslam.core.geometry import inverse, lift_se2
+from objslam.core.types import Log, Trajectory
+from objslam.frontend.odometry_restarts import counts_from_zero
+from objslam.mapping.checks.path import check_path
+from objslam.simulation import preset, simulate
+
+RATE = 0.4  # rad/s, of a robot that drives along a circle with a radius of 1.5 m.
+
+
+def circle(every: float, noise: float = 0.0, seconds: float = 60.0) -> Trajectory:
+    """A drive at 0.6 m/s that stops for 5 s each 20 s. every: s between poses. noise: of places, m."""
+    stamps = np.arange(0.0, seconds, every)
+    fine = np.arange(0.0, seconds, 0.01)
+    angle = np.interp(stamps, fine, np.cumsum(np.where(fine % 20 < 15, RATE, 0.0)) * 0.01)
+    places = 1.5 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+    places = places + np.random.default_rng(0).normal(0, noise, places.shape)
+    return Trajectory(stamps, lift_se2(np.column_stack([places, angle])))
+
+
+def jumped(path: Trajectory, after: float, way: float) -> Trajectory:
+    """The path, `way` m aside after a stamp."""
+    poses = path.poses.copy()
+    poses[path.stamps > after, 1, 3] += way
+    return replace(path, poses=poses)
+
+
+def names(localization: Trajectory | None, odometry: Trajectory | None = None) -> list[str]:
+    return [one.name for one in check_path(Log("log", (), localization=localization, odometry=odometry), 1.0)]
+
+
+@pytest.mark.parametrize(("every", "noise"), [(0.1, 0.0), (0.1, 0.03), (0.05, 0.05), (0.5, 0.03), (1.0, 0.0)])
+def test_a_drive_with_stops_does_not_jump(every: float, noise: float) -> None:
+    assert names(circle(every, noise)) == []
+    assert names(circle(every, noise), circle(0.05)) == []
+
+
+def test_a_localisation_that_repeats_each_pose_does_not_jump() -> None:
+    path, slow = circle(0.1), np.repeat(np.arange(0, 600, 10), 10)
+    assert names(replace(path, poses=path.poses[slow])) == []
+
+
+@pytest.mark.parametrize("back", [None, 40.0])
+def test_a_jump_of_half_a_metre_is_named(back: float | None) -> None:
+    """At 10 Hz it is slower than 5 m/s, but no robot accelerates and brakes so."""
+    path = jumped(circle(0.1, 0.03), 30.0, 0.55)
+    path = path if back is None else jumped(path, back, -0.55)
+    (found,) = check_path(Log("log", (), localization=path), 1.0)
+    assert found.name == "localisation jumps"
+    assert not found.spoils
+    assert f"jumps {1 if back is None else 2} time" in found.message
+    assert "stamp 30.1" in found.message or "stamp 30.0" in found.message
+
+
+def test_a_jump_between_rare_poses_is_named_by_the_odometry() -> None:
+    path = jumped(circle(0.5, 0.03), 30.2, 0.6)
+    assert names(path) == []
+    assert names(path, circle(0.05)) == ["localisation jumps"]
+
+
+@pytest.mark.parametrize(
+    ("gap", "restarts", "said"), [(4.0, True, ["odometry restarts"]), (4.0, False, []), (0.0, False, [])]
+)
+def test_odometry_that_restarts_in_a_gap_is_named(gap: float, restarts: bool, said: list[str]) -> None:
+    path = circle(0.1)
+    keep = (path.stamps < 28.0) | (path.stamps >= 28.0 + gap)
+    path = replace(path, stamps=path.stamps[keep], poses=path.poses[keep])
+    if restarts:
+        after = path.stamps > 28.0
+        path = replace(path, poses=np.where(after[:, None, None], inverse(path.poses[after][:1]) @ path.poses, path.poses))
+    assert names(None, path) == said
+    assert names(circle(0.1), path) == []  # With a localisation, each motion stands alone.
+
+
+def test_odometry_near_zero_before_a_gap_has_not_restarted() -> None:
+    poses = lift_se2(np.array([[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [2.0, 1.0, 0.5], [0.0, 0.02, 6.27], [0.2, 0.0, 0.0]]))
+    assert counts_from_zero(poses[:-1], poses[1:]).tolist() == [False, False, True, False]
+
+
+def test_an_arm_that_moves_its_camera_does_not_freeze_the_base() -> None:
+    """The base stands, and the boxes move. With the poses of the camera on the base, this is right."""
+    log = simulate(preset("rooms"), 0)
+    path = log.robot_path
+    assert path is not None
+    still = replace(path, poses=np.broadcast_to(path.poses[0], path.poses.shape).copy())
+    standing = replace(log, localization=still, odometry=None)
+    assert [one.name for one in check_path(standing, 1.0)] == ["localisation frozen"]
+    moved = tuple(replace(one, mount=path) for one in standing.cameras)
+    assert check_path(replace(standing, cameras=moved), 1.0) == []
