@@ -164,9 +164,9 @@ def _check(e: Evidence) -> list[str]:
     if e.unexplained > _UNEXPLAINED * e.rays:
         found.append(f"{100 * e.unexplained / e.rays:.0f} % of the used boxes belong to no object.")
     elif e.unexplained + e.rejected > _UNEXPLAINED * e.rays:
-        share, more = (100 * part / e.rays for part in (e.unexplained, e.rejected))
+        none, missed = (100 * part / e.rays for part in (e.unexplained, e.rejected))
         found.append(
-            f"{share:.0f} % of the used boxes belong to no object, and {more:.0f} % miss their object."
+            f"{none:.0f} % of the used boxes belong to no object, and {missed:.0f} % miss their object."
             + (" An object may be two." if e.rejected > e.unexplained else "")
         )
     if e.unresolved > e.resolved:
