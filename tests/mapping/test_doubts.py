@@ -15,6 +15,7 @@ from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
 from objslam.mapping.doubts import pairs, words
 from objslam.mapping.doubts.groups import REASONS
+from objslam.mapping.doubts.sizes import mixed_sizes
 from objslam.simulation import pair, preset, simulate
 from objslam.simulation.settings import DepthNoise
 
@@ -87,8 +88,9 @@ def test_a_thing_that_moves():
     log = simulate(preset("rooms", moving=1, tracks="perfect", missed=0.1, false=0.05), 0)
     result = mapped(log)
     moving = len(log.truth.objects)
-    found = [one for one in result.doubts if one.reason in ("follow", "moves")]
+    found = [one for one in result.doubts if one.reason in ("follow", "moves", "sizes")]  # Its rays met in a wrong place.
     assert found == list(result.doubts) != []
+    assert [one.reason for one in found if one.kind == "split"] == ["sizes"]
     rays = np.concatenate([one.rays for one in found])
     assert (result.rays.track_id[rays] == moving).mean() > 0.9
     assert len(rays) > 0.4 * (result.rays.track_id == moving).sum()
@@ -194,3 +196,29 @@ def test_neighbours_are_the_nearest_objects(number):
     found = np.sort(pairs._nearest(position, count), axis=1)
     expected = np.argsort(np.linalg.norm(position[:, None] - position, axis=2), axis=1)[:, :count]
     np.testing.assert_array_equal(found, np.sort(expected, axis=1))
+
+
+def test_an_object_whose_boxes_have_two_sizes():
+    """A third of its boxes are of a thing that is half as large."""
+    log = simulate(preset("rooms", false=0.0, tracks="perfect"), 4)
+    result = mapped(log)
+    widths = result.rays.box[:, 2] - result.rays.box[:, 0]
+    wide = max(range(len(result.map)), key=lambda j: np.median(widths[result.association.object == j]))
+    mine = np.flatnonzero(result.association.object == wide)[::3]
+    box = result.rays.box.copy()
+    middle, half = (box[mine, :2] + box[mine, 2:]) / 2, (box[mine, 2:] - box[mine, :2]) / 4
+    box[mine] = np.hstack([middle - half, middle + half])
+    assert mixed_sizes(result) == []
+    (found,) = mixed_sizes(replace(result, rays=replace(result.rays, box=box)))
+    assert (found.kind, found.reason, found.objects) == ("split", "sizes", (result.map.objects[wide].id,))
+    # A third of the logarithms is ln 2 less: their standard deviation is ln 2 times the root of 1/3 * 2/3.
+    assert found.numbers["size_scatter"] == pytest.approx(np.log(2) * np.sqrt(2) / 3, abs=0.06)
+    assert set(mine.tolist()) < set(found.rays.tolist())
+
+
+def test_a_camera_that_observes_no_sizes_tells_none():
+    result = mapped(simulate(preset("rooms", false=0.0), 4))
+    box = result.rays.box * np.random.default_rng(0).uniform(0.5, 2, (len(result.rays), 1))
+    odd = replace(result, rays=replace(result.rays, box=box))
+    blind = tuple(replace(camera, sees_size=False) for camera in result.cameras)
+    assert mixed_sizes(replace(odd, cameras=blind)) == []

@@ -11,6 +11,7 @@ from objslam.core.result import DOUBT_KINDS, RunResult
 from objslam.mapping.doubts.evidence import evidence_of
 from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
 from objslam.mapping.doubts.pairs import Pairs, find_pairs
+from objslam.mapping.doubts.sizes import mixed_sizes
 from objslam.mapping.doubts.splits import Splits, find_splits
 from objslam.mapping.doubts.twice import find_twice
 from objslam.mapping.doubts.unmapped import in_assessment, unmapped_labels
@@ -49,20 +50,22 @@ def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
     A map with objects that are more likely doubles than not is not called good. Neither is a map that holds a place twice,
-    nor one without an object where many boxes of a label meet. A label without an object is named, but its boxes may be
-    false, so the level stays.
+    one with an object of many sizes, nor one without an object where many boxes of a label meet. A label without an object
+    is named, but its boxes may be false, so the level stays.
     """
     found = find_doubts(result)
     doubts = tuple(in_words(result, found.pairs, found.splits, found.groups))
     unmapped, told = unmapped_labels(result), {one.label for one in doubts if one.kind == "boxes"}
-    doubts = (*doubts, *(one for one in unmapped if one.label not in told))  # One doubt says why its boxes are no object.
+    mixed = mixed_sizes(result)
+    # One doubt says why boxes are no object.
+    doubts = (*doubts, *mixed, *(one for one in unmapped if one.label not in told))
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
     if "assessment" in summary:
         lost = _of_lost_things(found.groups, result)
         twice = find_twice(result.map)
-        doubled = [*([twice.in_words()] if twice else []), *_of_doubles(doubles)]
+        doubled = [*([twice.in_words()] if twice else []), *_of_mixed(len(mixed)), *_of_doubles(doubles)]
         assessment = _assessed(summary["assessment"], doubled, lost)
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *in_assessment(unmapped)]}
     return replace(result, doubts=doubts, summary=summary)
@@ -75,6 +78,13 @@ def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -
         return assessment
     others = assessment["reasons"][assessment["level"] == "good" :]  # The first reason of a good map praises it.
     return {**assessment, "level": "check", "reasons": [*doubles, *others, *lost]}
+
+
+def _of_mixed(mixed: int) -> list[str]:
+    if mixed == 1:
+        return ["1 object has boxes of very different sizes, so it may be several things: `objslam explain` names it."]
+    many = f"{mixed} objects have boxes of very different sizes, so each may be several things"
+    return [f"{many}: `objslam explain` names them."] if mixed else []
 
 
 def _of_doubles(doubles: int) -> list[str]:
