@@ -98,6 +98,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         state, noisier = _relocalized(explored), _with_loose_odometry(explored, begin.theta)
         if noisier is not None:
             state = state.better(_relocalized(_from_start(*_explored(noisier))))
+        state = _split(state)
     if not state.settled:
         rounds = state.settings.joint.max_rounds
         state.ledger.warn(f"the association still changes after {rounds} rounds (joint.max_rounds)")
@@ -136,6 +137,16 @@ def _relocalized(state: JointState) -> JointState:
     """Return the state after searches for the most likely path, until the rays are no better explained."""
     for _ in range(state.settings.joint.max_rounds):
         found = state.relocalized()
+        if found is state:
+            break
+        state = found
+    return state
+
+
+def _split(state: JointState) -> JointState:
+    """Return the state after objects that may be two were split, until the rays are no better explained."""
+    for _ in range(state.settings.joint.max_rounds):
+        found = state.split()
         if found is state:
             break
         state = found
