@@ -16,7 +16,7 @@ from objslam.core.trace import Trace, Why
 from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.duplicates import merge_unseen_together
+from objslam.mapping.merge_and_split import merge_unseen_together, split_at_gaps
 from objslam.mapping.progress import Progress
 from objslam.mapping.relocalization import relocalize
 from objslam.mapping.solution import rays_moved, without_errors
@@ -207,6 +207,26 @@ class JointState:
         if turns.explained < best.explained:
             turns = replace(turns.continued_from(best), settled=turns.settled)
         return self.better(turns)
+
+    def split(self) -> Self:
+        """Return the state after objects that may be two were split, if its rays are better `explained`.
+
+        Rounds in turns keep two things that one object holds, because the path is bent until all rays agree. So do they keep
+        a phantom where the rays of two things cross. Here all objects whose rays come in two bundles are split at once. The
+        solve takes the bend out of the path, and bundles of one thing are merged again.
+        """
+        assert self.association is not None
+        _, direction = self.rays.in_map(self.solved_poses)
+        found = split_at_gaps(direction, self.association, self.agree, self.settings.association.min_rays)
+        if found.count == self.association.count:
+            return self
+        attempt = self.attempt().counted(found).solve("split", found, self.solved_poses).merged()
+        assert attempt.association is not None
+        assert attempt.estimate is not None
+        attempt = attempt.alternated(attempt.estimate.map_T_base, (attempt.association, attempt.estimate.positions))
+        assert attempt.association is not None
+        same = rays_moved(self.association.object, attempt.association.object) == 0
+        return self if same else self.better(attempt)
 
     def attempt(self) -> Self:
         """Return a state for rounds that may be discarded."""

@@ -13,6 +13,7 @@ from objslam.core.geometry import inverse
 from objslam.core.noise import NoiseFactors
 from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
+from objslam.frontend.turning_odometry import with_turns_of_tracks
 from objslam.mapping.doubted_labels import (
     CLEAR_ODDS,
     doubted_names,
@@ -33,6 +34,7 @@ from objslam.mapping.labels import (
 )
 
 if TYPE_CHECKING:
+    from objslam.core.arrays import Floats
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _NOISIER = 1.5
@@ -91,10 +93,12 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     if start is not None or state.keyframes.localized_every:
         state = _relocalized(_from_start(state, start))
     else:
-        explored = _from_start(*_explored(state))
-        state, noisier = _relocalized(explored), _with_loose_odometry(explored)
+        begin = _with_turns(state)
+        explored = _from_start(*_explored(begin))
+        state, noisier = _relocalized(explored), _with_loose_odometry(explored, begin.theta)
         if noisier is not None:
             state = state.better(_relocalized(_from_start(*_explored(noisier))))
+        state = _split(state)
     if not state.settled:
         rounds = state.settings.joint.max_rounds
         state.ledger.warn(f"the association still changes after {rounds} rounds (joint.max_rounds)")
@@ -113,6 +117,15 @@ def _with_clocks(state: JointState) -> JointState:
     return replace(state, theta=theta, keyframes=keyframes, rays=rays)
 
 
+def _with_turns(state: JointState) -> JointState:
+    """Return the state that begins at the error of the odometry's turns which the tracks of boxes show."""
+    if state.errors is None:
+        return state
+    theta = with_turns_of_tracks(state.errors, state.errors.mean if state.theta is None else state.theta)
+    keyframes, rays, _ = state.errors.at(theta)
+    return replace(state, theta=theta, keyframes=keyframes, rays=rays)
+
+
 def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after rounds from a start, or from the poses of the keyframes."""
     map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
@@ -124,6 +137,16 @@ def _relocalized(state: JointState) -> JointState:
     """Return the state after searches for the most likely path, until the rays are no better explained."""
     for _ in range(state.settings.joint.max_rounds):
         found = state.relocalized()
+        if found is state:
+            break
+        state = found
+    return state
+
+
+def _split(state: JointState) -> JointState:
+    """Return the state after objects that may be two were split, until the rays are no better explained."""
+    for _ in range(state.settings.joint.max_rounds):
+        found = state.split()
         if found is state:
             break
         state = found
@@ -190,28 +213,39 @@ def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
     return replace(solved, hold=True, association=None), start
 
 
-def _with_loose_odometry(state: JointState) -> JointState | None:
+def _with_loose_odometry(state: JointState, assumed: Floats | None) -> JointState | None:
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
-    None if both are about nominal, if the settings fix the noise, or if nearly all rays agree. The solve finds them, but the
+    None if the noise is about nominal and the shared errors are about those `assumed` (P,) by the first exploration, if the
+    settings fix the noise, or if nearly all rays agree. The solve finds them, but the
     exploration needs them before. A wrong map can hide the noise of the odometry in the noise of the rays.
+
+    The noise is at least nominal. A solve estimates the shared errors and the noise together, so the rest may be small. An
+    exploration has the shared errors fixed, and those of a wrong map are wrong by more than their sigma. With half the noise
+    it expects known objects within gates that they miss, and maps them again.
     """
     if state.errors is None or "odometry" not in state.errors.unknown_noise or state.agree.mean() >= _CLEAR:
         return None
     found, values = state.errors.noise, state.theta
     if max(found.along, found.turning) <= _NOISIER:
         if found.rays > _NOISIER:
-            found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), None
-        elif not _drives_otherwise(state):
+            found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), assumed
+        elif not _drives_otherwise(state, assumed):
             return None
-    errors = state.errors.with_noise(replace(found, shrinkage=0.0))
+    errors = state.errors.with_noise(_at_least_nominal(found))
     keyframes, rays, _ = errors.at(errors.mean if values is None else values)
     unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
     return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
 
 
-def _drives_otherwise(state: JointState) -> bool:
-    """Return whether the solve found that the robot turns or drives clearly less or more than its odometry says.
+def _at_least_nominal(noise: NoiseFactors) -> NoiseFactors:
+    """Return the noise of an exploration: no noise of rays or odometry below that of the settings, and no shrinkage."""
+    odometry = {name: max(getattr(noise, name), 1.0) for name in ("along", "across", "turning")}
+    return replace(noise, rays=max(noise.rays, 1.0), shrinkage=0.0, **odometry)
+
+
+def _drives_otherwise(state: JointState, assumed: Floats | None) -> bool:
+    """Return whether the solve found that the robot turns or drives clearly less or more than the exploration assumed.
 
     An exploration with this error may take neighbours of one label for one object. The map then bends between them.
     """
@@ -221,5 +255,5 @@ def _drives_otherwise(state: JointState) -> bool:
     if found is None:
         return False
     of_odometry = np.array([name.startswith("odometry.") for name in found.names])
-    off = np.abs(found.values - state.errors.mean) > _CLEARLY * found.sigma
+    off = np.abs(found.values - (state.errors.mean if assumed is None else assumed)) > _CLEARLY * found.sigma
     return bool((off & of_odometry).any())

@@ -5,60 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from turning_drive import drive, errors_of
 
-from objslam.config import load_settings
-from objslam.core.camera import Camera, project
-from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import inverse, lift_se2, make_pose
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
-from objslam.frontend.bearings import build_rays
-from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.core.geometry import inverse, make_pose
+from objslam.core.types import Trajectory
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.turning_clocks import clocks_of_turns
 from objslam.simulation.shared_errors import add_shared_errors
-
-BASE_T_CAMERA = make_pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 0.5]))
-
-
-def drive(seed: int = 1, turns: float = 0.8, clock: float = 0.0, false: float = 0.0) -> Log:
-    """A robot that looks to and fro (by `turns`, rad) while it drives, past objects of which some are out of view.
-
-    clock: s, what the stamps of the camera lack. false: the share of boxes with a wrong label.
-    """
-    rng = np.random.default_rng(seed)
-    at = np.arange(0.0, 60.0, 0.05)
-    heading = turns * (np.sin(0.9 * at) + 0.5 * np.sin(1.7 * at + 1))
-    path = np.column_stack([0.2 * at, np.zeros_like(at), heading])
-    stamps = np.arange(1.0, 59.0, 0.2)
-    poses = lift_se2(np.column_stack([np.interp(stamps, at, column) for column in path.T]))
-    places = np.column_stack([rng.uniform(0, 16, 40), rng.uniform(-4, 4, 40), rng.uniform(0, 1, 40)])
-    camera = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]), base_T_camera=BASE_T_CAMERA)
-    map_T_camera = poses @ BASE_T_CAMERA
-    local = np.einsum("kji,knj->kni", map_T_camera[:, :3, :3], places - map_T_camera[:, None, :3, 3])
-    with np.errstate(all="ignore"):
-        pixels = project(camera, local.reshape(-1, 3)).reshape(*local.shape[:2], 2)
-    frame, label = np.nonzero((local[..., 2] > 0.5) & ((pixels > 20) & (pixels < [619, 459])).all(axis=2))
-    centre = pixels[frame, label] + rng.normal(size=(len(frame), 2))
-    wrong = rng.random(len(frame)) < false
-    detections = Detections(
-        frame_stamps=stamps - clock,
-        frame=frame,
-        boxes=np.concatenate([centre - 8, centre + 8], axis=1),
-        label=np.where(wrong, rng.integers(0, 40, len(frame)), label),
-        scores=np.ones(len(frame)),
-        depths=np.full(len(frame), np.nan),
-        track_ids=np.full(len(frame), -1),
-        label_names=tuple(f"thing_{i}" for i in range(40)),
-    )
-    return Log("turning", (CameraLog(camera, detections),), odometry=Trajectory(at, lift_se2(path)))
-
-
-def errors_of(log: Log, *overrides: str) -> SharedErrors:
-    settings, ledger = load_settings(None, ("mode=joint", *overrides)), Ledger()
-    keyframes = build_keyframes(log, settings, ledger)
-    found = shared_errors(log, keyframes, build_rays(log, keyframes, settings, ledger), settings)
-    assert found is not None
-    return found
 
 
 def clock_of(errors: SharedErrors, theta: np.ndarray) -> float:

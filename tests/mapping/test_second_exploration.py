@@ -63,7 +63,19 @@ def replace_any(monkeypatch):
     ],
 )
 def test_a_robot_that_turns_less_than_its_odometry_says_is_explored_again(given, again):
-    attempt = _with_loose_odometry(state(**given))
+    attempt = _with_loose_odometry(state(**given), None)
     assert (attempt is not None) == again
     if attempt is not None:
         assert attempt.theta[1] == given["turn"]
+
+
+def test_turns_that_the_exploration_began_with_are_no_reason_to_explore_again():
+    assert _with_loose_odometry(state(turn=-0.05), np.array([0.0, -0.045, 0.0])) is None
+    assert _with_loose_odometry(state(turn=-0.05), np.array([0.0, 0.02, 0.0])) is not None
+
+
+def test_a_log_is_not_explored_with_less_noise_than_the_settings_say():
+    """The noise that a solve finds is that of a path which is solved together with its turns, perhaps to a wrong map."""
+    quiet = NoiseFactors(rays=0.66, along=0.7, across=2.0, turning=0.5, shrinkage=0.02)
+    attempt = _with_loose_odometry(state(turn=-0.05, noise=quiet), None)
+    assert attempt.errors.noise == NoiseFactors(across=2.0)

@@ -22,6 +22,7 @@ _WHY = {
     "labels": "one object assumed for each label",
     "association": "association at the latest poses",
     "merge": "merge of objects that the new poses move together",
+    "split": "split of objects that may be two",
     "bodies": "bearings to the centres of bodies",
 }
 """The words that the log shows for the reason of each round."""

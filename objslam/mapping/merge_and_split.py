@@ -1,4 +1,4 @@
-"""Merge objects that are in the map twice, because the poses drifted between two visits."""
+"""Merge objects that are in the map twice, and split objects that may be two. Drift between two visits causes both."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ import numpy as np
 
 from objslam.association.appearance.evidence import Looks, learn_ratio
 from objslam.association.duplicates import near_pairs, seen_as_two
+from objslam.association.refinement import grouped_sums
+from objslam.core.arrays import Bools, Floats
 from objslam.core.statistics import SAME_POINT
 from objslam.core.types import Association, Rays
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
+
+_GAP = np.radians(15.0)
+"""The least gap (rad) between the directions of two bundles of rays. A robot that drives past a thing sees it from all
+directions between the first and the last, apart from missed boxes. With a smaller gap, more objects are tried as two, which
+takes time."""
 
 
 def merge_unseen_together(rays: Rays, association: Association, estimate: Estimate, farthest: float) -> Association:
@@ -55,3 +62,43 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
         label_weights=None if weights is None else weights[kept],
         existence=None if existence is None else existence[kept],
     )
+
+
+def split_at_gaps(direction: Floats, association: Association, used: Bools, fewest: int) -> Association:
+    """Split objects whose rays come in two bundles: there is a wide gap between the directions of the rays.
+
+    The bundles may be two things, such as the signs on both sides of a wall. If a path is bent to bring them together, all
+    their rays agree with one point. The gap is searched along the line on which the directions spread most.
+
+    Args:
+        direction: (R, 3) unit, of the rays in map.
+        association: of the rays. The second bundle of an object becomes a new object of the same label.
+        used: (R,) the rays that agree with their objects. The others go with the bundle on their side of the gap.
+        fewest: the fewest used rays of a bundle.
+    """
+    mine, count = np.flatnonzero(used & (association.object >= 0)), association.count
+    owner, number = association.object[mine], np.bincount(association.object[mine], minlength=count)
+    mean = grouped_sums(direction[mine], owner, count) / np.maximum(number, 1)[:, None]
+    off = direction[mine] - mean[owner]
+    scatter = grouped_sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), owner, count).reshape(-1, 3, 3)
+    axis = np.linalg.eigh(scatter)[1][:, :, -1]
+    along = np.einsum("ri,ri->r", off, axis[owner])
+    order = np.lexsort((along, owner))
+    owner, along = owner[order], along[order]
+    before = np.arange(len(owner)) - (np.cumsum(number) - number)[owner] + 1  # Rays of the object up to each one.
+    gap = np.append(np.diff(along), 0.0)
+    gap[(before < fewest) | (number[owner] - before < fewest)] = 0.0
+    widest = np.zeros(count)
+    np.maximum.at(widest, owner, gap)
+    border = np.full(count, np.inf)
+    at = np.flatnonzero((gap == widest[owner]) & (gap >= _GAP))
+    border[owner[at]] = along[at] + gap[at] / 2
+    two = np.flatnonzero(np.isfinite(border))
+    second = np.full(count, -1)
+    second[two] = count + np.arange(len(two))
+    held = np.flatnonzero(association.object >= 0)
+    own = association.object[held]
+    beyond = np.einsum("ri,ri->r", direction[held] - mean[own], axis[own]) > border[own]
+    found = association.object.copy()
+    found[held[beyond]] = second[own[beyond]]
+    return Association(found, np.append(association.label, association.label[two]))
