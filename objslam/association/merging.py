@@ -12,6 +12,7 @@ from objslam.association.observations import Observations, overlap
 from objslam.association.refinement import BEHIND, normalised_residuals, range_costs, refine, squared_offsets, variance
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import nearest_points
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 
 _OBJECT_COST = 10.0
@@ -78,12 +79,10 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
 def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
     """Return the pairs of landmarks a < b (P,) that may be one object. They are near compared with the noise of their rays
     or with their sizes, or they lie on one line of sight."""
-    from scipy.spatial import cKDTree
-
     count, position = state.count, state.landmarks.position
-    near = min(_NEIGHBOURS + 1, count)
-    gap, b = (np.asarray(found).ravel() for found in cKDTree(position).query(position, k=np.arange(1, near + 1)))
-    a = np.repeat(np.arange(count), near)
+    b = nearest_points(position, min(_NEIGHBOURS + 1, count)).ravel()
+    a = np.repeat(np.arange(count), len(b) // max(count, 1))
+    gap = np.linalg.norm(position[a] - position[b], axis=1)
     by_rays = _REACH_GATES * np.sqrt(gate) * (state.ray_sigma[a] + state.ray_sigma[b])
     close = (gap < np.maximum(by_rays, 0.5 * (state.size[a] + state.size[b]))) & (a != b)
     pairs = np.concatenate([np.stack([a[close], b[close]], axis=1), _on_one_line(state, gate)])

@@ -238,7 +238,11 @@ def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 
 def _gain(problem: _Problem, a: Ints, b: Ints, miss: Floats) -> Floats:
     """Return the gains (..., C) of pairs (C,) whose positions differ by `miss` (..., C, 3) m."""
-    squared = np.einsum("...ci,cij,...cj->...c", miss, problem.information[a, b], miss)
+    x, y, z = miss[..., 0], miss[..., 1], miss[..., 2]
+    of = problem.information[a, b].T  # Symmetric. Written out, this takes half the time of an einsum.
+    squared = (
+        (of[0, 0] * x + 2 * (of[0, 1] * y + of[0, 2] * z)) * x + (of[1, 1] * y + 2 * of[1, 2] * z) * y + of[2, 2] * z**2
+    )
     return np.where(squared <= SAME_POINT_WIDE, problem.peak[a, b] - 0.5 * squared, -np.inf)
 
 

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import (
     cross,
     quaternion_from_rotation,
@@ -25,6 +25,9 @@ less exact. At this value, its relative error is below 1e-17."""
 _ON_A_LINE = 1e-9
 """Points lie on a line if the second singular value of their cross-covariance is at most this share of the first. A larger
 share takes more point sets for lines. Rounding leaves about 1e-15."""
+_FEW_POINTS = 100
+"""Up to this number of points, all distances between them are computed. With more, a search tree takes less time. But a log
+with few objects then needs no import of scipy.spatial, which takes 0.07 s."""
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
@@ -305,3 +308,13 @@ def evenly_spread(number: int) -> Floats:
     z, azimuth = 1 - 2 * k / number, k * (np.pi * (3 - np.sqrt(5)))
     radius = np.sqrt(1 - z**2)
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+
+
+def nearest_points(points: Floats, count: int) -> Ints:
+    """Return the `count` nearest of points (N, 3) to each of them, itself included, as indices (N, count) in any order."""
+    if len(points) <= _FEW_POINTS:
+        squared = sum((points[:, [axis]] - points[:, axis]) ** 2 for axis in range(3))
+        return np.argpartition(squared, count - 1, axis=1)[:, :count]
+    from scipy.spatial import cKDTree
+
+    return np.asarray(cKDTree(points).query(points, k=np.arange(1, count + 1))[1])

@@ -27,7 +27,7 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.loop_closure import Closure, Landmarks, distribute_correction, find_closure
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.robust_cost import FLOOR, ray_information, truncated_cost
-from objslam.graph.variables import make_values, read_points, read_poses
+from objslam.graph.variables import add_values, make_values, read_points, read_poses
 
 HORIZON = 0.1
 """A landmark is expected at its position if the heading drifted by less than this (rad, one standard deviation) since the
@@ -86,7 +86,7 @@ def initialize_unknown(
     none, pairs_left = np.zeros(0, dtype=np.int64), 0
     ratio: CosineRatio | None = None
     taught = _LESSON  # The number of rays with a landmark from which the ratio was learnt last.
-    graph = build_graph(measured.factors(owner, none, none, known.position, end=1))
+    graph, values, solved = build_graph(measured.factors(owner, none, none, known.position, end=1)), gtsam.Values(), (0, 0)
     for begin in range(1, len(keyframes), settings.joint.explore_step):
         end = min(begin + settings.joint.explore_step, len(keyframes))
         follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
@@ -105,7 +105,10 @@ def initialize_unknown(
 
         graph.push_back(build_graph(measured.factors(owner, fresh, born, known.position, begin=begin, end=end)))
         if len(known):
-            values = _solve(graph, map_T_camera[:end], known, _ITERATIONS)
+            # Most variables stay as the last solve left them. To make them all again would take a fifth of the solve.
+            fresh_poses, fresh_landmarks = np.arange(solved[0], end), np.arange(solved[1], len(known))
+            add_values(values, map_T_camera, known.position, fresh_poses, fresh_landmarks)
+            values, solved = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4).values, (end, len(known))
             map_T_camera[:end] = read_poses(values)
             known.position = read_points(values)
             known.covariance = _covariances(rays, owner, known.position, map_T_camera)
@@ -125,13 +128,9 @@ def initialize_unknown(
                 else:
                     graph, known, owner, map_T_camera[:end] = closed
                     refused.clear()  # The numbers of the landmarks have changed.
+                    values, solved = gtsam.Values(), (0, 0)
         progress(end, len(keyframes))
     return InitialEstimate(map_T_camera, Association(owner, known.label), known.position)
-
-
-def _solve(graph: gtsam.NonlinearFactorGraph, map_T_camera: Floats, known: Landmarks, iterations: int) -> gtsam.Values:
-    values = make_values(map_T_camera, known.position, np.arange(len(known)))
-    return levenberg_marquardt(graph, values, iterations, 1e-4).values
 
 
 def _close(
@@ -157,7 +156,8 @@ def _close(
     owned = np.where(owner >= 0, number[owner], -1)
     held = np.flatnonzero((owned >= 0) & (rays.keyframe < end))
     graph = build_graph(measured.factors(owned, held, np.arange(len(merged)), merged.position, end=end))
-    values = _solve(graph, poses, merged, _ITERATIONS_OF_A_LOOP)
+    start = make_values(poses, merged.position, np.arange(len(merged)))
+    values = levenberg_marquardt(graph, start, _ITERATIONS_OF_A_LOOP, 1e-4).values
     before = truncated_cost(rays, owner, known.position, map_T_camera, *measured.odometry())
     poses, merged.position = read_poses(values), read_points(values)
     if truncated_cost(rays, owned, merged.position, poses, *measured.odometry()) > before + _STRAIN * len(now):

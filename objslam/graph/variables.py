@@ -31,11 +31,16 @@ LETTER = 56
 def make_values(map_T_camera: Floats, positions: Floats, landmarks: Ints) -> gtsam.Values:
     """Return values with X(0) to X(K-1) at map_T_camera (K, 4, 4), and L(j) at positions[j] for each j in landmarks."""
     values = gtsam.Values()
-    for k, pose in enumerate(map_T_camera):
-        values.insert(X0 + k, gtsam.Pose3(pose))
+    add_values(values, map_T_camera, positions, np.arange(len(map_T_camera)), landmarks)
+    return values
+
+
+def add_values(values: gtsam.Values, map_T_camera: Floats, positions: Floats, keyframes: Ints, landmarks: Ints) -> None:
+    """Add X(k) at map_T_camera[k] for each k in keyframes, and L(j) at positions[j] for each j in landmarks, to values."""
+    for k in keyframes.tolist():
+        values.insert(X0 + k, gtsam.Pose3(map_T_camera[k]))
     for j in landmarks.tolist():
         values.insert(L0 + j, positions[j])
-    return values
 
 
 def read_poses(values: gtsam.Values) -> Floats:

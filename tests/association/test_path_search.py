@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from objslam.association.path_search import state_grid, viterbi
 from objslam.association.path_search.most_likely_path import most_likely_path
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Keyframes, Rays
@@ -138,3 +139,35 @@ def test_rays_taken_in_parts_give_the_same_path(monkeypatch):
     whole = most_likely_path(*ask)
     monkeypatch.setattr("objslam.association.path_search.ray_costs._RAYS_AT_ONCE", 7)
     np.testing.assert_array_equal(most_likely_path(*ask).map_T_base, whole.map_T_base)
+
+
+@pytest.mark.parametrize("drift", [0.3, 1.0, 4.0])
+def test_states_are_the_best_of_all_sequences_of_states(drift, monkeypatch):
+    """Against the total costs of all pairs of states, motion after motion. Steps reach the edges of the grid."""
+    monkeypatch.setattr(state_grid, "_SHIFTS", 2)
+    monkeypatch.setattr(state_grid, "_TURNS", 1)
+    grid, rng, count = state_grid.Grid(0.1, 0.05), np.random.default_rng(0), 40
+    unit = np.array([grid.shift, grid.shift, grid.turn])
+    motions = viterbi.Motions(
+        error=rng.normal(size=(count - 1, 3)) * drift * unit,
+        variance=(rng.uniform(0.6, 1 + drift, (count - 1, 3)) * unit) ** 2,
+        way=rng.normal(size=(count - 1, 2)),
+    )
+    seen = rng.uniform(0, 12, (count, 3, 5, 5)).astype(np.float32)
+    turn, x, y = (a.ravel() for a in np.meshgrid(grid.turns, grid.shifts, grid.shifts, indexing="ij"))
+    cos, sin = np.cos(turn) - 1, np.sin(turn)
+    total, paths = seen[0].ravel().astype(np.float64), [[i] for i in range(75)]
+    for k in range(count - 1):
+        by_x = x - x[:, None] - (cos * motions.way[k, 0] - sin * motions.way[k, 1])[:, None] + motions.error[k, 0]
+        by_y = y - y[:, None] - (sin * motions.way[k, 0] + cos * motions.way[k, 1])[:, None] + motions.error[k, 1]
+        by_turn = turn - turn[:, None] + motions.error[k, 2]
+        moving = sum(off**2 / motions.variance[k, i] for i, off in enumerate((by_x, by_y, by_turn)))
+        slipped = np.full_like(total, total.min() + 20.0)  # From the best state, a motion costs at most a slip.
+        sums = total[:, None] + moving
+        before = np.where(sums.min(axis=0) <= slipped, sums.argmin(axis=0), total.argmin())
+        total = np.minimum(sums.min(axis=0), slipped) + seen[k + 1].ravel()
+        paths = [[*paths[i], j] for j, i in enumerate(before)]
+    best = np.array(paths[int(total.argmin())])
+    found = viterbi.most_likely_states(motions, iter(seen), grid)
+    expected = np.column_stack([x[best], y[best], turn[best]])
+    assert (np.abs(found - expected).max(axis=1) < 1e-9).mean() > 0.9  # Totals are stored in one byte each.

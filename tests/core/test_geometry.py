@@ -20,6 +20,7 @@ from objslam.core.geometry import (
     log_se3,
     make_pose,
     motion_between,
+    nearest_points,
     pose_from_quaternion,
     quaternion,
     skew,
@@ -334,3 +335,13 @@ def test_widest_angle_of_opposite_or_single_lines_is_none():
     assert widest_angle(np.zeros((0, 3))) == 0.0
     assert widest_angle(np.array([[1.0, 0.0, 0.0]])) == 0.0
     assert widest_angle(np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])) == 0.0
+
+
+@pytest.mark.parametrize("number", [1, 2, 9, 100, 400])
+def test_nearest_points_are_those_of_all_distances(number):
+    """Few points, and many for which a search tree is faster."""
+    position = np.random.default_rng(0).normal(size=(number, 3))
+    count = min(9, number)
+    found = np.sort(nearest_points(position, count), axis=1)
+    expected = np.argsort(np.linalg.norm(position[:, None] - position, axis=2), axis=1)[:, :count]
+    np.testing.assert_array_equal(found, np.sort(expected, axis=1))

@@ -4,12 +4,14 @@ import itertools
 
 import gtsam
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.graph.factors.bearing import bearings
 from objslam.graph.optimizers import build_graph
+from objslam.graph.posterior import marginals as marginals_module
 from objslam.graph.posterior.marginals import (
     SolvedGraph,
     correlated_factor,
@@ -42,7 +44,7 @@ def anchors(cameras, sigma=1e-3):
     ]
 
 
-def dense(graph, values, landmark):
+def inverse_block(graph, values, landmark):
     """The block of the inverse of the whole information matrix."""
     keys = [(X0 + k) for k in range(3)] + [(L0 + j) for j in range(3)]
     ordering = gtsam.Ordering()
@@ -57,21 +59,24 @@ def test_covariances_are_blocks_of_the_inverse_information():
     graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]), anchors(range(3)))
     values, ledger = make_values(CAMERAS, POINTS, np.arange(3)), Ledger()
     covariance = marginal_covariances(SolvedGraph(graph, values), np.array([2, 0]), ledger)
-    np.testing.assert_allclose(covariance[0], dense(graph, values, 2), rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(covariance[1], dense(graph, values, 0), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(covariance[0], inverse_block(graph, values, 2), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(covariance[1], inverse_block(graph, values, 0), rtol=1e-6, atol=1e-12)
     assert not ledger.lines()
 
 
-def test_the_normal_equations_give_what_gtsam_gives():
+@pytest.mark.parametrize("dense", [2000, 12, 9, 0])
+def test_the_normal_equations_give_what_gtsam_gives(dense, monkeypatch):
+    """Also if only some of the landmarks, or none, are in the dense block of the last columns."""
+    monkeypatch.setattr(marginals_module, "_DENSE", dense)
     graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]), anchors(range(3)))
     values = make_values(CAMERAS, POINTS, np.arange(3))
-    groups = [(L0 + 1,), (X0 + 2, L0 + 0)]
+    groups = [(L0 + 1,), (X0 + 2, L0 + 0), (L0 + 2,), (X0,)]
     marginals = gtsam.Marginals(graph, values)
     expected = [in_order(marginals.jointMarginalCovariance(list(keys)), keys) for keys in groups]
     found = joint_covariances(SolvedGraph(graph, values), groups)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-12)
-    np.testing.assert_allclose(found[0], dense(graph, values, 1), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found[0], inverse_block(graph, values, 1), rtol=1e-6, atol=1e-12)
     floating = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]))  # Nothing holds the frame.
     assert SolvedGraph(floating, values).inverse is None
 
@@ -121,7 +126,7 @@ def test_a_landmark_that_one_ray_holds_is_left_out_and_the_others_are_not():
     sure = build_graph(sightings([*pairs, (1, 2)]), anchors(range(3)))
     sure.push_back(gtsam.PriorFactorPoint3((L0 + 2), POINTS[2], gtsam.noiseModel.Isotropic.Sigma(3, 1)))
     for j in range(2):
-        np.testing.assert_allclose(covariance[j], dense(sure, values, j), rtol=1e-4, atol=1e-9)
+        np.testing.assert_allclose(covariance[j], inverse_block(sure, values, j), rtol=1e-4, atol=1e-9)
     assert len(ledger.warnings) == 1
     assert "l2" in ledger.warnings[0]
     assert "left unresolved" in ledger.warnings[0]

@@ -22,7 +22,9 @@ def test_the_last_block_of_the_inverse_is_that_of_the_dense_matrix():
     normal = NormalEquations.of(jacobian, elimination_order(jacobian, np.arange(jacobian.shape[1])))
     inverse = np.linalg.inv((jacobian.T @ jacobian).toarray())
     columns = np.array([2, 0])
-    found = normal.last_block(columns, 20)
-    assert found is not None
+    assert normal.late(columns, 20).tolist() == [2, 0]
+    found = normal.last_block(columns)
     np.testing.assert_allclose(found, inverse[np.ix_(columns, columns)], rtol=1e-9)
-    assert normal.last_block(np.array([normal.order[0]]), 20) is None  # It is eliminated first.
+    first = normal.order[0]  # It is eliminated first.
+    assert normal.late(np.array([2, first, 0]), 20).tolist() == [2, 0]
+    assert not len(normal.last_block(normal.late(np.array([first]), 20)))

@@ -13,7 +13,7 @@ from doubtful_drives import LEAN, boxes_of, camera_poses, mapped, reassociated, 
 from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
-from objslam.mapping.doubts import pairs, words
+from objslam.mapping.doubts import words
 from objslam.mapping.doubts.groups import REASONS
 from objslam.mapping.doubts.sizes import mixed_sizes
 from objslam.simulation import pair, preset, simulate
@@ -186,16 +186,6 @@ def test_boxes_of_another_label_on_an_object():
     on = [one for one in result.doubts if one.reason == "on an object"]
     pairs = [one for one in result.doubts if one.kind == "pair"]
     assert len(on) + len(pairs) == len(result.doubts) == 1
-
-
-@pytest.mark.parametrize("number", [2, 9, 400, 1200])
-def test_neighbours_are_the_nearest_objects(number):
-    """Few objects, and many; against all distances."""
-    position = np.random.default_rng(0).normal(size=(number, 3))
-    count = min(9, number)
-    found = np.sort(pairs._nearest(position, count), axis=1)
-    expected = np.argsort(np.linalg.norm(position[:, None] - position, axis=2), axis=1)[:, :count]
-    np.testing.assert_array_equal(found, np.sort(expected, axis=1))
 
 
 def test_an_object_whose_boxes_have_two_sizes():

@@ -53,16 +53,17 @@ class Motions:
         )
 
     def costs(self, k: int, grid: Grid) -> tuple[Cells, Cells, Cells]:
-        """Return the costs of motion `k` by x (Y, X, X), by y (Y, X, X) and by yaw (Y, Y). The last two axes are the states
-        before and after. The drift in x, y and yaw counts as independent."""
-        before, after = grid.shifts[:, None], grid.shifts
+        """Return the costs of motion `k` by x (2 X - 1, Y), by y (2 X - 1, Y) and by yaw (2 Y - 1,). The first axis is the
+        step from the state before to the one after, from the least to the largest. Y is the turn, which is the same before
+        and after the steps in x and y. The drift in x, y and yaw counts as independent."""
+        shifts, turns = (np.arange(1 - len(axis), len(axis)) for axis in (grid.shifts, grid.turns))
         cos, sin, way = np.cos(grid.turns) - 1, np.sin(grid.turns), self.way[k]
         carried = cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]  # A turn about one pivot shifts the next one.
         x, y = (
-            (after - before - carried[axis][:, None, None] + self.error[k, axis]) ** 2 / self.variance[k, axis]
+            ((shifts * grid.shift)[:, None] - carried[axis] + self.error[k, axis]) ** 2 / self.variance[k, axis]
             for axis in (0, 1)
         )
-        yaw = (grid.turns - grid.turns[:, None] + self.error[k, 2]) ** 2 / self.variance[k, 2]
+        yaw = (turns * grid.turn + self.error[k, 2]) ** 2 / self.variance[k, 2]
         return x.astype(np.float32), y.astype(np.float32), yaw.astype(np.float32)
 
 
@@ -76,10 +77,8 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
     for k, seen in enumerate(costs):
         if k:
             x, y, yaw = motions.costs(k - 1, grid)
-            total = (total[:, :, None, :] + x[:, :, :, None]).min(axis=1)
-            total = (total[:, :, :, None] + y[:, None, :, :]).min(axis=2)
-            total = (total[:, None] + yaw[:, :, None, None]).min(axis=0)
-            total = np.minimum(total, _SLIP) + seen
+            total = _least(np.swapaxes(_least(total, x), 1, 2), y)
+            total = np.minimum(_least_turn(np.swapaxes(total, 1, 2), yaw), _SLIP) + seen
         else:
             total = seen
         total = total - total.min()
@@ -91,7 +90,49 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
         if k:
             x, y, yaw = motions.costs(k - 1, grid)
             before = stored[k - 1] * np.float32(_SLIP / _LEVELS)
-            from_there = before + x[:, :, at[1], None] + y[:, None, :, at[2]] + yaw[:, at[0], None, None]
+            turn, east, north = (int(i) for i in at)
+            turning, count = yaw[_steps_to(turn, len(before))], before.shape[1]
+            along_x, along_y = x[_steps_to(east, count)].T, y[_steps_to(north, count)].T
+            from_there = before + along_x[:, :, None] + along_y[:, None, :] + turning[:, None, None]
             slipped = from_there.min() > _SLIP
             at = np.unravel_index(np.argmin(before if slipped else from_there), before.shape)
     return found
+
+
+def _steps_to(state: int, count: int) -> slice:
+    """Return where `Motions.costs` has the steps from each of `count` states, in order, to a state."""
+    return slice(state + count - 1, state - 1 if state else None, -1)
+
+
+def _least(total: Cells, cost: Cells) -> Cells:
+    """Return the least sum (Y, X, n) of a state before and a step along the second axis, to each state.
+
+    The sum counts as at most `_SLIP`, so only the steps that cost less are tried. The odometry drifts by few grid steps
+    between two stretches, so they are few. All sums at once take three times as long.
+
+    Args:
+        total: (Y, X, n) of the states before.
+        cost: (2 X - 1, Y) of the steps.
+    """
+    total = np.ascontiguousarray(total)
+    least, count = np.full_like(total, _SLIP), total.shape[1]
+    for i in np.flatnonzero(cost.min(axis=1) < _SLIP).tolist():
+        before, after = _shifted(i, count)
+        np.minimum(least[:, after], total[:, before] + cost[i, :, None, None], out=least[:, after])
+    return least
+
+
+def _least_turn(total: Cells, cost: Cells) -> Cells:
+    """Return the least sum (Y, X, X) of a state before and a turn, as `_least` does. cost: (2 Y - 1,)."""
+    total = np.ascontiguousarray(total)
+    least, count = np.full_like(total, _SLIP), len(total)
+    for i in np.flatnonzero(cost < _SLIP).tolist():
+        before, after = _shifted(i, count)
+        np.minimum(least[after], total[before] + cost[i], out=least[after])
+    return least
+
+
+def _shifted(index: int, count: int) -> tuple[slice, slice]:
+    """Return the states before and after a step, by its index in `Motions.costs`, that are both on the grid."""
+    step = index - (count - 1)
+    return slice(max(0, -step), count - max(0, step)), slice(max(0, step), count - max(0, -step))

@@ -40,21 +40,25 @@ class NormalEquations:
         found[self.order] = self.factored.solve(right[self.order])
         return found
 
-    def last_block(self, columns: Ints, most: int) -> Floats | None:
-        """Return the block (n, n) of the inverse at some columns (n,), if they are eliminated among the `most` last ones.
+    def late(self, columns: Ints, most: int) -> Ints:
+        """Return those of some columns (n,) that are eliminated among the `most` last ones, for `last_block`."""
+        straight = np.arange(len(self.order))
+        if not all(np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)):
+            return columns[:0]
+        return columns[np.isin(columns, self.order[-most:])] if most else columns[:0]
+
+    def last_block(self, columns: Ints) -> Floats:
+        """Return the block (n, n) of the inverse at some columns (n,), which are `late`.
 
         With J^T J = L U, the last block of the inverse is the inverse of the last block of L times the last block of U.
         Landmarks are eliminated late, because many poses see them. So their covariances come from a small dense matrix,
-        where `solve` would go through all poses for each column. None if a column is eliminated earlier.
+        where `solve` would go through all poses for each column.
         """
+        if not len(columns):
+            return np.zeros((0, 0))
         rank = np.empty_like(self.order)
         rank[self.order] = np.arange(len(self.order))
         first = int(rank[columns].min())
-        straight = np.arange(len(rank))
-        if len(rank) - first > most or not all(
-            np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)
-        ):
-            return None
         last = (self.factored.L[first:, first:] @ self.factored.U[first:, first:]).toarray()
         at = rank[columns] - first
         return np.asarray(np.linalg.inv(last)[np.ix_(at, at)])

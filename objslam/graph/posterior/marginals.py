@@ -232,14 +232,21 @@ class _Inverse:
 
     def blocks(self, groups: Sequence[Sequence[int]]) -> list[Floats]:
         """Return the block (d, d) of the inverse for each group of variables, in the order of their keys."""
-        found: list[Floats] = []
-        waiting: list[Ints] = []
         asked = [self.columns(group) for group in groups]
         every = np.unique(np.concatenate(asked)) if asked else np.zeros(0, dtype=np.int64)
-        dense = self.normal.last_block(every, min(_DENSE, _EACH * len(every))) if len(every) else None
-        if dense is not None:
-            block = (dense + dense.T) / 2 / self.scale[every] / self.scale[every, None]
-            return [block[np.ix_(at, at)] for at in (np.searchsorted(every, one) for one in asked)]
+        late = self.normal.late(every, min(_DENSE, _EACH * len(every)))
+        dense = self.normal.last_block(late)
+        block = (dense + dense.T) / 2 / self.scale[late] / self.scale[late, None]
+        # A landmark that few poses see is eliminated early. It takes columns of its own, but the others still need none.
+        in_block = [bool(np.isin(own, late).all()) for own in asked]
+        alone = iter(self._by_columns([own for own, here in zip(asked, in_block, strict=True) if not here]))
+        places = [np.searchsorted(late, own) for own in asked]
+        return [block[np.ix_(at, at)] if here else next(alone) for at, here in zip(places, in_block, strict=True)]
+
+    def _by_columns(self, asked: Sequence[Ints]) -> list[Floats]:
+        """Return the block (d, d) of the inverse for each group of columns (d,), from whole columns of the inverse."""
+        found: list[Floats] = []
+        waiting: list[Ints] = []
         for i in range(len(asked)):
             waiting.append(asked[i])
             if sum(map(len, waiting)) < _COLUMNS and i + 1 < len(asked):

@@ -10,15 +10,13 @@ import numpy as np
 from objslam.association.duplicates import TOGETHER
 from objslam.association.merging import common_frames
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import nearest_points
 from objslam.core.statistics import SAME_POINT, logistic
 from objslam.mapping.doubts.evidence import Evidence
 
 _NEIGHBOURS = 8
 """The number of nearest objects that each object is compared with. A larger number is slower, and matters in dense places
 only."""
-_FEW = 1000
-"""Up to this number of objects, all distances between them are computed. This takes at most 0.025 s. The import of
-scipy.spatial, for a search tree, takes 0.07 s."""
 _PRIOR = 0.05
 """The prior probability that two neighbours are one object. It is chosen, not measured: association has merged nearly all
 copies. A larger value reports more pairs."""
@@ -75,7 +73,7 @@ def find_pairs(evidence: Evidence) -> Pairs:
     position = state.landmarks.position
     if state.count < 2:
         return _none()
-    found = _nearest(position, min(_NEIGHBOURS + 1, state.count))
+    found = nearest_points(position, min(_NEIGHBOURS + 1, state.count))
     pairs = np.stack([np.repeat(np.arange(state.count), found.shape[1]), found.ravel()], axis=1)
     pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
     a, b = pairs[:, 0], pairs[:, 1]
@@ -97,16 +95,6 @@ def find_pairs(evidence: Evidence) -> Pairs:
     result = Pairs(evidence.object[a], evidence.object[b], gap, np.sqrt(squared), probability, frames, expected)
     order = np.argsort(-probability, kind="stable")
     return result.take(order[probability[order] >= _LEAST])
-
-
-def _nearest(position: Floats, count: int) -> Ints:
-    """Return the `count` nearest positions to each of positions (N, 3), itself included, as indices (N, count)."""
-    if len(position) <= _FEW:
-        squared = sum((position[:, [axis]] - position[:, axis]) ** 2 for axis in range(3))
-        return np.argpartition(squared, count - 1, axis=1)[:, :count]
-    from scipy.spatial import cKDTree
-
-    return np.asarray(cKDTree(position).query(position, k=np.arange(1, count + 1))[1])
 
 
 def _none() -> Pairs:
