@@ -41,7 +41,8 @@ class Evidence:
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
     frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
     journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
-    whether they name one object or several.
+    whether they name one object or several. scale: the standard deviation of the scale of the odometry, as a share, if the
+    log does not tell it, else None.
     """
 
     resolved: int
@@ -60,6 +61,7 @@ class Evidence:
     late: int = 0
     journal: str = ""
     doubted: tuple[str, ...] = ()
+    scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,13 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         late=sum(summary["dropped"].get(reason, 0) for reason in (TOO_SLOW, RARE_POSES)),
         journal=summary["log_path"] or "",
         doubted=tuple(summary["doubted_labels"]),
+        scale=_untold_scale(summary),
     )
+
+
+def _untold_scale(summary: dict[str, Any]) -> float | None:
+    scale = (summary.get("calibration") or {}).get("parameters", {}).get("odometry.scale")
+    return None if scale is None or scale["observable"] else scale["sigma"]
 
 
 def assess(e: Evidence) -> Assessment:
@@ -108,8 +116,21 @@ def assess(e: Evidence) -> Assessment:
     bad, check = _bad(e), _check(e)
     level: Level = "bad" if bad else "check" if check else "good"
     good = f"{_objects(e.resolved)}, whose boxes agree to within the expected noise."
-    frame = "The map lies in the frame of the odometry, which begins where the robot began."
-    return Assessment(level, tuple(bad or check or [good]) + ((frame,) if e.odometry_frame and not bad else ()))
+    about = [] if bad else _frame_and_scale(e)
+    return Assessment(level, (*(bad or check or [good]), *about))
+
+
+def _frame_and_scale(e: Evidence) -> list[str]:
+    """Return what holds for every map by odometry. It is no reason for a lower level."""
+    found = []
+    if e.odometry_frame:
+        found.append("The map lies in the frame of the odometry, which begins where the robot began.")
+    if e.scale is not None:
+        found.append(
+            "The log does not tell the scale of the odometry: all distances may be too long or too short by one factor, "
+            f"with a sigma of {100 * e.scale:.2g} %. Depths tell it, or fiducials of known size."
+        )
+    return found
 
 
 def _bad(e: Evidence) -> list[str]:
