@@ -8,6 +8,7 @@ import json
 import os
 import random
 import resource
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -147,10 +148,12 @@ def taken() -> int:
 
 
 def _ends_well(parse: Callable[[], Any]) -> bool:
-    try:
-        check(parse())
-    except ObjslamError:
-        return False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # A user would see it in the middle of what a command says.
+        try:
+            check(parse())
+        except ObjslamError:
+            return False
     return True
 
 
