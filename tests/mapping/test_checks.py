@@ -514,8 +514,7 @@ def test_clocks_that_contradict_each_other_explain_nothing():
     assert "another drive" in both.message
     assert both.spoils
     assert found(0.44, 0.42, 0.6).message.endswith("the boxes")  # What fits clearly better than both is the cause.
-    assert found(0.44, 0.3, 0.3).message.endswith("the camera ahead, or the poses are of another drive than the boxes")
-    assert found(0.6, 0.3, 0.3).message.endswith("the camera ahead")
+    assert found(0.44, 0.3, 0.3).message.endswith("the camera ahead")
 
 
 @pytest.mark.parametrize("seed", [1, 3, 5])

@@ -41,10 +41,6 @@ _BOTH_WAYS = 0.8
 """Two shifts of a clock contradict each other if one is earlier, one is later, and the worse has at least this share of the
 score of the better. A clock has one error. In simulated logs with a wrong clock, no shift the other way has more than 0.61
 of the best score. A smaller share names fewer clocks."""
-_EXPLAINED = 0.75
-"""A clock that lets a smaller share of the boxes fit may not be the cause. In simulated logs with a wrong clock, 0.78 and
-more fit with the nearest tried clock. A larger share names another cause besides more often."""
-
 _CHANCE = 90.0
 """The percentage of all turned mounts that have at most the score of chance. A larger percentage takes more for chance."""
 _BEYOND, _FAR_BETTER = 1.3, 1.5
@@ -136,8 +132,6 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     best = equal[0]
     assert best.hypothesis is not None
     causes = list(dict.fromkeys(trial.hypothesis.cause for trial in equal if trial.hypothesis is not None))[:3]
-    if best.hypothesis.clock and best.share < _EXPLAINED:
-        causes.append("the poses are of another drive than the boxes")
     fit = f"{100 * best.share:.0f} % of the boxes fit instead of {100 * first.share:.0f} %"
     if _is_crooked(first) and best.straight is not None and best.straight > _STRAIGHT:
         fit += ", and the robot drives where it heads"
