@@ -63,6 +63,12 @@ def is_valid_position(x: float, y: float, z: float) -> bool:
     return -MAX_POSITION < x < MAX_POSITION and -MAX_POSITION < y < MAX_POSITION and -MAX_POSITION < z < MAX_POSITION
 
 
+def lengths(vectors: Floats) -> Floats:
+    """Return the lengths (...) of vectors (..., D) from outside. A length that is too large for a number is inf."""
+    with np.errstate(over="ignore"):
+        return np.asarray(np.linalg.norm(vectors, axis=-1))
+
+
 def valid_pose_rows(rows: Floats) -> Bools:
     """Return which rows (N, 7) of x, y, z, m, and a quaternion qx, qy, qz, qw of any length are poses."""
     turns = np.asarray((np.abs(rows[:, 3:]) < _LONGEST).all(axis=1))

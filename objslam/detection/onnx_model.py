@@ -1,8 +1,15 @@
-"""The network: an ONNX model in an onnxruntime session, with its inputs, outputs and metadata."""
+"""The network: an ONNX model in an onnxruntime session, with its inputs, outputs and metadata.
+
+A file of some kB can describe tensors of any size. The sizes of the image and of the outputs, and the memory of a run are
+therefore limited.
+"""
 
 import hashlib
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +33,17 @@ _MASK, _SIZES = "pixel_mask", "orig_target_sizes"
 _FED = {_MASK: 3, _SIZES: 2}  # The numbers of axes of the inputs that exported DETR models need besides the image.
 _NOT_A_MODEL = "INVALID_PROTOBUF"  # What onnxruntime calls a file of another kind. Its text says no more.
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
+_GIB = 1 << 30  # bytes
+_MOST_MEMORY = 8 * _GIB
+"""The most memory of the computer, bytes, that the models of a process take together. On a computer with less than twice as
+much, they get the half of it. A larger value allows larger models, but a damaged model can then take the memory from all
+other programs. YOLO12n with images of 640 px takes 0.1 GiB."""
+_MOST_PIXELS = 1 << 26
+"""The most pixels of the images of a run, if the model fixes their size and number: an image of 8192x8192. A larger value
+takes more memory before the model runs."""
+_MOST_VALUES = 1 << 28
+"""The most values of an output. A larger value takes more memory: float64 copies of this number take 2 GiB. YOLO with 80
+classes and an image of 8192x8192 has less than half of it."""
 
 
 @dataclass(frozen=True)
@@ -74,15 +92,27 @@ class Network:
         for extra in self.extras:
             feed[extra.name] = _extra(extra, count, height, width)
         try:
-            return [np.asarray(output) for output in self.session.run(None, feed)]
+            outputs = [np.asarray(output) for output in self.session.run(None, feed)]
         except Exception as error:
+            if _is_refused_memory(error):
+                raise DetectorError(
+                    f"on images of {width}x{height}, the model needs more than {_memory() / _GIB:.1f} GiB of memory",
+                    where=str(self.path),
+                    hint="if the model is not damaged, set a smaller detector.size or detector.batch=1",
+                ) from error
             message = f"onnxruntime cannot run the model on images of {width}x{height}: {first_line(error)}"
             raise DetectorError(message, where=str(self.path)) from error
+        for tensor, output in zip(self.outputs, outputs, strict=True):
+            if output.size > _MOST_VALUES:
+                message = f"the output {tensor.name} has {output.size} values, objslam takes at most {_MOST_VALUES}"
+                raise DetectorError(message, where=str(self.path))
+        return outputs
 
 
 def open_network(path: Path, settings: config.Detector) -> Network:
     """Load an ONNX model. The settings give the device and the number of threads. Raises DetectorError if the file is
-    missing, is no ONNX model, or needs other inputs than an image, and ConfigError if cuda is set but missing."""
+    missing, is no ONNX model, or needs other inputs than an image or a too large one, and ConfigError if cuda is set but
+    missing."""
     import onnxruntime
 
     try:
@@ -94,9 +124,12 @@ def open_network(path: Path, settings: config.Detector) -> Network:
     options.intra_op_num_threads = settings.threads
     # Spinning threads would take the cores from the threads that decode the images.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    _limit_memory()
+    options.add_session_config_entry("session.use_env_allocators", "1")
     providers = _providers(onnxruntime, settings.device)
     try:
-        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+        # Without CUDA, the fallback of onnxruntime would only load the same file again, and print that.
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers, enable_fallback=_CUDA in providers)
     except Exception as error:
         why = "" if _NOT_A_MODEL in str(error) else f": {first_line(error)}"
         raise DetectorError(f"not an ONNX model that onnxruntime loads{why}", where=str(path)) from error
@@ -113,6 +146,9 @@ def open_network(path: Path, settings: config.Detector) -> Network:
         saw = "; ".join(map(str, inputs)) or "none"
         hint = f"export the model with one image input of 3 channels, and at most {_MASK} and {_SIZES} besides"
         raise DetectorError(f"the model has inputs that an image does not feed: {saw}", where=str(path), hint=hint)
+    if prod(size or 1 for size in (images[0].batch, images[0].height, images[0].width)) > _MOST_PIXELS:
+        message = f"the model takes larger images than objslam, which takes {_MOST_PIXELS} px in a run: {images[0].tensor}"
+        raise DetectorError(message, where=str(path))
     return Network(path, session, digest, metadata, images[0], extras, tuple(outputs))
 
 
@@ -124,6 +160,30 @@ def _digest(path: Path) -> str:
         with part.open("rb") as file:
             total.update(hashlib.file_digest(file, "sha256").digest())
     return total.hexdigest()
+
+
+def _memory() -> int:
+    """Return the most memory of the computer, bytes, that the models of this process take together."""
+    try:
+        return min(_MOST_MEMORY, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
+    except (AttributeError, OSError, ValueError):  # Not every system says how much memory it has.
+        return _MOST_MEMORY
+
+
+@cache
+def _limit_memory() -> None:
+    """Give onnxruntime the memory that the sessions of this process share. It raises an error where they need more."""
+    from onnxruntime.capi import _pybind_state as ort
+
+    # A size of -1 leaves the other choices to onnxruntime.
+    pool = ort.OrtArenaCfg(_memory(), -1, -1, -1)
+    place = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
+    ort.create_and_register_allocator(place, pool)
+
+
+def _is_refused_memory(error: Exception) -> bool:
+    """Whether onnxruntime ends a run because its pool of memory, or the computer, has too little."""
+    return any(text in str(error) for text in ("is smaller than requested bytes", "Failed to allocate memory", "bad_alloc"))
 
 
 def _providers(onnxruntime: Any, device: config.Device) -> list[str]:

@@ -16,7 +16,7 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import COEFFICIENTS, Camera, DistortionModel, RangeNoise
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
-from objslam.core.validity import MAX_SIDE, camera_fault, valid_positions
+from objslam.core.validity import MAX_SIDE, camera_fault, lengths, valid_positions
 from objslam.errors import LogError
 from objslam.io.text import read_bytes
 
@@ -309,7 +309,7 @@ def _pose(path: Path, node: yaml.Node) -> Floats:
     translation, xyzw = parts
     if not valid_positions(translation):
         raise _error(path, fields["translation"], "translation is too far away", "metres")
-    length = float(np.linalg.norm(xyzw))
+    length = float(lengths(xyzw))
     if not abs(length - 1) < 0.01:
         raise _error(path, fields["rotation_xyzw"], f"rotation_xyzw must have length 1, has {length:g}", "x, y, z, w")
     return pose_from_quaternion(translation[None], xyzw[None])[0]

@@ -1,17 +1,20 @@
 """Read the size of an image from the header of its file, without decoding the image."""
 
+import re
 import struct
 from collections.abc import Callable
 
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # The JPEG markers without a segment.
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # The JPEG markers of frame headers, which contain the size.
 _WIDTH_TAG, _HEIGHT_TAG = 256, 257
+_HEADER = 4096  # The most bytes of a Netpbm header that are read. Comments are the only long part of one.
+_NUMBERS = re.compile(rb"P[1-6Ff](?:\s+|#[^\n]*\n)+([0-9]{1,9})(?:\s+|#[^\n]*\n)+([0-9]{1,9})\s")
 _TIFF_INTEGERS = {1: "B", 3: "H", 4: "I", 6: "b", 8: "h", 9: "i", 16: "Q", 17: "q"}  # `struct` formats by TIFF field type.
 
 
 def stated_size(data: bytes) -> tuple[int, int] | None:
     """Return the width and height, px, that an image file states in its header. Return None for an unknown format.
-    Raises ValueError if the header is damaged or cut off."""
+    Raises ValueError if the header is damaged, or a PNG file is cut off."""
     for magic, read in _READERS.items():
         if data.startswith(magic):
             try:
@@ -24,6 +27,30 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
 def _pair(form: str, data: bytes, at: int) -> tuple[int, int]:
     first, second = struct.unpack_from(form, data, at)
     return first, second
+
+
+def _png(data: bytes) -> tuple[int, int]:
+    """Check the stated lengths of all chunks too. OpenCV takes as much memory before it finds that the file is shorter."""
+    size, at, kind = _pair(">II", data, 16), 8, b""
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data, at)
+        at += 12 + length
+        if at > len(data):
+            raise ValueError("a chunk is longer than the rest of the file")
+    return size
+
+
+def _netpbm(data: bytes) -> tuple[int, int]:
+    found = _NUMBERS.match(data[:_HEADER])
+    if found is None:
+        raise ValueError("no width and height")
+    return int(found[1]), int(found[2])
+
+
+def _pam(data: bytes) -> tuple[int, int]:
+    words = data[: data.index(b"ENDHDR", 0, _HEADER)].split()
+    width, height = (int(words[words.index(key) + 1]) for key in (b"WIDTH", b"HEIGHT"))
+    return width, height
 
 
 def _jpeg(data: bytes) -> tuple[int, int]:
@@ -77,10 +104,12 @@ def _bmp(data: bytes) -> tuple[int, int]:
 
 
 _READERS: dict[bytes, Callable[[bytes], tuple[int, int]]] = {
-    b"\x89PNG\r\n\x1a\n": lambda data: _pair(">II", data, 16),
+    b"\x89PNG\r\n\x1a\n": _png,
     b"\xff\xd8\xff": _jpeg,
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), _tiff),
     b"RIFF": _webp,
     b"GIF8": lambda data: _pair("<HH", data, 6),
     b"BM": _bmp,
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6", b"PF", b"Pf"), _netpbm),
+    b"P7": _pam,
 }

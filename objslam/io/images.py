@@ -1,7 +1,8 @@
-"""Decode compressed images (PNG, JPEG, TIFF, ...) to pixels, except images that would take much memory or time.
+"""Decode image files (PNG, JPEG, TIFF, ...) to pixels, except images that would take much memory or time.
 
-A PNG, JPEG or GIF file of some kB can state a size of gigabytes. A JPEG file can have thousands of scans, each of which
-changes all pixels. The stated size and the number of scans are therefore checked before the image is decoded.
+A file of some bytes can state a size of gigabytes. A JPEG file can have thousands of scans, each of which changes all
+pixels. The stated size and the number of scans are therefore checked before the image is decoded. A format whose header
+`stated_size` cannot read is not decoded.
 """
 
 from typing import Any
@@ -38,7 +39,10 @@ def _decode(data: bytes, flags: int) -> NDArray[Any] | None:
     import cv2
 
     try:
-        width, height = stated_size(data) or (0, 0)
+        size = stated_size(data)
+        if size is None:
+            return None
+        width, height = size
         scans = data.count(_SCAN) if data.startswith(_JPEG) else 1
         if width * height > MAX_PIXELS or width * height * scans > _MAX_SCANNED:
             return None

@@ -16,7 +16,7 @@ from objslam.core.bodies.tag_pose import TagPose, tag_entry
 from objslam.core.maps.shared_covariance import NUMBERS
 from objslam.core.object_map import FATES, Life, MapObject, ObjectMap, SeenFrom
 from objslam.core.types import TruthObject
-from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, valid_positions
+from objslam.core.validity import MAX_POSITION, MAX_STAMP, covariance_fault, lengths, valid_positions
 from objslam.errors import LogError, ObjslamError, OutputError
 
 FORMAT = "objslam.objects/2"  # The value of the key "format", which is the file type and its version.
@@ -209,7 +209,7 @@ def _map_object(entry: dict[str, Any]) -> MapObject:
         if not isinstance(ray, dict):
             raise _Malformed("ray must have an origin and a direction")
         ray = (_vector(ray.get("origin"), "ray.origin"), _vector(ray.get("direction"), "ray.direction"))
-        if not valid_positions(ray[0]) or not abs(float(np.linalg.norm(ray[1])) - 1) < _UNIT:
+        if not valid_positions(ray[0]) or not abs(float(lengths(ray[1])) - 1) < _UNIT:
             raise _Malformed(f"ray must have an origin within {MAX_POSITION:g} m of 0 and a direction of length 1")
     if labels is not None:
         if not isinstance(labels, dict):
@@ -257,7 +257,7 @@ def _seen_from(value: Any) -> SeenFrom:
     if not 0 <= near <= far < MAX_POSITION:
         raise _Malformed("near and far of seen_from must be distances in metres, near not above far")
     sides = np.array([_vector(side, "a side of seen_from") for side in value["sides"]]).reshape(-1, 3)
-    if not (np.abs(np.linalg.norm(sides, axis=1) - 1) < _UNIT).all():
+    if not (np.abs(lengths(sides) - 1) < _UNIT).all():
         raise _Malformed("a side of seen_from must have the length 1")
     return SeenFrom(near, far, sides)
 
@@ -291,7 +291,7 @@ def _covariance(value: Any, name: str, size: int = 3) -> Floats:
 
 def _quaternion(value: Any, name: str) -> Floats:
     xyzw = _vector(value, name, 4)
-    if not abs(float(np.linalg.norm(xyzw)) - 1) < _UNIT:
+    if not abs(float(lengths(xyzw)) - 1) < _UNIT:
         raise _Malformed(f"{name} must have the length 1")
     return xyzw
 

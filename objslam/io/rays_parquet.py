@@ -9,7 +9,7 @@ import numpy as np
 
 from objslam.core.appearance.features import are_unit_vectors
 from objslam.core.arrays import Floats, Floats32, Ints
-from objslam.core.validity import MAX_POSITION, box_rules, valid_depths, valid_positions, valid_stamps
+from objslam.core.validity import MAX_POSITION, box_rules, lengths, valid_depths, valid_positions, valid_stamps
 from objslam.errors import OutputError, first_line
 from objslam.io.atomic_files import encode
 from objslam.io.tables import arrow_table, to_pandas
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _NUMBERS = {"stamp": 1, "origin": 3, "direction": 3, "residual": 1, "weight": 1, "score": 1, "box": 4, "sigma": 1}
 _NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # How many numbers each column has in a row.
-_UNIT = 1e-3  # The most that the squared length of a direction may differ from 1. A larger value accepts worse directions.
+_UNIT = 1e-3  # The most that the length of a direction may differ from 1. A larger value accepts worse directions.
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -144,7 +144,7 @@ def _fault(rays: RaysTable) -> str | None:
     rules = (
         (valid_stamps(rays.stamp), "a wrong stamp"),
         (valid_positions(rays.origin), "a wrong origin"),
-        (np.abs((rays.direction**2).sum(axis=1) - 1) < _UNIT, "a direction whose length is not 1"),
+        (np.abs(lengths(rays.direction) - 1) < _UNIT, "a direction whose length is not 1"),
         (angles[0] & angles[1], "a residual that is not an angle"),
         ((rays.weight >= 0) & (rays.weight <= 1), "a weight outside 0 to 1"),
         (valid_depths(rays.sigma), "a sigma that is not above zero"),

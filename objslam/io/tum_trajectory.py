@@ -11,7 +11,7 @@ import numpy as np
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
 from objslam.core.types import Trajectory
-from objslam.core.validity import valid_pose_rows, valid_positions, valid_stamps
+from objslam.core.validity import lengths, valid_pose_rows, valid_positions, valid_stamps
 from objslam.errors import LogError
 from objslam.io.text import Table, in_order, parse_numbers, read_lines, require_order, select, to_table
 
@@ -56,7 +56,7 @@ def read_pose_table(path: Path, ledger: Ledger) -> Table:
     table = select(table, forward, "pose line with a stamp that repeats or goes back", path, ledger)
     if not len(table.lines):
         raise LogError("no usable pose: every stamp, position or quaternion is invalid", where=str(path))
-    off = np.abs(np.linalg.norm(table.values[:, 4:], axis=1) - 1) > 0.01
+    off = np.abs(lengths(table.values[:, 4:]) - 1) > 0.01
     if off.any():
         first = f"{path}:{table.lines[off][0]}"
         ledger.warn(f"{first}: {int(off.sum())} quaternions are not of length 1: are the columns tx ty tz qx qy qz qw?")

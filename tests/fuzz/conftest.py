@@ -4,6 +4,7 @@ tools/fuzz.sh prints a table at the end: the inputs that each target got, and th
 """
 
 import os
+import resource
 import sys
 from pathlib import Path
 
@@ -13,7 +14,19 @@ sys.path += [str(Path(__file__).parents[1] / part) for part in ("sources/ros", "
 
 from mutations import COUNTED, LEAST, ROUNDS
 
+ROOM = 16 << 30
+"""How much address space a target may ask for, bytes. More is refused, so that no input takes the memory of the computer.
+Libraries reserve some GB that they do not use."""
 TABLE: dict[str, tuple[int, float]] = {}
+
+
+@pytest.fixture(autouse=True)
+def _bounded():
+    """No target gets more than ROOM."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (ROOM if soft == resource.RLIM_INFINITY else min(soft, ROOM), hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 @pytest.hookimpl(wrapper=True)

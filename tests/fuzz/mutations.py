@@ -7,6 +7,8 @@ import hashlib
 import json
 import os
 import random
+import resource
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -26,6 +28,8 @@ SEED = int(os.environ.get("OBJSLAM_FUZZ_SEED", "0"))
 """The first seed of the byte mutations. tools/fuzz.sh counts it up, so that each of its rounds has other inputs."""
 CORPUS = Path(__file__).parent / "corpus"
 """The inputs that once broke a target, in a folder for each. Every run gives them to the target again."""
+MEMORY = 2 << 30
+"""How much one input may raise the most memory of the process, bytes. More means that a parser trusts a size in it."""
 COUNTED = {"inputs": 0}
 """How many inputs the targets got so far."""
 NUMBERS = [b"nan", b"inf", b"-1", b"1e300", b"1e400", b"99999999999999999999", b"0", b"null", b"true", b"[]", b"{}", b'""']
@@ -125,17 +129,31 @@ def survives(parse: Callable[[], Any], target: str = "", data: bytes = b"") -> b
     target, data: an input that breaks the parser is written into the folder `corpus` under the name of the target.
     """
     COUNTED["inputs"] += 1
+    before = taken()
     try:
-        found = parse()
-        check(found)
-    except ObjslamError:
-        return False
+        valid = _ends_well(parse)
+        assert taken() - before < MEMORY, f"{(taken() - before) >> 20} MiB for one input"
     except BaseException:
         if target:
             file = CORPUS / target / hashlib.sha256(data).hexdigest()[:16]
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(data)
         raise
+    return valid
+
+
+def taken() -> int:
+    """The most memory that this process has taken so far, bytes."""
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def _ends_well(parse: Callable[[], Any]) -> bool:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # A user would see it in the middle of what a command says.
+        try:
+            check(parse())
+        except ObjslamError:
+            return False
     return True
 
 

@@ -150,7 +150,7 @@ def test_mutated_journals(tmp_path):
         survives(lambda: read_journal(file, Ledger()))
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".tiff", ".webp", ".bmp"])
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".tiff", ".webp", ".bmp", ".gif", ".ppm", ".pam"])
 def test_mutated_images(ending):
     picture = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
     good = cv2.imencode(ending, picture)[1].tobytes()

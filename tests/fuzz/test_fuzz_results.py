@@ -116,16 +116,21 @@ CELLS = [None, 0.0, -1.0, 1e8, 1e300, float("nan"), float("inf"), "x", b"x", 2**
 @settings(max_examples=examples(12, READERS))
 @given(data=st.data())
 def test_altered_tables(result: Path, name: str, data: st.DataObject) -> None:
-    table = pq.read_table(result / name)
-    column = data.draw(st.sampled_from(table.column_names))
-    at, cell = table.column_names.index(column), data.draw(st.sampled_from(CELLS))
-    kept: list[Any] = table[column].to_pylist()
-    whole = data.draw(st.booleans())
-    values = [cell] * len(kept) if whole else [cell, *kept[1:]]
-    try:
-        made = table.set_column(at, column, pa.array(values))
-    except (pa.ArrowException, TypeError, OverflowError):  # arrow has no column of such cells
-        made = table.remove_column(at)
+    made = pq.read_table(result / name)
+    for _ in range(data.draw(st.integers(1, 3))):
+        made = with_odd_cells(made, data)
     out = with_file(result, name, b"")
     pq.write_table(made, out / name)
     read_everything(out)
+
+
+def with_odd_cells(table: pa.Table, data: st.DataObject) -> pa.Table:
+    """Return the table with one cell replaced by an odd one, or all cells of a column."""
+    at, cell = data.draw(st.integers(0, table.num_columns - 1)), data.draw(st.sampled_from(CELLS))
+    values: list[Any] = table[at].to_pylist()
+    row = data.draw(st.integers(-1, len(values) - 1))
+    values = [cell] * len(values) if row < 0 else [*values[:row], cell, *values[row + 1 :]]
+    try:
+        return table.set_column(at, table.column_names[at], pa.array(values))
+    except (pa.ArrowException, TypeError, OverflowError):  # arrow has no column of such cells
+        return table.remove_column(at) if table.num_columns > 1 else table

@@ -268,3 +268,10 @@ def test_doubtful_calibrations_are_warned_about(tmp_path):
 def test_no_file(tmp_path):
     with pytest.raises(LogError, match="No such file"):
         read_camera(tmp_path / "camera.yaml", Ledger())
+
+
+def test_a_quaternion_of_absurd_length_is_refused_without_a_warning(tmp_path, recwarn):
+    (tmp_path / "camera.yaml").write_text(_TEXT.replace("rotation_xyzw: [-0.5", "rotation_xyzw: [1.0e+300"))
+    with pytest.raises(LogError, match="must have length 1, has inf"):
+        read_camera(tmp_path / "camera.yaml", Ledger())
+    assert not recwarn.list

@@ -22,7 +22,7 @@ from objslam.ros.messages.decode import DecodeError
 from objslam.ros.messages.images import colour_image, depth_image
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".tiff", ".webp", ".bmp"])
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".tiff", ".webp", ".bmp", ".ppm", ".pam"])
 def test_pixels_come_back(ending):
     image = np.full((20, 30, 3), 77, np.uint8)
     data = cv2.imencode(ending, image)[1].tobytes()
@@ -57,7 +57,7 @@ def test_a_colour_image_stays_as_the_sensor_has_it():
     assert np.array_equal(colour_image(message), decode_colour(jpeg))
 
 
-@pytest.mark.parametrize("ending", [".png", ".tiff"])
+@pytest.mark.parametrize("ending", [".png", ".tiff", ".pgm"])
 def test_depth_keeps_its_bits(ending):
     depth = np.arange(600, dtype=np.uint16).reshape(20, 30) * 100
     np.testing.assert_array_equal(decode_depth(cv2.imencode(ending, depth)[1].tobytes()), depth)
@@ -71,7 +71,7 @@ def test_what_is_no_image(data):
     assert decode_depth(data) is None
 
 
-@pytest.mark.parametrize("ending", [".png", ".jpg", ".tiff", ".webp", ".gif", ".bmp"])
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".tiff", ".webp", ".gif", ".bmp", ".ppm", ".pam"])
 def test_the_size_is_read_off_the_header(ending):
     data = cv2.imencode(ending, np.random.default_rng(0).integers(0, 255, (20, 30, 3), np.uint8))[1].tobytes()
     assert stated_size(data) == (30, 20)
@@ -79,7 +79,7 @@ def test_the_size_is_read_off_the_header(ending):
         with suppress(ValueError):
             assert stated_size(data[:length]) in (None, (30, 20))
     with pytest.raises(ValueError, match="damaged or cut off"):
-        stated_size(data[:9])
+        stated_size(data[:8])
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -99,8 +99,14 @@ def test_the_size_of_a_large_tiff(order):
         lambda: image_bombs.png(40_000, 40_000, rows=2000),
         lambda: image_bombs.jpeg(SIDE, SIDE),
         lambda: image_bombs.gif(SIDE, SIDE),
+        lambda: image_bombs.png(5, 5).replace(struct.pack(">I", 13) + b"IHDR", struct.pack(">I", 1 << 30) + b"IHDR"),
+        lambda: b"P6\n# by hand\n%d %d\n255\n" % (SIDE, SIDE) + bytes(100),
+        lambda: b"PF %d %d -1\n" % (SIDE, SIDE) + bytes(100),
+        lambda: b"P7\nWIDTH %d\nHEIGHT %d\nDEPTH 3\nMAXVAL 255\nTUPLTYPE RGB\nENDHDR\n" % (SIDE, SIDE) + bytes(100),
+        lambda: b"Y\xa6j\x95" + struct.pack(">7I", SIDE, SIDE, 24, 3 * SIDE * SIDE, 1, 0, 0),
+        lambda: b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (SIDE, SIDE) + bytes(100),
     ],
-    ids=["png", "png cut off", "jpeg", "gif"],
+    ids=["png", "png cut off", "jpeg", "gif", "png chunk", "ppm", "pfm", "pam", "sun", "hdr"],
 )
 def test_a_small_file_of_absurd_size_is_not_unpacked(bomb, monkeypatch):
     data = bomb()

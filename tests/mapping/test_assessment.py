@@ -9,9 +9,10 @@ import pytest
 from small_log import small_log
 
 import objslam
+from objslam.config import Odometry
 from objslam.frontend.bearings import CUT_OFF
 from objslam.mapping.checks.assessment import Evidence, assess
-from objslam.simulation import PoseNoise
+from objslam.simulation import DepthNoise, PoseNoise
 
 GOOD = Evidence(resolved=12, unresolved=1, boxes=1000, cut=100, rays=900, unexplained=90, rejected=20, misses=1.0)
 QUIET = {"output": {"recording": False, "picture": False}}
@@ -73,6 +74,24 @@ def test_a_map_in_the_frame_of_the_odometry_says_so() -> None:
     found = assess(replace(GOOD, odometry_frame=True))
     assert found.level == "good"
     assert "frame of the odometry" in found.reasons[-1]
+
+
+def test_a_scale_that_the_log_does_not_tell_is_no_flaw_but_said() -> None:
+    found = assess(replace(GOOD, odometry_frame=True, scale=0.03))
+    assert found.level == "good"
+    assert found.reasons[-1].startswith(
+        "The log does not tell the scale of the odometry: all distances may be too long or too"
+    )
+    assert "with a sigma of 3 %." in found.reasons[-1]
+    assert len(assess(replace(GOOD, scale=0.03, spoilt=True)).reasons) == 1
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_boxes_without_depth_do_not_tell_the_scale(depth: bool) -> None:
+    """A map and its path can be stretched together, and no box moves. A depth changes."""
+    log = small_log(localization=None, odometry=Odometry(), depth=DepthNoise() if depth else None)
+    found = objslam.run(log, {**QUIET, "mode": "joint"})
+    assert ("does not tell the scale" in str(found.assessment)) != depth
 
 
 @pytest.mark.parametrize(("sigma", "level"), [(2.0, "good"), (0.8, "check")])

@@ -496,6 +496,34 @@ def test_a_tilted_camera_is_not_taken_for_another_order_of_its_quaternion():
     assert verdict(trials, part, 0.79) is None
 
 
+def test_clocks_that_contradict_each_other_explain_nothing():
+    """Shifted poses of another drive fit by chance, whichever way they are shifted. So may anything else."""
+    part = bounded_part(drive("fixed"), load_settings(None, ("mode=fixed",)))
+    plain = Hypothesis("boxes yxyx", "", "the boxes", lambda log: log)
+
+    def found(earlier, later, other):
+        made = [(None, 0.2, 0.35), (replace(plain, name="-", cause="the camera ahead", clock=-0.5), earlier, earlier + 0.25)]
+        made += [(replace(plain, name="+", cause="the camera behind", clock=0.5), later, later + 0.25), (plain, other, 0.6)]
+        trials = [Trial(what, score, share, None) for what, score, share in made]
+        return verdict([trials[0], *sorted(trials[1:], key=lambda t: -t.score)], part, 0.0)
+
+    both = found(0.44, 0.42, 0.45)
+    assert both.name == "boxes disagree"
+    assert "only 35 % of the boxes" in both.message
+    assert "up to 69 % do" in both.message
+    assert "another drive" in both.message
+    assert both.spoils
+    assert found(0.44, 0.42, 0.6).message.endswith("the boxes")  # What fits clearly better than both is the cause.
+    assert found(0.44, 0.3, 0.3).message.endswith("the camera ahead")
+
+
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_poses_of_another_drive_are_named(seed):
+    (found,) = findings(replace(drive("fixed"), localization=drive("fixed", seed).localization), "fixed")
+    assert found.name == "boxes disagree"
+    assert "whether the poses are of this drive" in found.message
+
+
 def test_what_a_run_corrects_itself_is_no_reason_to_warn():
     """A short lap around the things. Another clock fits a little better, and with it a camera that is 1.7 m aside."""
     truth = simulate(preset("demo", objects=12), 50).truth

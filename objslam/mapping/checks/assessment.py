@@ -49,6 +49,7 @@ class Evidence:
     frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
     journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
     whether they name one object or several. odometry: the largest factor on a noise of the odometry that the log shows.
+    scale: the standard deviation of the scale of the odometry, as a share, if the log does not tell it, else None.
     """
 
     resolved: int
@@ -68,6 +69,7 @@ class Evidence:
     journal: str = ""
     doubted: tuple[str, ...] = ()
     odometry: float = 1.0
+    scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,13 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         journal=summary["log_path"] or "",
         doubted=tuple(summary["doubted_labels"]),
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
+        scale=_untold_scale(summary),
     )
+
+
+def _untold_scale(summary: dict[str, Any]) -> float | None:
+    scale = (summary.get("calibration") or {}).get("parameters", {}).get("odometry.scale")
+    return None if scale is None or scale["observable"] else scale["sigma"]
 
 
 def assess(e: Evidence) -> Assessment:
@@ -117,8 +125,21 @@ def assess(e: Evidence) -> Assessment:
     bad, check = _bad(e), _check(e)
     level: Level = "bad" if bad else "check" if check else "good"
     good = f"{_objects(e.resolved)}, whose boxes agree to within the expected noise."
-    frame = "The map lies in the frame of the odometry, which begins where the robot began."
-    return Assessment(level, tuple(bad or check or [good]) + ((frame,) if e.odometry_frame and not bad else ()))
+    about = [] if bad else _frame_and_scale(e)
+    return Assessment(level, (*(bad or check or [good]), *about))
+
+
+def _frame_and_scale(e: Evidence) -> list[str]:
+    """Return what holds for every map by odometry. It is no reason for a lower level."""
+    found = []
+    if e.odometry_frame:
+        found.append("The map lies in the frame of the odometry, which begins where the robot began.")
+    if e.scale is not None:
+        found.append(
+            "The log does not tell the scale of the odometry: all distances may be too long or too short by one factor, "
+            f"with a sigma of {100 * e.scale:.2g} %. Depths tell it, or fiducials of known size."
+        )
+    return found
 
 
 def _bad(e: Evidence) -> list[str]:

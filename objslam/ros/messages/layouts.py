@@ -9,6 +9,7 @@ from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODO
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
+_CAPITALS = {"d": "D", "k": "K", "r": "R", "p": "P"}  # How ROS 1 writes these fields of a camera.
 _INTEGERS = {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32)}
 _TIMES = {"int32", "uint32"}  # Wider seconds do not fit a count of ns in 64 bits.
 _NUMBERS = {*_INTEGERS, "int64", "uint64", "float32", "float64"}
@@ -61,7 +62,7 @@ def _has(store: Typestore, type_: str, path: str, kind: str) -> bool:
             return False
         name, _, count = part.partition("[")
         fields = dict(store.fielddefs[described[1]][1])
-        described = fields.get(name, fields.get(name.upper()))  # ROS 1 writes D, K, R and P of a camera in capitals.
+        described = fields.get(name, fields.get(_CAPITALS.get(name, "")))
         if described is None:
             return False
         if count:

@@ -247,6 +247,15 @@ def test_types_that_cannot_be_decoded(connection, message):
         make_decoder(connection)
 
 
+def test_fields_have_exactly_the_names_that_are_read(makers):
+    """Only the matrices of a camera have capitals, in ROS 1."""
+    name = "geometry_msgs/msg/PoseStamped"
+    text, _ = makers["1"].store.generate_msgdef(name)
+    assert make_decoder(Connection("/x", name, "ros1", text))
+    with pytest.raises(DecodeError, match=r"no usable field pose.position.x"):
+        make_decoder(Connection("/x", name, "ros1", text.replace("float64 x", "float64 X")))
+
+
 def test_type_names():
     assert type_name("nav_msgs/Odometry") == type_name("nav_msgs/msg/Odometry") == "nav_msgs/msg/Odometry"
     assert type_name("foxglove.Log") == "foxglove.Log"

@@ -39,7 +39,8 @@ def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | Non
         return None
     message = (
         f"only {100 * found.share:.0f} % of the boxes agree with the poses, hardly more than with a camera that is turned "
-        "at random, and no usual mistake explains that: look at base_T_camera, at the frame of the poses, and at the stamps"
+        "at random, and no usual mistake explains that: look at base_T_camera, at the frame of the poses and at the "
+        "stamps, and ask whether the poses are of this drive"
     )
     if unset(part.log):
         message += ". base_T_camera has no rotation, so the camera looks where z of the poses points"

@@ -133,6 +133,7 @@ def _clocks() -> Iterator[Hypothesis]:
             f"the stamps of the frames {abs(offset):g} s {sign}",
             f"the clock of the camera is about {abs(offset):g} s {'behind' if offset > 0 else 'ahead of'} that of the poses",
             partial(later, offset=offset),
+            clock=offset,
         )
 
 

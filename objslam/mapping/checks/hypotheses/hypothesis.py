@@ -10,7 +10,8 @@ from objslam.core.types import CameraLog, Log
 class Hypothesis:
     """A possible fault of the input. name: short and fixed. what: a description of the corrected log. cause: the probable
     mistake. put_right: returns the corrected log. of_mount: whether it is about how a camera is turned on the robot. usual:
-    whether people often make this mistake. Of two hypotheses that explain a log equally, the usual one is named."""
+    whether people often make this mistake. Of two hypotheses that explain a log equally, the usual one is named. clock: the
+    time (s) by which it makes the stamps of the frames later, 0 if it is not about a clock."""
 
     name: str
     what: str
@@ -18,6 +19,7 @@ class Hypothesis:
     put_right: Callable[[Log], Log]
     of_mount: bool = False
     usual: bool = True
+    clock: float = 0.0
 
 
 def with_cameras(log: Log, change: Callable[[CameraLog], CameraLog]) -> Log:

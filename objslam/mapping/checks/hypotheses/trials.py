@@ -37,6 +37,10 @@ _RIVAL = 0.02
 """A mount explains the boxes as well as an unusual error if its score is at most this much smaller. Two fits of one log with
 different random pairs differ by as much. A larger value names more mounts."""
 
+_BOTH_WAYS = 0.8
+"""Two shifts of a clock contradict each other if one is earlier, one is later, and the worse has at least this share of the
+score of the better. A clock has one error. In simulated logs with a wrong clock, no shift the other way has more than 0.61
+of the best score. A smaller share names fewer clocks."""
 _CHANCE = 90.0
 """The percentage of all turned mounts that have at most the score of chance. A larger percentage takes more for chance."""
 _BEYOND, _FAR_BETTER = 1.3, 1.5
@@ -117,6 +121,12 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     good = good or [trial for trial in rest if taken and rivals(trial)]
     if not good:
         return None
+    clocks = _both_ways(good)
+    if clocks:
+        # What fits hardly better than two contradictory clocks fits by chance, as they do.
+        good = [trial for trial in good if trial not in clocks and _EQUAL * trial.score > clocks[0].score]
+    if not good:
+        return _of_another_drive(first, clocks[0])
     equal = [trial for trial in good if trial.score >= _EQUAL * good[0].score]
     equal = [trial for trial in equal if trial.hypothesis is not None and trial.hypothesis.usual] or equal
     best = equal[0]
@@ -129,6 +139,27 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     if taken:
         message += f". The run takes it for {unusual}, and corrects that"
     return Finding(best.hypothesis.name, message, spoils=not taken, basis="log" if _is_crooked(first) else "boxes")
+
+
+def _both_ways(good: Sequence[Trial]) -> list[Trial]:
+    """Return the trials with another clock if earlier and later frames fit about equally, the best first. Else none."""
+    clocks = [trial for trial in good if _shift(trial)]
+    earlier, later = (max((t.score for t in clocks if sign * _shift(t) > 0), default=0.0) for sign in (-1, 1))
+    return clocks if clocks and min(earlier, later) >= _BOTH_WAYS * max(earlier, later) else []
+
+
+def _shift(trial: Trial) -> float:
+    return 0.0 if trial.hypothesis is None else trial.hypothesis.clock
+
+
+def _of_another_drive(first: Trial, best: Trial) -> Finding:
+    """Return the finding of a log whose boxes fit better at other times. best: the best trial with another clock."""
+    message = (
+        f"only {100 * first.share:.0f} % of the boxes agree with the poses. With earlier stamps of the frames, and as well "
+        f"with later ones, up to {100 * best.share:.0f} % do, so no error of the clock explains it: the poses may be of "
+        "another drive than the boxes"
+    )
+    return Finding("boxes disagree", message, basis="boxes")
 
 
 def chance(trials: Sequence[Trial]) -> float | None:
