@@ -1,0 +1,306 @@
+"""Estimate the noise of a localisation, and how long its errors last, from the rest of the log.
+
+Odometry and rays predict the path, up to a shift and a turn of the whole. The localisation differs from this prediction by
+the error of the prediction, whose covariance the graph knows, and by its own error. The size of its own error, the share of
+it that lasts, and for how long, are those of the largest restricted likelihood (Patterson and Thompson 1971).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import CalibratedMeasurements
+from objslam.core.geometry import adjoint, inverse
+from objslam.core.noise import MOST_NOISE, MOST_PLACE_NOISE, NoiseFactors
+from objslam.core.statistics import SAME_POINT_WIDE, WHITE, Lasting
+from objslam.core.types import Keyframes
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.shared_error_jacobian import linearise
+
+_LOOSE = 1e4
+"""The factor on the noise of the localisation in the graph that predicts it. With a larger factor, the prediction contains
+less of the localisation, and more rounding errors."""
+_FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
+"""A long log is seen at 18 times that are spread evenly, and at these numbers of keyframes after each. Near poses show
+errors that are new in each pose, far ones errors that last. More poses are more exact, and the time grows with their
+cube."""
+_TIMES = tuple(2.0**k for k in range(8))
+"""The tried times (s) for which errors last. A shorter one hardly differs from new errors in each pose, and a longer one
+from a shift of the whole map. More times are finer and slower."""
+_SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
+"""The tried shares of an error that last. More shares are finer and slower."""
+_STEPS = (0.8, 0.4, 0.2, 0.1)
+"""The steps of the search for factors on noise, as logarithms. A smaller last step is more exact and slower."""
+_AROUND = (-0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8)
+"""The factors around the most likely one over which a lasting error is averaged, as logarithms. The posterior of a variance
+from few samples falls more slowly to larger values."""
+_PREDICTED = (np.log(0.3), np.log(MOST_NOISE))
+"""The bounds of the logarithm of the factor on the error of the prediction, whose noise may be unknown too."""
+_CHANCE = 1e-3
+"""The chance of a false alarm: that a localisation which is as good as the settings say is found worse. With a larger value,
+shorter logs can show its noise, and more good logs seem to have such noise."""
+_SIGNIFICANT = -2 * np.log(_CHANCE)
+"""Noise beyond the settings, or a lasting part, counts if it lowers -2 ln of the likelihood by at least this value: the
+quantile of chi-squared, with 2 degrees of freedom, that is exceeded with the probability `_CHANCE`."""
+_MOST_STRAYS = 0.1
+"""At most this share of the poses are jumps. A larger share explains noise by jumps."""
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """The error of headings, or of places. factor: the logarithm of the factor on its noise. share, time: the places of its
+    lasting part in `_SHARES` and `_TIMES`."""
+
+    factor: float = 0.0
+    share: int = 0
+    time: int = 3
+
+    @property
+    def lasting(self) -> Lasting:
+        """The lasting part."""
+        return Lasting(_SHARES[self.share], _TIMES[self.time]) if self.share else WHITE
+
+
+@dataclass(frozen=True)
+class _Model:
+    """A hypothesis: the errors of headings and places, and the logarithm of the factor on the error of the prediction."""
+
+    heading: _Kind = _Kind()
+    place: _Kind = _Kind()
+    predicted: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Data:
+    """n poses of the localisation against their prediction.
+
+    off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction. times:
+    (n,) s. apart: s, the time between two poses that were measured independently, 0 if all were. nominal: of headings, rad,
+    and places, m. free: whether the size of the noise is unknown. prior: the weight of the noise of the prediction, as a
+    number of residuals.
+    """
+
+    off: Floats
+    covariance: Floats
+    times: Floats
+    apart: float
+    nominal: tuple[float, float]
+    free: bool
+    prior: float
+
+    def take(self, poses: Ints) -> "_Data":
+        """Return the data of some poses."""
+        n = len(self.times)
+        at = np.concatenate([poses, n + poses, 2 * n + poses])
+        return replace(self, off=self.off[at], covariance=self.covariance[np.ix_(at, at)], times=self.times[poses])
+
+    def expected(self, model: _Model) -> Floats:
+        """Return the covariance (3 n, 3 n) of `off`."""
+        n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance
+        gap = np.abs(self.times[:, None] - self.times)
+        white = np.maximum(1 - gap / self.apart, 0.0) if self.apart else np.eye(n)
+        for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
+            variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
+            own = variance * (1 - lasting.share) * white
+            if lasting.share:
+                own = own + variance * lasting.share * np.exp(-gap / lasting.seconds)
+            for part in (0,) if first == 0 else (1, 2):
+                found[part * n : (part + 1) * n, part * n : (part + 1) * n] += own
+        return found
+
+    def cost(self, model: _Model) -> float:
+        """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction."""
+        root, failed = dpotrf(self.expected(model), lower=1, clean=0, overwrite_a=1)
+        if failed:
+            return np.inf
+        white, _ = dtrtrs(root, self.off, lower=1)
+        prior = self.prior * (2 * model.predicted + np.exp(-2 * model.predicted))
+        return float(white @ white + 2 * np.log(np.diagonal(root)).sum() + prior)
+
+
+def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
+    """Return `errors.noise` with the noise of the localisation that agrees best with the rest of a graph at its values.
+
+    Factors are at least 1, and 1 unless the log refutes the settings. theta: (P,) the shared errors. SolveError if the graph
+    without its localisation is singular.
+    """
+    data = _compared(of, errors, theta)
+    found = _most_likely(data)
+    near = _without_jumps(data, found)
+    if len(near) < len(data.times):
+        data = data.take(near)
+        found = _most_likely(data)
+    (heading, turned), (place, shifted) = (_averaged(data, found, name) for name in ("heading", "place"))
+    return replace(
+        errors.noise,
+        heading=heading,
+        heading_share=turned.share,
+        heading_seconds=turned.seconds,
+        place=place,
+        place_share=shifted.share,
+        place_seconds=shifted.seconds,
+    )
+
+
+def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Data:
+    """Return the localisation against a prediction by all other measurements."""
+    measured = replace(of.measured, keyframes=_white(of.measured.keyframes), settings=_without_places(of.measured.settings))
+    loose = replace(of, measured=measured, known=None)
+    system, keyframes, nominal = linearise(loose, errors, theta), measured.keyframes, errors.settings.localization
+    poses = _poses(len(keyframes))
+    map_T_base = (of.map_T_camera @ inverse(keyframes.base_T_camera))[poses]
+    apart = inverse(keyframes.map_T_base[poses]) @ map_T_base
+    place = map_T_base[:, :2, 3] - keyframes.map_T_base[poses, :2, 3]
+    off = np.concatenate([np.arctan2(apart[:, 1, 0], apart[:, 0, 0]), place.T.ravel()])
+    by_twist = adjoint(keyframes.base_T_camera[poses])
+    by_twist = np.concatenate([by_twist[:, 2:3], map_T_base[:, :2, :3] @ by_twist[:, 3:]], axis=1)  # (n, 3, 6)
+    columns = 3 * len(of.landmarks) + 6 * poses[:, None] + np.arange(6)
+    select = np.zeros((system.jacobian.shape[1], 3 * len(poses)))
+    for part in range(3):
+        for axis in range(6):
+            select[columns[:, axis], part * len(poses) + np.arange(len(poses))] = by_twist[:, part, axis]
+    solved = system.normal.solve(select)
+    off = off - solved.T @ (system.jacobian.T @ system.residual)
+    covariance = select.T @ solved
+    if len(theta):
+        left = system.left(system.sides)
+        told = np.linalg.inv(left.T @ left + np.linalg.inv(errors.prior))
+        by_error = solved.T @ (system.jacobian.T @ system.sides)
+        covariance = covariance + by_error @ told @ by_error.T
+    stamps, every = keyframes.stamps, keyframes.localized_every
+    usual = errors.settings.model_copy(update={"localization": type(nominal)()}).localization
+    use = errors.settings.noise.localization
+    return _Data(
+        off=off,
+        covariance=(covariance + covariance.T) / 2,
+        times=stamps[poses],
+        apart=every * float(np.median(np.diff(stamps))) if every > 1 else 0.0,
+        nominal=(nominal.yaw, nominal.xy),
+        free=nominal == usual if use == "auto" else use,
+        prior=errors.settings.noise.prior,
+    )
+
+
+def _white(keyframes: Keyframes) -> Keyframes:
+    return replace(keyframes, pose_noise=(1.0, 1.0), lasting=(WHITE, WHITE))
+
+
+def _without_places(settings: Settings) -> Settings:
+    """Return settings in which the localisation hardly tells anything."""
+    of = settings.localization
+    return settings.model_copy(update={"localization": of.model_copy(update={"xy": of.xy * _LOOSE, "yaw": of.yaw * _LOOSE})})
+
+
+def _poses(count: int) -> Ints:
+    """Return the indices of the compared poses of `count`, in increasing order."""
+    if count <= _FIRST * len(_LAGS):
+        return np.arange(count)
+    begin = np.linspace(0, count - 1 - max(_LAGS), _FIRST).astype(np.int64)
+    return np.unique(begin[:, None] + np.array(_LAGS))
+
+
+def _without_jumps(data: _Data, model: _Model) -> Ints:
+    """Return the poses (m,) that agree with what all other poses predict, or all of them if too many do not."""
+    inner = np.linalg.inv(data.expected(model))
+    n = len(data.times)
+    at = np.arange(n)[:, None] + n * np.arange(3)
+    blocks, pull = inner[at[:, :, None], at[:, None, :]], (inner @ data.off)[at]
+    size = (pull * np.linalg.solve(blocks, pull[..., None])[..., 0]).sum(axis=1)
+    near = np.flatnonzero(size < SAME_POINT_WIDE)
+    return near if len(near) >= (1 - _MOST_STRAYS) * n else np.arange(n)
+
+
+def _most_likely(data: _Data) -> _Model:
+    """Return the simplest model that the data do not refute."""
+    usual, cost_usual = _searched(data, _Model(), ())
+    white = _searched(data, usual, ("heading", "place")) if data.free else (usual, cost_usual)
+    found, cost = white
+    for name in ("place", "heading"):
+        found, cost = min(((found, cost), _begun(data, found, name)), key=lambda one: one[1])
+    if cost > cost_usual - _SIGNIFICANT:
+        return usual
+    found, cost = _searched(data, found, ("heading", "place"), lasting=True)
+    for name in ("heading", "place"):  # Leave out what the data do not need.
+        kind = getattr(found, name)
+        for simpler in (_Kind(), replace(kind, share=0)):
+            if simpler == kind:
+                break
+            others = tuple(other for other in ("heading", "place") if other != name or simpler.factor)
+            less, cost_less = _searched(data, _with(found, name, simpler), others)
+            if cost_less < cost + _SIGNIFICANT:
+                found, cost = less, cost_less
+                break
+    return found
+
+
+def _averaged(data: _Data, model: _Model, name: str) -> tuple[float, Lasting]:
+    """Return the factor on an error, and its lasting part, averaged over their posterior if the error lasts.
+
+    A log contains few independent samples of an error that lasts. The variance, and the variance of the mean of many poses,
+    which is the variance times the time, are averaged. The most likely values would promise too much.
+    """
+    kind = getattr(model, name)
+    if not kind.share:
+        return float(np.exp(kind.factor)), WHITE
+    factors = np.maximum(kind.factor + (np.array(_AROUND) if data.free else np.zeros(1)), 0.0)
+    tried = [
+        [data.cost(_with(model, name, replace(kind, factor=f, time=t))) for t in range(len(_TIMES))]
+        for f in factors.tolist()
+    ]
+    weight = np.exp(-(np.array(tried) - np.min(tried)) / 2)
+    weight /= weight.sum()
+    variance = weight * np.exp(2 * factors)[:, None]
+    seconds = float((variance * _TIMES).sum() / variance.sum())
+    return float(np.sqrt(variance.sum())), Lasting(_SHARES[kind.share], seconds)
+
+
+def _with(model: _Model, name: str, kind: _Kind) -> _Model:
+    """Return a model with another error of this name."""
+    return replace(model, heading=kind) if name == "heading" else replace(model, place=kind)
+
+
+def _begun(data: _Data, model: _Model, name: str) -> tuple[_Model, float]:
+    """Return the best of a few models in which the error of this name lasts, and its cost."""
+    kind, best, least = getattr(model, name), model, np.inf
+    for share in (3, 6):
+        for time in (1, 3, 5, 7):
+            tried = _with(model, name, replace(kind, share=share, time=time))
+            if (cost := data.cost(tried)) < least:
+                best, least = tried, cost
+    return best, least
+
+
+def _searched(data: _Data, start: _Model, free: tuple[str, ...], *, lasting: bool = False) -> tuple[_Model, float]:
+    """Return the model of the least cost, and this cost, by steps along the axes, then smaller ones.
+
+    free: the errors whose size changes. lasting: whether their lasting parts change too."""
+    best, cost = start, data.cost(start)
+    for step in _STEPS:
+        moved = True
+        while moved:
+            moved = False
+            for other in _moves(best, free if data.free else (), ("heading", "place") if lasting else (), step):
+                if (tried := data.cost(other)) < cost - 1e-6:
+                    best, cost, moved = other, tried, True
+    return best, cost
+
+
+def _moves(model: _Model, sized: tuple[str, ...], lasting: tuple[str, ...], step: float) -> list[_Model]:
+    """Return the neighbours of a model. sized, lasting: the errors whose size, and whose lasting part, change."""
+    found = []
+    for sign in (1, -1):
+        found.append(replace(model, predicted=float(np.clip(model.predicted + sign * step, *_PREDICTED))))
+        for name in sized:
+            most = np.log(MOST_NOISE if name == "heading" else MOST_PLACE_NOISE)
+            kind = getattr(model, name)
+            factor = float(np.clip(kind.factor + sign * step, 0.0, most))
+            found.append(_with(model, name, replace(kind, factor=factor)))
+        for name in lasting:
+            kind = getattr(model, name)
+            share = int(np.clip(kind.share + sign, 0, len(_SHARES) - 1))
+            time = int(np.clip(kind.time + sign, 0, len(_TIMES) - 1))
+            found += [_with(model, name, other) for other in (replace(kind, share=share), replace(kind, time=time))]
+    return [one for one in found if one != model]
