@@ -30,10 +30,14 @@ cube."""
 _TIMES = tuple(2.0**k for k in range(8))
 """The tried times (s) for which errors last. A shorter one hardly differs from new errors in each pose, and a longer one
 from a shift of the whole map. More times are finer and slower."""
+_FINE = np.geomspace(_TIMES[0], _TIMES[-1], 200)
+"""Times (s) between which a mean of several of `_TIMES` is interpolated. More are finer."""
 _SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
 """The tried shares of an error that last. More shares are finer and slower."""
 _STEPS = (0.8, 0.4, 0.2, 0.1)
 """The steps of the search for factors on noise, as logarithms. A smaller last step is more exact and slower."""
+_BOTH = ("heading", "place")
+"""The errors of a pose."""
 _AROUND = (-0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8)
 """The factors around the most likely one over which a lasting error is averaged, as logarithms. The posterior of a variance
 from few samples falls more slowly to larger values."""
@@ -133,7 +137,7 @@ def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta:
     if len(near) < len(data.times):
         data = data.take(near)
         found = _most_likely(data)
-    (heading, turned), (place, shifted) = (_averaged(data, found, name) for name in ("heading", "place"))
+    (heading, turned), (place, shifted) = _averaged(data, found)
     return replace(
         errors.noise,
         heading=heading,
@@ -214,47 +218,53 @@ def _without_jumps(data: _Data, model: _Model) -> Ints:
 
 
 def _most_likely(data: _Data) -> _Model:
-    """Return the simplest model that the data do not refute."""
-    usual, cost_usual = _searched(data, _Model(), ())
-    white = _searched(data, usual, ("heading", "place")) if data.free else (usual, cost_usual)
-    found, cost = white
-    for name in ("place", "heading"):
-        found, cost = min(((found, cost), _begun(data, found, name)), key=lambda one: one[1])
-    if cost > cost_usual - _SIGNIFICANT:
-        return usual
-    found, cost = _searched(data, found, ("heading", "place"), lasting=True)
-    for name in ("heading", "place"):  # Leave out what the data do not need.
-        kind = getattr(found, name)
-        for simpler in (_Kind(), replace(kind, share=0)):
-            if simpler == kind:
-                break
-            others = tuple(other for other in ("heading", "place") if other != name or simpler.factor)
-            less, cost_less = _searched(data, _with(found, name, simpler), others)
-            if cost_less < cost + _SIGNIFICANT:
-                found, cost = less, cost_less
-                break
-    return found
+    """Return the simplest model that the data do not refute: the noise in the settings, more of it, the same part of both
+    errors that lasts, or a part of each.
 
-
-def _averaged(data: _Data, model: _Model, name: str) -> tuple[float, Lasting]:
-    """Return the factor on an error, and its lasting part, averaged over their posterior if the error lasts.
-
-    A log contains few independent samples of an error that lasts. The variance, and the variance of the mean of many poses,
-    which is the variance times the time, are averaged. The most likely values would promise too much.
+    If places err for seconds, headings probably do too, because both come from one filter. A short log may not show it.
     """
-    kind = getattr(model, name)
-    if not kind.share:
-        return float(np.exp(kind.factor)), WHITE
-    factors = np.maximum(kind.factor + (np.array(_AROUND) if data.free else np.zeros(1)), 0.0)
-    tried = [
-        [data.cost(_with(model, name, replace(kind, factor=f, time=t))) for t in range(len(_TIMES))]
-        for f in factors.tolist()
-    ]
-    weight = np.exp(-(np.array(tried) - np.min(tried)) / 2)
-    weight /= weight.sum()
-    variance = weight * np.exp(2 * factors)[:, None]
-    seconds = float((variance * _TIMES).sum() / variance.sum())
-    return float(np.sqrt(variance.sum())), Lasting(_SHARES[kind.share], seconds)
+    usual, cost_usual = _searched(data, _Model(), False, ())
+    best, least = _searched(data, usual, True, ())
+    lasting, cost = _searched(data, _begun(data, best), True, (_BOTH,))
+    apart, cost_apart = _searched(data, lasting, True, tuple((one,) for one in _BOTH))
+    if cost_apart < cost - _SIGNIFICANT:
+        lasting, cost = apart, cost_apart
+    if cost < least - _SIGNIFICANT:
+        best, least = lasting, cost
+    return best if least < cost_usual - _SIGNIFICANT else usual
+
+
+def _averaged(data: _Data, model: _Model) -> tuple[tuple[float, Lasting], tuple[float, Lasting]]:
+    """Return the noise and the lasting parts of headings and places, averaged over their posterior if they last.
+
+    A log contains few independent samples of an error that lasts. The most likely values would promise too much. So the
+    variance of the error, and that of its mean over the log, are averaged. The time is the one that gives this mean.
+    """
+    duration = float(np.ptp(data.times))
+    found = dict[str, tuple[float, Lasting]]()
+    for name in _BOTH:
+        kind = getattr(model, name)
+        if not kind.share:
+            found[name] = float(np.exp(kind.factor)), WHITE
+            continue
+        factors = np.maximum(kind.factor + (np.array(_AROUND) if data.free else np.zeros(1)), 0.0)
+        tried = [
+            [data.cost(_with(model, name, replace(kind, factor=f, time=t))) for t in range(len(_TIMES))]
+            for f in factors.tolist()
+        ]
+        weight = np.exp(-(np.array(tried) - np.min(tried)) / 2)
+        weight /= weight.sum()
+        variance = weight * np.exp(2 * factors)[:, None]
+        of_mean = float((variance * _variance_of_mean(np.array(_TIMES), duration)).sum() / variance.sum())
+        seconds = float(np.interp(of_mean, _variance_of_mean(_FINE, duration), _FINE))
+        found[name] = float(np.sqrt(variance.sum())), Lasting(_SHARES[kind.share], seconds)
+    return found["heading"], found["place"]
+
+
+def _variance_of_mean(seconds: Floats, duration: float) -> Floats:
+    """Return the variances of the mean over `duration`, s, of errors of variance 1 that last for `seconds` (n,), s."""
+    share = seconds / max(duration, 1e-9)
+    return np.asarray(2 * share * (1 - share * (1 - np.exp(-1 / share))))
 
 
 def _with(model: _Model, name: str, kind: _Kind) -> _Model:
@@ -262,45 +272,47 @@ def _with(model: _Model, name: str, kind: _Kind) -> _Model:
     return replace(model, heading=kind) if name == "heading" else replace(model, place=kind)
 
 
-def _begun(data: _Data, model: _Model, name: str) -> tuple[_Model, float]:
-    """Return the best of a few models in which the error of this name lasts, and its cost."""
-    kind, best, least = getattr(model, name), model, np.inf
-    for share in (3, 6):
-        for time in (1, 3, 5, 7):
-            tried = _with(model, name, replace(kind, share=share, time=time))
-            if (cost := data.cost(tried)) < least:
-                best, least = tried, cost
-    return best, least
+def _with_lasting(model: _Model, names: tuple[str, ...], share: int, time: int) -> _Model:
+    """Return a model in which the errors of these names have this lasting part."""
+    for name in names:
+        model = _with(model, name, replace(getattr(model, name), share=share, time=time))
+    return model
 
 
-def _searched(data: _Data, start: _Model, free: tuple[str, ...], *, lasting: bool = False) -> tuple[_Model, float]:
+def _begun(data: _Data, model: _Model) -> _Model:
+    """Return the best of a few models in which both errors last."""
+    tried = [_with_lasting(model, _BOTH, share, time) for share in (3, 6) for time in (1, 3, 5, 7)]
+    return min(tried, key=data.cost)
+
+
+def _searched(data: _Data, start: _Model, sized: bool, lasting: tuple[tuple[str, ...], ...]) -> tuple[_Model, float]:
     """Return the model of the least cost, and this cost, by steps along the axes, then smaller ones.
 
-    free: the errors whose size changes. lasting: whether their lasting parts change too."""
+    sized: whether the sizes of errors change. lasting: groups of errors whose lasting part changes. A group has one part."""
     best, cost = start, data.cost(start)
     for step in _STEPS:
         moved = True
         while moved:
             moved = False
-            for other in _moves(best, free if data.free else (), ("heading", "place") if lasting else (), step):
+            for other in _moves(best, sized and data.free, lasting, step):
                 if (tried := data.cost(other)) < cost - 1e-6:
                     best, cost, moved = other, tried, True
     return best, cost
 
 
-def _moves(model: _Model, sized: tuple[str, ...], lasting: tuple[str, ...], step: float) -> list[_Model]:
-    """Return the neighbours of a model. sized, lasting: the errors whose size, and whose lasting part, change."""
+def _moves(model: _Model, sized: bool, lasting: tuple[tuple[str, ...], ...], step: float) -> list[_Model]:
+    """Return the neighbours of a model. sized, lasting: as in `_searched`."""
     found = []
     for sign in (1, -1):
         found.append(replace(model, predicted=float(np.clip(model.predicted + sign * step, *_PREDICTED))))
-        for name in sized:
+        for name in _BOTH if sized else ():
             most = np.log(MOST_NOISE if name == "heading" else MOST_PLACE_NOISE)
             kind = getattr(model, name)
-            factor = float(np.clip(kind.factor + sign * step, 0.0, most))
-            found.append(_with(model, name, replace(kind, factor=factor)))
-        for name in lasting:
-            kind = getattr(model, name)
+            found.append(_with(model, name, replace(kind, factor=float(np.clip(kind.factor + sign * step, 0.0, most)))))
+        for names in lasting:
+            kind = getattr(model, names[0])
             share = int(np.clip(kind.share + sign, 0, len(_SHARES) - 1))
             time = int(np.clip(kind.time + sign, 0, len(_TIMES) - 1))
-            found += [_with(model, name, other) for other in (replace(kind, share=share), replace(kind, time=time))]
+            found.append(_with_lasting(model, names, share, kind.time))
+            found.append(_with_lasting(model, names, kind.share, time))
     return [one for one in found if one != model]
