@@ -6,6 +6,7 @@ it that lasts, and for how long, are those of the largest restricted likelihood 
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
@@ -34,7 +35,7 @@ _FINE = np.geomspace(_TIMES[0], _TIMES[-1], 200)
 """Times (s) between which a mean of several of `_TIMES` is interpolated. More are finer."""
 _SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
 """The tried shares of an error that last. More shares are finer and slower."""
-_STEPS = (0.8, 0.4, 0.2, 0.1)
+_STEPS = (0.8, 0.3, 0.1)
 """The steps of the search for factors on noise, as logarithms. A smaller last step is more exact and slower."""
 _BOTH = ("heading", "place")
 """The errors of a pose."""
@@ -101,16 +102,29 @@ class _Data:
         at = np.concatenate([poses, n + poses, 2 * n + poses])
         return replace(self, off=self.off[at], covariance=self.covariance[np.ix_(at, at)], times=self.times[poses])
 
+    @cached_property
+    def gaps(self) -> Floats:
+        """(n, n) s, the times between poses."""
+        return np.abs(self.times[:, None] - self.times)
+
+    @cached_property
+    def white(self) -> Floats:
+        """(n, n) the correlation of errors that are new in each measured pose."""
+        return np.maximum(1 - self.gaps / self.apart, 0.0) if self.apart else np.eye(len(self.times))
+
+    @cached_property
+    def alike(self) -> Floats:
+        """(m, n, n) the correlations of errors that last for each of `_TIMES`."""
+        return np.exp(-self.gaps / np.array(_TIMES)[:, None, None])
+
     def expected(self, model: _Model) -> Floats:
         """Return the covariance (3 n, 3 n) of `off`."""
         n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance
-        gap = np.abs(self.times[:, None] - self.times)
-        white = np.maximum(1 - gap / self.apart, 0.0) if self.apart else np.eye(n)
         for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
             variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
-            own = variance * (1 - lasting.share) * white
+            own = variance * (1 - lasting.share) * self.white
             if lasting.share:
-                own = own + variance * lasting.share * np.exp(-gap / lasting.seconds)
+                own = own + variance * lasting.share * self.alike[kind.time]
             for part in (0,) if first == 0 else (1, 2):
                 found[part * n : (part + 1) * n, part * n : (part + 1) * n] += own
         return found
@@ -226,11 +240,11 @@ def _most_likely(data: _Data) -> _Model:
     usual, cost_usual = _searched(data, _Model(), False, ())
     best, least = _searched(data, usual, True, ())
     lasting, cost = _searched(data, _begun(data, best), True, (_BOTH,))
-    apart, cost_apart = _searched(data, lasting, True, tuple((one,) for one in _BOTH))
-    if cost_apart < cost - _SIGNIFICANT:
-        lasting, cost = apart, cost_apart
     if cost < least - _SIGNIFICANT:
         best, least = lasting, cost
+        apart, cost = _searched(data, lasting, True, tuple((one,) for one in _BOTH))
+        if cost < least - _SIGNIFICANT:
+            best, least = apart, cost
     return best if least < cost_usual - _SIGNIFICANT else usual
 
 
