@@ -96,9 +96,9 @@ MOST_NOISE = 20.0
 """The largest estimated factor on a noise. With a larger factor, measurements with wrong units or axes fit as noise. Real
 robots have up to 6.3, for odometry that is only the commanded speed."""
 
-MOST_PLACE_NOISE = 100.0
-"""The largest estimated factor on `localization.xy`, in joint mode. With its default, this is the 2 m of a GPS without
-corrections. A larger factor lets a path with wrong units fit as noise."""
+MOST_POSE_NOISE = 100.0
+"""The largest estimated factor on `localization.xy` and `localization.yaw`, in joint mode. With their defaults, this is the
+2 m of a GPS without corrections, and half a radian. A larger factor lets a path with wrong units fit as noise."""
 
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""
