@@ -118,6 +118,11 @@ class Measurements:
         """The motions that a localisation with lasting errors measures, None without such errors."""
         return localized_motions(self.keyframes, self.settings)
 
+    @property
+    def localized_factors(self) -> list[gtsam.NonlinearFactor]:
+        """The factors of `localized_motions`. Like the ties of fiducials, they belong to whole logs only."""
+        return [] if self.localized_motions is None else self.localized_motions.factors()
+
     def whole(
         self, owner: Ints, used: Bools, map_T_camera: Floats, positions: Floats, loss: Loss = "huber"
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -128,7 +133,7 @@ class Measurements:
         """
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         factors = self.factors(owner, np.flatnonzero(used), landmarks, positions, loss)
-        factors += [] if self.localized_motions is None else self.localized_motions.factors()
+        factors += self.localized_factors
         values = make_values(map_T_camera, positions, landmarks)
         if self.tags is not None:
             factors += add_squares(self.tags, landmarks, positions, values, self.settings.joint.prior_sigma)
