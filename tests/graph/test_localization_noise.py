@@ -149,6 +149,14 @@ def test_a_localisation_that_errs_as_the_settings_say_has_no_more_noise():
         assert found.lasting == (WHITE, WHITE)
 
 
+def test_a_localisation_without_errors_has_no_lasting_ones():
+    """Its small differences from pose to pose must not count as a large error that hardly changes."""
+    for seed in range(2):
+        found = found_in(localised(seed, localization=PoseNoise(xy=1e-4, yaw=1e-4))[0])
+        assert (found.heading, found.place) == (1.0, 1.0)
+        assert found.lasting == (WHITE, WHITE)
+
+
 def test_the_size_of_lasting_errors_and_their_time_are_found():
     sizes, times = [], []
     for seed in range(3):

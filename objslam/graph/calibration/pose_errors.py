@@ -21,13 +21,16 @@ _STEPS = (0.8, 0.3, 0.1)
 """The steps of the search for factors on noise, as logarithms. A smaller last step is more exact and slower."""
 _BOTH = ("heading", "place")
 """The errors of a pose."""
-_SIZES = (0.0, 1.0, 2.0, 3.0)
+_SIZES = (-1.5, 0.0, 1.0, 2.0, 3.0)
 """The factors on noise at which a search begins, as logarithms. More are slower."""
 _AROUND = (-0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8)
 """The factors around the most likely one over which a lasting error is averaged, as logarithms. The posterior of a variance
 from few samples falls more slowly to larger values."""
 _MOST_STRAYS = 0.1
 """At most this share of the poses are jumps. A larger share explains noise by jumps."""
+_LEAST_FACTOR, _MOST_FACTOR = np.log(0.05), np.log(MOST_POSE_NOISE)
+"""The bounds of the logarithm of a factor on noise. A localisation may be far better than the settings say. Without small
+factors, its small differences from pose to pose would look like errors that last."""
 _PREDICTED = (np.log(0.3), np.log(MOST_NOISE))
 """The bounds of the logarithm of the factor on the error of the prediction, whose noise may be unknown too."""
 _CHANCE = 1e-3
@@ -140,12 +143,13 @@ def most_likely(data: ComparedPoses) -> PoseErrors:
 
     If places err for seconds, headings probably do too, because both come from one filter. A short log may not show it.
     """
-    usual, cost_usual = _searched(data, PoseErrors(), False, ())
-    best, least = _searched(data, _begun(data, usual), True, ())
-    lasting, cost = _searched(data, _begun_lasting(data, best), True, (_BOTH,))
+    most = _MOST_FACTOR if data.free else 0.0
+    usual, cost_usual = _searched(data, _begun(data, PoseErrors(), 0.0), 0.0, ())
+    best, least = _searched(data, _begun(data, usual, most), most, ())
+    lasting, cost = _searched(data, _begun_lasting(data, best), most, (_BOTH,))
     if cost < least - _SIGNIFICANT:
         best, least = lasting, cost
-        apart, cost = _searched(data, lasting, True, tuple((one,) for one in _BOTH))
+        apart, cost = _searched(data, lasting, most, tuple((one,) for one in _BOTH))
         if cost < least - _SIGNIFICANT:
             best, least = apart, cost
     return best if least < cost_usual - _SIGNIFICANT else usual
@@ -162,9 +166,9 @@ def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasti
     for name in _BOTH:
         kind = getattr(model, name)
         if not kind.share:
-            found[name] = float(np.exp(kind.factor)), WHITE
+            found[name] = max(float(np.exp(kind.factor)), 1.0), WHITE
             continue
-        factors = np.maximum(kind.factor + (np.array(_AROUND) if data.free else np.zeros(1)), 0.0)
+        factors = np.minimum(kind.factor + np.array(_AROUND), _MOST_FACTOR if data.free else 0.0)
         tried = [
             [data.cost(_with(model, name, replace(kind, factor=f, time=t))) for t in range(len(_TIMES))]
             for f in factors.tolist()
@@ -174,7 +178,9 @@ def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasti
         variance = weight * np.exp(2 * factors)[:, None]
         of_mean = float((variance * _variance_of_mean(np.array(_TIMES), duration)).sum() / variance.sum())
         seconds = float(np.interp(of_mean, _variance_of_mean(_FINE, duration), _FINE))
-        found[name] = float(np.sqrt(variance.sum())), Lasting(_SHARES[kind.share], seconds)
+        total = float(variance.sum())
+        # Poses count as no better than the settings say. If they are, the rest of this noise is white.
+        found[name] = max(float(np.sqrt(total)), 1.0), Lasting(_SHARES[kind.share] * min(total, 1.0), seconds)
     return found["heading"], found["place"]
 
 
@@ -196,10 +202,10 @@ def _with_lasting(model: PoseErrors, names: tuple[str, ...], share: int, time: i
     return model
 
 
-def _begun(data: ComparedPoses, model: PoseErrors) -> PoseErrors:
-    """Return the best of a few models with other sizes of the errors. From a large error of the prediction, the steps of a
+def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
+    """Return the best of a few models with sizes of the errors up to `most`. From a large error of the prediction, the steps of a
     search would not find small ones."""
-    sizes = _SIZES if data.free else (0.0,)
+    sizes = [size for size in _SIZES if size <= most]
     tried = [
         replace(model, heading=ErrorKind(heading), place=ErrorKind(place), predicted=predicted)
         for heading in sizes
@@ -216,34 +222,36 @@ def _begun_lasting(data: ComparedPoses, model: PoseErrors) -> PoseErrors:
 
 
 def _searched(
-    data: ComparedPoses, start: PoseErrors, sized: bool, lasting: tuple[tuple[str, ...], ...]
+    data: ComparedPoses, start: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...]
 ) -> tuple[PoseErrors, float]:
     """Return the model of the least cost, and this cost, by steps along the axes, then smaller ones.
 
-    sized: whether the sizes of errors change. lasting: groups of errors whose lasting part changes. A group has one part."""
+    most: the largest logarithm of a factor on noise. lasting: groups of errors whose lasting part changes. A group has one
+    part.
+    """
     best, cost = start, data.cost(start)
     for step in _STEPS:
         moved = True
         while moved:
             moved = False
-            for other in _moves(best, sized and data.free, lasting, step):
+            for other in _moves(best, most, lasting, step):
                 if (tried := data.cost(other)) < cost - 1e-6:
                     best, cost, moved = other, tried, True
     return best, cost
 
 
-def _moves(model: PoseErrors, sized: bool, lasting: tuple[tuple[str, ...], ...], step: float) -> list[PoseErrors]:
-    """Return the neighbours of a model. sized, lasting: as in `_searched`."""
+def _moves(model: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...], step: float) -> list[PoseErrors]:
+    """Return the neighbours of a model. most, lasting: as in `_searched`."""
     found = []
     for sign in (1, -1):
         found.append(replace(model, predicted=float(np.clip(model.predicted + sign * step, *_PREDICTED))))
-        for name in _BOTH if sized else ():
+        for name in _BOTH:
             kind = getattr(model, name)
             found.append(
                 _with(
                     model,
                     name,
-                    replace(kind, factor=float(np.clip(kind.factor + sign * step, 0.0, np.log(MOST_POSE_NOISE)))),
+                    replace(kind, factor=float(np.clip(kind.factor + sign * step, _LEAST_FACTOR, most))),
                 )
             )
         for names in lasting:
