@@ -203,8 +203,10 @@ def _with_lasting(model: PoseErrors, names: tuple[str, ...], share: int, time: i
 
 
 def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
-    """Return the best of a few models with sizes of the errors up to `most`. From a large error of the prediction, the steps of a
-    search would not find small ones."""
+    """Return the best of a few models with sizes of the errors up to `most`.
+
+    From a large error of the prediction, the steps of a search would not find small ones.
+    """
     sizes = [size for size in _SIZES if size <= most]
     tried = [
         replace(model, heading=ErrorKind(heading), place=ErrorKind(place), predicted=predicted)
