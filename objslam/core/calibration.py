@@ -197,7 +197,8 @@ class CalibratedMeasurements(Protocol):
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: any of `rays`, `ranges` and `odometry`."""
+        """The kinds of noise that are estimated: any of `rays`, `ranges`, `odometry` and
+        `localization`."""
 
     @property
     def unknown_scales(self) -> frozenset[str]:

@@ -8,6 +8,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
+from objslam.core.statistics import Lasting
 from objslam.core.types import Rays
 
 
@@ -18,7 +19,8 @@ class NoiseFactors:
     rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges: `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`.
     along: `odometry.x_per_m` and `odometry.xy_per_rad`. across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the
     odometry's noise of the heading. heading: `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a
-    joint solve makes all lengths too short.
+    joint solve makes all lengths too short. The other four are no factors: heading_share, place_share are the shares of the
+    variance of these errors that last, and heading_seconds, place_seconds how long (`Lasting`).
     """
 
     rays: float = 1.0
@@ -30,6 +32,20 @@ class NoiseFactors:
     heading: float = 1.0
     place: float = 1.0
     shrinkage: float = 0.0
+    heading_share: float = 0.0
+    heading_seconds: float = 0.0
+    place_share: float = 0.0
+    place_seconds: float = 0.0
+
+    @property
+    def lasting(self) -> tuple[Lasting, Lasting]:
+        """The lasting parts of the errors of localised headings and places."""
+        return Lasting(self.heading_share, self.heading_seconds), Lasting(self.place_share, self.place_seconds)
+
+    @property
+    def factors(self) -> Floats:
+        """(8,) all factors on standard deviations."""
+        return np.array([getattr(self, name) for name in FACTORS])
 
     def settings(self, nominal: Settings) -> Settings:
         """Return the settings with the odometry noise multiplied by the factors. `rays_with_noise` multiplies the noise of
@@ -60,10 +76,12 @@ class NoiseFactors:
         )
 
     def like(self, other: "NoiseFactors", tolerance: float) -> bool:
-        """Return whether all factors agree with the factors of `other` within a relative tolerance. The shrinkage is not
-        compared."""
-        mine, its = (np.array(list(one.to_dict(None).values())) for one in (self, other))
-        return bool((np.abs(np.log(np.maximum(mine[:-1], 1e-9) / np.maximum(its[:-1], 1e-9))) < tolerance).all())
+        """Return whether all factors agree with the factors of `other` within a relative tolerance, and the same errors
+        last. The shrinkage is not compared."""
+        mine, its = self.factors, other.factors
+        return bool((np.abs(np.log(np.maximum(mine, 1e-9) / np.maximum(its, 1e-9))) < tolerance).all()) and (
+            self.lasting == other.lasting
+        )
 
     def to_dict(self, digits: int | None = 4) -> dict[str, float]:
         """Return the factors and the shrinkage by name, as in summary.json. If `digits` is not None, they are rounded to
@@ -71,9 +89,16 @@ class NoiseFactors:
         return {name: value if digits is None else round(value, digits) for name, value in asdict(self).items()}
 
 
+FACTORS = ("rays", "ranges", "range_bias", "along", "across", "turning", "heading", "place")
+"""The fields of `NoiseFactors` that are factors on standard deviations."""
+
 MOST_NOISE = 20.0
 """The largest estimated factor on a noise. With a larger factor, measurements with wrong units or axes fit as noise. Real
 robots have up to 6.3, for odometry that is only the commanded speed."""
+
+MOST_POSE_NOISE = 100.0
+"""The largest estimated factor on `localization.xy` and `localization.yaw`, in joint mode. With their defaults, this is the
+2 m of a GPS without corrections, and half a radian. A larger factor lets a path with wrong units fit as noise."""
 
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""

@@ -1,10 +1,11 @@
-"""Statistical thresholds that several packages share, and medians of groups.
+"""Statistical thresholds that several packages share, errors that last, and medians of groups.
 
 A deviation is a residual divided by its standard deviation, or the norm of several such residuals. The deviation of a ray is
 the norm of the two residuals across the ray. The nominal noise of a ray is the standard deviation that the settings give it.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -57,6 +58,22 @@ near the noise of their class for longer."""
 POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """The part of an error that a first-order Gauss-Markov process describes. The rest of the error is white.
+
+    share: of the variance, 0 for an error that is new in each pose, 1 for one that only lasts. seconds: the time (s) after
+    which the correlation of the lasting part is 1/e.
+    """
+
+    share: float = 0.0
+    seconds: float = 0.0
+
+
+WHITE = Lasting()
+"""An error that is new in each pose."""
 
 
 def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) -> Floats:

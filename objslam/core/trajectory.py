@@ -52,3 +52,15 @@ def correct_poses(stamps: Floats, poses: Floats, keyframe_stamps: Floats, before
     correction = after[first] @ inverse(before[first])
     at, _ = interpolate(known, correction, np.clip(stamps, known[0], known[-1]), np.inf)
     return at @ poses
+
+
+def poses_near(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:
+    """Return the poses (Q, 4, 4) of a path at stamps (Q,), s.
+
+    A stamp beyond an end of the path, or in a gap longer than `max_gap`, s, takes the nearest pose.
+    """
+    known = np.clip(stamps, path.stamps[0], path.stamps[-1])
+    index = np.clip(np.searchsorted(path.stamps, known), 1, max(len(path) - 1, 1))
+    before, after = path.stamps[index - 1], path.stamps[np.minimum(index, len(path) - 1)]
+    nearest = np.where(known - before < after - known, before, after)
+    return interpolate(path.stamps, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]

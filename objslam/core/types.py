@@ -15,6 +15,7 @@ from objslam.core.appearance.features import FeatureTable, are_unit_vectors
 from objslam.core.arrays import Bools, Floats, Floats32, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
+from objslam.core.statistics import WHITE, Lasting
 
 MAX_BOXES = 10_000
 """The most boxes of a frame. A frame with more is rejected: no detector finds so many, and association would be too slow."""
@@ -194,11 +195,12 @@ class Keyframes:
     index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera. base_T_camera: (K, 4, 4).
     map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation. localized_every: how many
     keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. pose_noise:
-    the factors on `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. odom_T_base:
-    (K, 4, 4) in the coordinate frame of the first odometry pose, None without odometry. drift: (K, 6, 6) covariance,
-    rotation first, of the odometry's error since its start, in the frame of odom_T_base. stretch: (K,) the stretch of the
-    odometry between two gaps, None means one for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have
-    no meaning. step, wander: (K,), (K, 6) by `frontend.odometry_bridge`, None if the odometry is exact between its poses.
+    the factors on `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. lasting: the
+    parts of the errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the coordinate frame of
+    the first odometry pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error
+    since its start, in the frame of odom_T_base. stretch: (K,) the stretch of the odometry between two gaps, None means one
+    for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step, wander: (K,), (K, 6) by
+    `frontend.odometry_bridge`, None if the odometry is exact between its poses.
     """
 
     stamps: Floats
@@ -208,6 +210,7 @@ class Keyframes:
     map_T_base: Floats
     localized_every: float = 0.0
     pose_noise: tuple[float, float] = (1.0, 1.0)
+    lasting: tuple[Lasting, Lasting] = (WHITE, WHITE)
     odom_T_base: Floats | None = None
     drift: Floats | None = None
     stretch: Ints | None = None

@@ -10,8 +10,9 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
-from objslam.core.geometry import interpolate, inverse
+from objslam.core.geometry import inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
+from objslam.core.trajectory import poses_near
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.frontend.corrected_log import (
     ODOMETRY,
@@ -64,11 +65,15 @@ class SharedErrors:
     def unknown_noise(self) -> frozenset[str]:
         """The kinds of noise that are estimated: those that the settings allow, if the log has their measurements.
 
-        The set is empty in fixed mode, and if odometry is not used.
+        The set is empty in fixed mode. Without odometry, only the noise of the localisation is estimated. How long its
+        errors last is estimated even if the settings say how large they are.
         """
         of, default = self.settings, Settings()
-        if of.mode != "joint" or self.keyframes.odom_T_base is None:
+        if of.mode != "joint":
             return frozenset()
+        localized = {"localization"} if self.keyframes.localized_every and of.noise.localization is not False else set()
+        if self.keyframes.odom_T_base is None:
+            return frozenset(localized)
         ranged = bool(np.isfinite(self.rays.range).any())
         told = any(one.camera.depth_noise is not None for one in self.log.cameras)
         kinds = {
@@ -76,7 +81,8 @@ class SharedErrors:
             "ranges": (of.noise.ranges, of.depth == default.depth and not told, ranged),
             "odometry": (of.noise.odometry, of.odometry == default.odometry, True),
         }
-        return frozenset(k for k, (use, usual, there) in kinds.items() if there and (usual if use == "auto" else use))
+        unknown = {k for k, (use, usual, there) in kinds.items() if there and (usual if use == "auto" else use)}
+        return frozenset(unknown | localized)
 
     @cached_property
     def unknown_scales(self) -> frozenset[str]:
@@ -174,6 +180,9 @@ class SharedErrors:
         ranges = {"range": rays.range * longer, "range_sigma": rays.range_sigma * longer}
         ranged = replace(rays, direction=direction, sigma=sigma, **ranges)
         tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))
+        if self.settings.mode == "joint":
+            noise = self.noise
+            moved = replace(moved, pose_noise=(noise.heading, noise.place), lasting=noise.lasting)
         return moved, ranged, settings if tags is settings.tags else settings.model_copy(update={"tags": tags})
 
     def corrected_log(self, values: Floats) -> Log:
@@ -241,9 +250,9 @@ class SharedErrors:
             known[mine] = np.clip(stamps[mine] + clock, path.stamps[0], path.stamps[-1])
             stamps[mine] = later(stamps[mine], clock, path)
             if one.mount is not None:
-                base_T_camera[mine] = _at_stamps(one.mount, known[mine], max_gap)
+                base_T_camera[mine] = poses_near(one.mount, known[mine], max_gap)
         localization, odom_T_base = self.log.localization, keyframes.odom_T_base
-        map_T_base = keyframes.map_T_base if localization is None else _at_stamps(localization, known, max_gap)
+        map_T_base = keyframes.map_T_base if localization is None else poses_near(localization, known, max_gap)
         if self.log.odometry is not None and (localization is None or odom_T_base is not None):
             at = self._odometry_at(known, error)
             map_T_base = at if localization is None else map_T_base
@@ -266,7 +275,7 @@ class SharedErrors:
         needed[after - 1] = needed[np.minimum(after, len(odometry) - 1)] = True
         around = np.flatnonzero(needed)
         path = Trajectory(odometry.stamps[around], self._correctable().poses(self._of_odometry(error), around))
-        return _at_stamps(path, stamps, self.settings.poses.max_gap)
+        return poses_near(path, stamps, self.settings.poses.max_gap)
 
     def _of_odometry(self, error: Mapping[str, float]) -> dict[str, float]:
         """The errors of the odometry. Its distances compensate the shrinkage of the map, as the ranges do."""
@@ -339,12 +348,3 @@ def _sized_tags(rays: Rays, settings: Settings) -> bool:
         return False
     labels = np.unique(rays.label[np.isfinite(rays.corner_sigma)]).tolist()
     return any(settings.tags.size_of(rays.label_names[i]) is not None for i in labels)
-
-
-def _at_stamps(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:
-    """Poses (Q, 4, 4) of a path at stamps (Q,). A stamp beyond an end of the path, or in a gap, takes the nearest pose."""
-    known = np.clip(stamps, path.stamps[0], path.stamps[-1])
-    index = np.clip(np.searchsorted(path.stamps, known), 1, max(len(path) - 1, 1))
-    before, after = path.stamps[index - 1], path.stamps[np.minimum(index, len(path) - 1)]
-    nearest = np.where(known - before < after - known, before, after)
-    return interpolate(path.stamps, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]

@@ -12,7 +12,8 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Rays
 from objslam.graph.factors.bearing import bearings_fixed, point_to_line_fixed
-from objslam.graph.factors.localization import localizations
+from objslam.graph.factors.localization import LocalizedMotions, localizations, localized_motions
+from objslam.graph.factors.localized_rows import LocalizedRows
 from objslam.graph.factors.noise import robust
 from objslam.graph.factors.odometry import betweens, motions
 from objslam.graph.factors.odometry_motions import OdometryMotions, find_ties
@@ -112,6 +113,16 @@ class Measurements:
         of = self.motions
         return [] if of is None else betweens(of.before, of.after, of.motion, of.covariance, self.seen_twice)
 
+    @cached_property
+    def localized_motions(self) -> LocalizedMotions | None:
+        """The motions that a localisation with lasting errors measures, None without such errors."""
+        return localized_motions(self.keyframes, self.settings)
+
+    @property
+    def localized_factors(self) -> list[gtsam.NonlinearFactor]:
+        """The factors of `localized_motions`. Like the ties of fiducials, they belong to whole logs only."""
+        return [] if self.localized_motions is None else self.localized_motions.factors()
+
     def whole(
         self, owner: Ints, used: Bools, map_T_camera: Floats, positions: Floats, loss: Loss = "huber"
     ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -122,6 +133,7 @@ class Measurements:
         """
         landmarks = np.flatnonzero(np.isfinite(positions[:, 0]))
         factors = self.factors(owner, np.flatnonzero(used), landmarks, positions, loss)
+        factors += self.localized_factors
         values = make_values(map_T_camera, positions, landmarks)
         if self.tags is not None:
             factors += add_squares(self.tags, landmarks, positions, values, self.settings.joint.prior_sigma)
@@ -138,7 +150,10 @@ class Measurements:
             owner: (n,) the landmark of each ray.
             landmarks: (m,) the landmarks in the graph, in increasing order.
         """
-        return (SquareRows.of(self.tags, landmarks),)
+        squares, by_localization = SquareRows.of(self.tags, landmarks), self.localized_motions
+        if by_localization is None:
+            return (squares,)
+        return squares, LocalizedRows(by_localization, 3 * len(landmarks))
 
     def odometry(self) -> tuple[Floats, Floats]:
         """Return the motions (P-1, 4, 4) and their covariances (P-1, 6, 6). ValueError without odometry."""

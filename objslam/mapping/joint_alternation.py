@@ -272,6 +272,7 @@ class JointState:
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
         from objslam.association.global_association import associate_globally
+        from objslam.graph.fixed_pose_triangulation import noise_of_poses
 
         frames, rays = self.frames, self.all_rays
         if self.errors is not None and self.theta is not None:
@@ -281,7 +282,10 @@ class JointState:
         mine = self.keyframes
         at = correct_poses(frames.stamps, frames.map_T_base, mine.stamps, mine.map_T_base, map_T_base)
         scale = _FIRST if rough else 1.0
-        sigma = np.hypot(rays.sigma, scale * _SOLVED_YAW)
+        yaw, place = scale * _SOLVED_YAW, scale * _SOLVED_XY
+        if rough and mine.localized_every:  # The poses are those of the localisation.
+            yaw, place = (max(pair) for pair in zip((yaw, place), noise_of_poses(mine, self.settings), strict=True))
+        sigma = np.hypot(rays.sigma, yaw)
         return associate_globally(
             rays,
             frames,
@@ -289,7 +293,7 @@ class JointState:
             self.settings,
             map_T_camera=at @ frames.base_T_camera,
             sigma=sigma,
-            position_sigma=scale * _SOLVED_XY,
+            position_sigma=place,
             seed=self.settings.seed,
             guess=guess,
             # Landmarks of a solve hold the path together. Before it, the odometry alone says how two sights of one lie.

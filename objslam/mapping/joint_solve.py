@@ -57,7 +57,7 @@ def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
 
     start: a known start. With it, the log is not explored, and labels are not trusted.
     """
-    state = _with_clocks(state)
+    state = _with_noise_of_poses(_with_clocks(state))
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
         return _associated(state, start)
     named, agree = _by_label(state)
@@ -124,6 +124,18 @@ def _with_turns(state: JointState) -> JointState:
     theta = with_turns_of_tracks(state.errors, state.errors.mean if state.theta is None else state.theta)
     keyframes, rays, _ = state.errors.at(theta)
     return replace(state, theta=theta, keyframes=keyframes, rays=rays)
+
+
+def _with_noise_of_poses(state: JointState) -> JointState:
+    """Return the state that begins with the noise of the localisation which the odometry shows."""
+    if state.errors is None or "localization" not in state.errors.unknown_noise or state.keyframes.odom_T_base is None:
+        return state
+    from objslam.graph.calibration.paths_alone import noise_of_paths
+
+    theta = state.errors.mean if state.theta is None else state.theta
+    errors = state.errors.with_noise(noise_of_paths(state.errors, theta))
+    keyframes, rays, _ = errors.at(theta)
+    return replace(state, errors=errors, keyframes=keyframes, rays=rays)
 
 
 def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:

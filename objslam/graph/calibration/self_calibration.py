@@ -22,6 +22,7 @@ from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.inner_solve import InnerSolve
+from objslam.graph.calibration.localization_noise import noise_of_localization
 from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.shrinkage import shrinking_force
@@ -101,6 +102,8 @@ def calibrate(
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
         noise = estimate_noise(state, at.system, fit.errors, theta, fit.prior_residuals)
+        if "localization" in errors.unknown_noise:
+            noise = noise_of_localization(state, fit.errors.with_noise(noise), theta)
         before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
         fit = replace(fit, errors=fit.errors.with_noise(noise))
         state = fit.remeasured(state, theta)

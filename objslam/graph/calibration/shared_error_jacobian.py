@@ -18,6 +18,7 @@ from objslam.core.types import Keyframes, Rays
 from objslam.graph.calibration.clock_instruments import ClockInstruments
 from objslam.graph.calibration.instruments import ODOMETRY_SCALES, Motions, motion_instruments
 from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.factors.localized_rows import LocalizedRows
 from objslam.graph.least_squares.joint_rows import from_origins
 from objslam.graph.least_squares.normal_equations import NormalEquations
 
@@ -232,11 +233,24 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
     def poses(measured: Floats) -> Floats:
         return np.einsum("kij,kj->ki", absolute_root, log_se3(inverse(measured) @ absolute))
 
-    (squares, *_), landmarks = graph.further, of.positions[of.landmarks]
+    (squares, *others), landmarks = graph.further, of.positions[of.landmarks]
 
     def sides(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
         tags = of.measured.tags
         return () if tags is None else (squares.sized(tags.sized(rays.label_names, settings)).side,)
+
+    localized = next((one for one in others if isinstance(one, LocalizedRows)), None)
+
+    def between(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
+        if localized is None:
+            return ()
+        poses = keyframes.map_T_camera
+        return (inverse(poses[localized.of.before]) @ poses[localized.of.after],)
+
+    def localized_motions(motion: Floats) -> Floats:
+        assert localized is not None
+        off = log_se3(inverse(motion) @ localized.moved(map_T_camera))
+        return np.einsum("kij,kj->ki", localized.weighted_roots(map_T_camera), off)
 
     return (
         _Part(0, lambda _, rays, settings: (rays.direction, from_origins(rays, seen)), bearings),
@@ -252,4 +266,5 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
             poses,
         ),
         _Part(graph.first_further, sides, lambda side: squares.by_sides(landmarks, side)),
+        _Part(graph.first_further + squares.rows_each * len(squares.tag), between, localized_motions),
     )

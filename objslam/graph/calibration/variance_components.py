@@ -20,7 +20,7 @@ from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry_motions import OdometryMotions
-from objslam.graph.least_squares.joint_rows import whitening
+from objslam.graph.factors.residual_algebra import whitening
 from objslam.graph.least_squares.normal_equations import NormalEquations
 
 _PROBES, _FEWEST_PROBES = 12, 4
@@ -49,6 +49,8 @@ _MOST_SHRINKAGE = 0.3
 _PRIOR_OBJECTS = 4
 """The range bias in the settings weighs at most as much as this number of objects. With a larger number, the bias changes
 less."""
+_KINDS = ("rays", "ranges", "range_bias", "along", "across", "turning")
+"""The factors that this iteration estimates, as fields of `NoiseFactors`."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
 """The factor from the mean absolute value of Gaussian numbers to their standard deviation."""
 
@@ -92,6 +94,8 @@ def estimate_noise(
     nominal noise in each kind, as a number of residuals. Kinds of noise that are known keep their factor.
     """
     kinds, rows = errors.unknown_noise, _rows(of, errors, theta)
+    if not kinds - {"localization"}:
+        return errors.noise
     root = np.linalg.cholesky(np.linalg.inv(errors.prior)).T
     jacobian, residual = system.jacobian, np.append(system.residual, root @ (theta - errors.mean))
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(residual), rows.probes))
@@ -121,14 +125,13 @@ def correlation_time(stamps: Floats) -> float:
 
 def _logarithms(noise: NoiseFactors) -> Floats:
     """Return the logarithms of the factors on noise. The iteration is close to linear in them."""
-    return np.log([factor for name, factor in noise.to_dict(None).items() if name != "shrinkage"])
+    return np.log([getattr(noise, name) for name in _KINDS])
 
 
 def _from_logarithms(logarithms: Floats, other: NoiseFactors) -> NoiseFactors:
-    """Return the noise with these logarithms of its factors, within `_LIMITS`, and with the shrinkage of `other`."""
-    names = [name for name in other.to_dict(None) if name != "shrinkage"]
+    """Return the noise `other` with these logarithms of its factors, within `_LIMITS`."""
     factors = np.clip(np.exp(logarithms), *_LIMITS)
-    return replace(other, **dict(zip(names, factors.tolist(), strict=True)))
+    return replace(other, **dict(zip(_KINDS, factors.tolist(), strict=True)))
 
 
 def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Rows:
@@ -233,8 +236,7 @@ def _updated(
             squares = share * variance**2 * (own**2).sum()
             redundancy = share * variance * (first * second).sum() / count
             found[name] = np.sqrt((prior + squares) / (prior + max(redundancy, 0.0)))
-    limited = {k: float(v if k == "shrinkage" else np.clip(v, *_LIMITS)) for k, v in found.items()}
-    return NoiseFactors(**limited)
+    return replace(noise, **{kind: float(np.clip(found[kind], *_LIMITS)) for kind in _KINDS})
 
 
 def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kept: Floats, prior: float) -> float:

@@ -1,14 +1,51 @@
-"""Factors for a localisation, which measures the absolute pose of a keyframe."""
+"""Factors for a localisation, which measures the absolute pose of a keyframe.
+
+The error of a pose may be new in each pose, or last for seconds, or both. A lasting error is a first-order Gauss-Markov
+process (Jazwinski 1970, 4.5): between two poses it keeps the share r = exp(-t / T), and r^2 of its variance. The information
+of such a chain is a sum of terms on single errors and on differences of consecutive errors. So poses whose errors last are
+weak absolute poses, and precise motions from pose to pose: priors and between-factors, without further variables.
+"""
+
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import adjoint, inverse, is_planar
+from objslam.core.statistics import Lasting
 from objslam.core.types import Keyframes
 from objslam.graph.factors.noise import huber
 from objslam.graph.variables import X0
+
+_UNTOLD = 10.0
+"""The standard deviation (rad, m) of the parts of a motion that a localisation does not tell, such as its change of height.
+A larger value tells less, and costs digits."""
+_LONGEST = 0.9999
+"""The largest share of a lasting error that stays from one pose to the next. A larger share ties two poses of nearly the
+same time more closely, and costs digits."""
+
+
+@dataclass(frozen=True)
+class LocalizedMotions:
+    """The motions that a localisation with lasting errors measures between consecutive keyframes.
+
+    before, after: (s,) the keyframes. motion: (s, 4, 4) of the camera. covariance: (s, 6, 6), rotation first, in the frame
+    of the camera after the motion.
+    """
+
+    before: Ints
+    after: Ints
+    motion: Floats
+    covariance: Floats
+
+    def factors(self) -> list[gtsam.NonlinearFactor]:
+        """Return one between-factor for each motion, with Huber's loss, because a localisation may jump."""
+        return [
+            gtsam.BetweenFactorPose3(X0 + i, X0 + j, gtsam.Pose3(m), huber(gtsam.noiseModel.Gaussian.Covariance(c)))
+            for i, j, m, c in zip(self.before.tolist(), self.after.tolist(), self.motion, self.covariance, strict=True)
+        ]
 
 
 def localizations(
@@ -29,12 +66,76 @@ def localizations(
 def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> Floats:
     """Return the covariances (K, 6, 6) of the keyframes' absolute poses, in their camera frames, rotation first.
 
-    on_plane: whether the path is planar. If it is None, the poses decide.
+    If errors last, the poses have less information, and `localized_motions` has the rest. on_plane: whether the path is
+    planar. If it is None, the poses decide.
     """
-    of, planar = settings.localization, settings.planar
+    planar = settings.planar
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
-    tilt, z = (planar.tilt, planar.z) if on_plane else (of.yaw, of.xy)
-    s = np.diag([tilt, tilt, of.yaw, of.xy, of.xy, z]) ** 2 * keyframes.localized_every
-    to_camera = adjoint(inverse(keyframes.base_T_camera))
-    covariance = to_camera @ s @ np.swapaxes(to_camera, 1, 2)
+    (yaw, _), (xy, _) = _chains(keyframes, settings)
+    tilt, z = (planar.tilt, planar.z) if on_plane else (yaw, xy)
+    parts = (tilt, tilt, yaw, xy, xy, z)
+    s = np.stack([np.broadcast_to(np.square(part), len(keyframes)) for part in parts], axis=1) * keyframes.localized_every
+    return _in_camera(keyframes.base_T_camera, s)
+
+
+def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> LocalizedMotions | None:
+    """Return the motions that a localisation measures because its errors last. None if its errors are new in each pose.
+
+    A motion is known in the frame of the robot, whose heading errs. The error of the heading turns the motion to a side. It
+    may last too, so it counts with the noise of the absolute heading.
+    """
+    if not keyframes.localized_every or not any(one.share for one in keyframes.lasting) or len(keyframes) < 2:
+        return None
+    on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
+    (heading, yaw), (_, xy) = _chains(keyframes, settings)
+    way = np.linalg.norm(np.diff(keyframes.map_T_base[:, :3, 3], axis=0), axis=1)
+    xy, every = np.hypot(xy, way * heading[:-1]), keyframes.localized_every
+    tilt, z = (_UNTOLD, _UNTOLD) if on_plane else (yaw, xy)
+    parts = (tilt, tilt, yaw, xy, xy, z)
+    s = np.stack([np.broadcast_to(np.square(part), len(way)) for part in parts], axis=1) / every
+    poses = keyframes.map_T_camera
+    before = np.arange(len(way))
+    return LocalizedMotions(
+        before,
+        before + 1,
+        inverse(poses[:-1]) @ poses[1:],
+        _in_camera(keyframes.base_T_camera[1:], np.minimum(s, _UNTOLD**2)),
+    )
+
+
+def _in_camera(base_T_camera: Floats, variances: Floats) -> Floats:
+    """Return the covariances (n, 6, 6) in camera frames of errors with `variances` (n, 6) in the base frames."""
+    to_camera = adjoint(inverse(base_T_camera))
+    covariance = (to_camera * variances[:, None, :]) @ np.swapaxes(to_camera, 1, 2)
     return np.asarray((covariance + np.swapaxes(covariance, 1, 2)) / 2)
+
+
+def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floats]]:
+    """Return, for headings (rad) and places (m), the standard deviations (K,) of poses and (K-1,) of motions."""
+    gaps = np.maximum(np.diff(keyframes.stamps), 0.0) * max(keyframes.localized_every, 1.0)
+    of = settings.localization
+    columns = zip((of.yaw, of.xy), keyframes.pose_noise, keyframes.lasting, strict=True)
+    return [chain(gaps, nominal * factor, lasting) for nominal, factor, lasting in columns]
+
+
+def chain(gaps: Floats, sigma: float, lasting: Lasting) -> tuple[Floats, Floats]:
+    """Return the standard deviations (K,) of errors, and (K-1,) of their differences, as independent terms.
+
+    The two are exact if the whole error lasts, or nothing of it. An error with both parts has no such terms. It gets those
+    with its information about constant errors and about errors that change their sign from pose to pose. Between these two,
+    the true information is larger, because it is a concave function of 2 - 2 cos(w), and the terms are linear in it.
+
+    Args:
+        gaps: (K-1,) s, the times between consecutive errors.
+        sigma: the standard deviation of the whole error.
+        lasting: its lasting part.
+    """
+    if not lasting.share:
+        return np.full(len(gaps) + 1, sigma), np.full(len(gaps), np.inf)
+    white, lasts = sigma**2 * (1 - lasting.share), sigma**2 * lasting.share
+    stays = np.minimum(np.exp(-gaps / lasting.seconds), _LONGEST)
+    before, after = np.append(0.0, stays), np.append(stays, 0.0)
+    alone = white + lasts / (1 / (1 + before) + 1 / (1 + after) - 1)
+    constant = 1 / (white + lasts * (1 + stays) / (1 - stays))
+    changing = 1 / (white + lasts * (1 - stays) / (1 + stays))
+    return np.sqrt(alone), 2 / np.sqrt(np.maximum(changing - constant, 1e-12))

@@ -13,14 +13,14 @@ from scipy import sparse
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse, log_se3
-from objslam.core.rotation import skew
-from objslam.core.statistics import CAUCHY_K, HUBER_K
+from objslam.core.statistics import CAUCHY_K
 from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements, RowsOfKind
 from objslam.graph.factors.bearing import EQ1_SIGMA, ray_jacobians, ray_residuals, residual_axes
 from objslam.graph.factors.localization import localization_covariance
 from objslam.graph.factors.odometry import JUMP
 from objslam.graph.factors.priors import ANCHOR
+from objslam.graph.factors.residual_algebra import by_end, huber_roots, whitening
 from objslam.graph.tags.square_rows import SquareRows
 
 
@@ -67,7 +67,10 @@ class JointGraph:
 
     def measuring(self, measured: Measurements) -> Self:
         """Return the graph of the same rays and landmarks with other measured values."""
-        return replace(self, measured=measured, rays=measured.rays.take(self.which))
+        rays, pattern = measured.rays.take(self.which), self.pattern
+        if (measured.localized_motions is None) != (self.measured.localized_motions is None):
+            pattern = _pattern(measured, rays, self.landmark, self.landmarks)
+        return replace(self, measured=measured, rays=rays, pattern=pattern)
 
     @cached_property
     def further(self) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
@@ -141,7 +144,7 @@ class JointGraph:
     def bearing_roots(self, residuals: Floats) -> tuple[Floats, Floats]:
         """Return the factors (n, 1) that whiten residuals (n, 2), with the weights of Huber's loss, and their costs (n,)."""
         sigma = np.full(len(self.rays), EQ1_SIGMA) if self._metric else self.rays.sigma
-        weight, cost = _huber(np.linalg.norm(residuals, axis=1) / sigma)
+        weight, cost = huber_roots(np.linalg.norm(residuals, axis=1) / sigma)
         return (weight / sigma)[:, None], cost
 
     def range_roots(self, distances: Floats) -> tuple[Floats, Floats]:
@@ -160,7 +163,7 @@ class JointGraph:
         size = np.linalg.norm((roots @ off[..., None])[..., 0], axis=1)
         if not keyframes.localized_every:
             return off, roots, size**2 / 2
-        weight, cost = _huber(size)
+        weight, cost = huber_roots(size)
         return off, roots * weight[:, None, None], cost
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> JointRows:
@@ -185,7 +188,7 @@ class JointGraph:
         held = (absolute_roots @ apart[..., None]).ravel()
         weak = (landmarks - self.weak).ravel() / self.measured.settings.joint.prior_sigma
         by_weak = np.full(weak.size, 1 / self.measured.settings.joint.prior_sigma)
-        by_absolute = (absolute_roots @ _by_end(apart)).ravel()
+        by_absolute = (absolute_roots @ by_end(apart)).ravel()
         by_further = [derivatives.ravel() for _, derivatives, _ in further]
         data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute, *by_further])
         columns, first = self.pattern
@@ -226,7 +229,7 @@ class JointGraph:
         off = log_se3(error)
         weight, cost = self.motion_weights(map_T_camera)
         roots = weight[:, None, None] * self.motion_roots
-        after = roots @ _by_end(off)
+        after = roots @ by_end(off)
         before = -after @ adjoint(inverse(moved))
         return (roots @ off[..., None]).ravel(), np.concatenate([before, after], axis=2), cost
 
@@ -267,26 +270,3 @@ def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: Ints
 def from_origins(rays: Rays, seen: Floats) -> Floats:
     """Return positions (n, 3), m, relative to the points where their rays begin."""
     return seen if rays.offset is None else seen - rays.offset
-
-
-def whitening(covariance: Floats) -> Floats:
-    """Return upper triangular matrices (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM does."""
-    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
-
-
-def _huber(size: Floats) -> tuple[Floats, Floats]:
-    """Return the roots (n,) of Huber's weights of whitened norms (n,), and the costs (n,)."""
-    weight = np.sqrt(np.minimum(1.0, HUBER_K / np.maximum(size, 1e-12)))
-    return weight, np.where(size <= HUBER_K, size**2 / 2, HUBER_K * (size - HUBER_K / 2))
-
-
-def _by_end(twist: Floats) -> Floats:
-    """Return the derivatives (n, 6, 6) of log(X exp(d)) by d at 0, for the twists (n, 6) log(X).
-
-    This is the inverse of the right Jacobian of SE(3) up to the square of the twist (Barfoot, State Estimation for Robotics,
-    eq. 8.102). The error is the twist's fourth power divided by 720.
-    """
-    small = np.zeros((len(twist), 6, 6))
-    small[:, :3, :3] = small[:, 3:, 3:] = skew(twist[:, :3])
-    small[:, 3:, :3] = skew(twist[:, 3:])
-    return np.asarray(np.eye(6) + small / 2 + small @ small / 12)

@@ -132,7 +132,8 @@ def _drive_factors(
         return object_priors(L0, solved, estimate.positions[solved], estimate.covariance[solved] / 2, robust=False)
     used = (estimate.weight > 0) & np.isin(association.object, solved)
     loss = measured.settings.joint.loss if robust and measured.settings.joint.loss != "gnc" else "gnc"
-    return measured.factors(association.object, np.flatnonzero(used), solved, estimate.positions, loss)
+    factors = measured.factors(association.object, np.flatnonzero(used), solved, estimate.positions, loss)
+    return factors + measured.localized_factors
 
 
 def _unknown_to(

@@ -116,7 +116,8 @@ class Calibrator:
         found = collect(m, self._name, count_dropped=False)
         if found.errors is None or found.theta is None or not len(found.theta) or not found.association.count:
             return
-        settings = m.given.model_copy(update={"noise": Noise(rays=False, ranges=False, odometry=False)})
+        known = Noise(rays=False, ranges=False, odometry=False, localization=False)
+        settings = m.given.model_copy(update={"noise": known})
         errors = replace(found.errors, settings=settings)
         request = CalibrationRequest(errors, found.theta, found.association, found.map_T_camera, settings)
         self._asked = number, request if self._replaying else None

@@ -6,7 +6,7 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
-from objslam.core.noise import MOST_NOISE, NoiseFactors
+from objslam.core.noise import MOST_NOISE, MOST_POSE_NOISE, NoiseFactors
 from objslam.mapping.checks.finding import Finding
 
 MOST_SIGMAS = 3.0
@@ -38,8 +38,10 @@ _NOISES = {
     "along": "of the odometry along the path",
     "across": "of the odometry across the path",
     "turning": "of the odometry's heading",
+    "heading": "of the localisation's heading (localization.yaw)",
+    "place": "of the localisation's place (localization.xy)",
 }
-_DEPTHS, _ODOMETRY = ("ranges", "range_bias"), ("along", "across", "turning")
+_DEPTHS, _ODOMETRY, _POSES = ("ranges", "range_bias"), ("along", "across", "turning"), ("heading", "place")
 
 
 def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
@@ -91,12 +93,13 @@ def _with_most_noise(noise: NoiseFactors) -> list[Finding]:
     Wheels may slip that far, and a depth image may be that bad, but hardly both in one log. No detector errs by that many
     pixels. So the positions are spoilt if the noise of the boxes ends at its bound, or that of both depths and odometry.
     """
-    ended = [name for name in _NOISES if getattr(noise, name) >= 0.999 * MOST_NOISE]
+    limits = {name: MOST_POSE_NOISE if name in _POSES else MOST_NOISE for name in _NOISES}
+    ended = [name for name, limit in limits.items() if getattr(noise, name) >= 0.999 * limit]
     depths, odometry = ([name for name in names if name in ended] for names in (_DEPTHS, _ODOMETRY))
     return [
         Finding(
             f"noise {name} at its bound",
-            f"the boxes agree only if the noise {_NOISES[name]} is {MOST_NOISE:.3g} times what the settings say, or more: "
+            f"the boxes agree only if the noise {_NOISES[name]} is {limits[name]:.3g} times what the settings say, or more: "
             "unless it really is, the input is wrong",
             spoils=name == "rays" or bool(depths and odometry),
         )

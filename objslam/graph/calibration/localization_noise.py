@@ -1,0 +1,110 @@
+"""Estimate the noise of a localisation, and how long its errors last, from the rest of the log.
+
+Odometry and rays predict the path, up to a shift and a turn of the whole. The localisation differs from this prediction by
+the error of the prediction, whose covariance the graph knows, and by its own error. The size of its own error, the share of
+it that lasts, and for how long, are those of the largest restricted likelihood (Patterson and Thompson 1971).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import CalibratedMeasurements
+from objslam.core.geometry import adjoint, inverse
+from objslam.core.noise import NoiseFactors
+from objslam.core.statistics import WHITE
+from objslam.core.types import Keyframes
+from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.pose_errors import ComparedPoses, averaged, most_likely, without_jumps
+from objslam.graph.calibration.shared_error_jacobian import linearise
+
+_LOOSE = 1e4
+"""The factor on the noise of the localisation in the graph that predicts it. With a larger factor, the prediction contains
+less of the localisation, and more rounding errors."""
+_FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
+"""A long log is seen at 18 times that are spread evenly, and at these numbers of keyframes after each. Near poses show
+errors that are new in each pose, far ones errors that last. More poses are more exact, and the time grows with their
+cube."""
+
+
+def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
+    """Return `errors.noise` with the noise of the localisation that agrees best with the rest of a graph at its values.
+
+    Factors are at least 1, and 1 unless the log refutes the settings. theta: (P,) the shared errors. SolveError if the graph
+    without its localisation is singular.
+    """
+    data = _compared(of, errors, theta)
+    found = most_likely(data)
+    near = without_jumps(data, found)
+    if len(near) < len(data.times):
+        data = data.take(near)
+        found = most_likely(data)
+    (heading, turned), (place, shifted) = averaged(data, found)
+    return replace(
+        errors.noise,
+        heading=heading,
+        heading_share=turned.share,
+        heading_seconds=turned.seconds,
+        place=place,
+        place_share=shifted.share,
+        place_seconds=shifted.seconds,
+    )
+
+
+def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> ComparedPoses:
+    """Return the localisation against a prediction by all other measurements."""
+    measured = replace(of.measured, keyframes=_white(of.measured.keyframes), settings=_without_places(of.measured.settings))
+    loose = replace(of, measured=measured, known=None)
+    system, keyframes, nominal = linearise(loose, errors, theta), measured.keyframes, errors.settings.localization
+    poses = _poses(len(keyframes))
+    map_T_base = (of.map_T_camera @ inverse(keyframes.base_T_camera))[poses]
+    apart = inverse(keyframes.map_T_base[poses]) @ map_T_base
+    place = map_T_base[:, :2, 3] - keyframes.map_T_base[poses, :2, 3]
+    off = np.concatenate([np.arctan2(apart[:, 1, 0], apart[:, 0, 0]), place.T.ravel()])
+    by_twist = adjoint(keyframes.base_T_camera[poses])
+    by_twist = np.concatenate([by_twist[:, 2:3], map_T_base[:, :2, :3] @ by_twist[:, 3:]], axis=1)  # (n, 3, 6)
+    columns = 3 * len(of.landmarks) + 6 * poses[:, None] + np.arange(6)
+    select = np.zeros((system.jacobian.shape[1], 3 * len(poses)))
+    for part in range(3):
+        for axis in range(6):
+            select[columns[:, axis], part * len(poses) + np.arange(len(poses))] = by_twist[:, part, axis]
+    solved = system.normal.solve(select)
+    off = off - solved.T @ (system.jacobian.T @ system.residual)
+    covariance = select.T @ solved
+    if len(theta):
+        left = system.left(system.sides)
+        told = np.linalg.inv(left.T @ left + np.linalg.inv(errors.prior))
+        by_error = solved.T @ (system.jacobian.T @ system.sides)
+        covariance = covariance + by_error @ told @ by_error.T
+    stamps, every = keyframes.stamps, keyframes.localized_every
+    usual = errors.settings.model_copy(update={"localization": type(nominal)()}).localization
+    use = errors.settings.noise.localization
+    return ComparedPoses(
+        off=off,
+        covariance=(covariance + covariance.T) / 2,
+        times=stamps[poses],
+        apart=every * float(np.median(np.diff(stamps))) if every > 1 else 0.0,
+        nominal=(nominal.yaw, nominal.xy),
+        free=nominal == usual if use == "auto" else use,
+        prior=errors.settings.noise.prior,
+    )
+
+
+def _white(keyframes: Keyframes) -> Keyframes:
+    return replace(keyframes, pose_noise=(1.0, 1.0), lasting=(WHITE, WHITE))
+
+
+def _without_places(settings: Settings) -> Settings:
+    """Return settings in which the localisation hardly tells anything."""
+    of = settings.localization
+    return settings.model_copy(update={"localization": of.model_copy(update={"xy": of.xy * _LOOSE, "yaw": of.yaw * _LOOSE})})
+
+
+def _poses(count: int) -> Ints:
+    """Return the indices of the compared poses of `count`, in increasing order."""
+    if count <= _FIRST * len(_LAGS):
+        return np.arange(count)
+    begin = np.linspace(0, count - 1 - max(_LAGS), _FIRST).astype(np.int64)
+    return np.unique(begin[:, None] + np.array(_LAGS))

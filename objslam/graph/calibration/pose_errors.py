@@ -1,0 +1,265 @@
+"""Hypotheses on the errors of localised poses, and the search for the one that agrees best with predicted poses."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.noise import MOST_NOISE, MOST_POSE_NOISE
+from objslam.core.statistics import SAME_POINT_WIDE, WHITE, Lasting
+
+_TIMES = tuple(2.0**k for k in range(8))
+"""The tried times (s) for which errors last. A shorter one hardly differs from new errors in each pose, and a longer one
+from a shift of the whole map. More times are finer and slower."""
+_FINE = np.geomspace(_TIMES[0], _TIMES[-1], 200)
+"""Times (s) between which a mean of several of `_TIMES` is interpolated. More are finer."""
+_SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
+"""The tried shares of an error that last. More shares are finer and slower."""
+_STEPS = (0.8, 0.3, 0.1)
+"""The steps of the search for factors on noise, as logarithms. A smaller last step is more exact and slower."""
+_BOTH = ("heading", "place")
+"""The errors of a pose."""
+_SIZES = (-1.5, 0.0, 1.0, 2.0, 3.0)
+"""The factors on noise at which a search begins, as logarithms. More are slower."""
+_AROUND = (-0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8)
+"""The factors around the most likely one over which a lasting error is averaged, as logarithms. The posterior of a variance
+from few samples falls more slowly to larger values."""
+_MOST_STRAYS = 0.1
+"""At most this share of the poses are jumps. A larger share explains noise by jumps."""
+_LEAST_FACTOR, _MOST_FACTOR = np.log(0.05), np.log(MOST_POSE_NOISE)
+"""The bounds of the logarithm of a factor on noise. A localisation may be far better than the settings say. Without small
+factors, its small differences from pose to pose would look like errors that last."""
+_PREDICTED = (np.log(0.3), np.log(MOST_NOISE))
+"""The bounds of the logarithm of the factor on the error of the prediction, whose noise may be unknown too."""
+_CHANCE = 1e-3
+"""The chance of a false alarm: that a localisation which is as good as the settings say is found worse. With a larger value,
+shorter logs can show its noise, and more good logs seem to have such noise."""
+_SIGNIFICANT = -2 * np.log(_CHANCE)
+"""Noise beyond the settings, or a lasting part, counts if it lowers -2 ln of the likelihood by at least this value: the
+quantile of chi-squared, with 2 degrees of freedom, that is exceeded with the probability `_CHANCE`."""
+
+
+@dataclass(frozen=True)
+class ErrorKind:
+    """The error of headings, or of places. factor: the logarithm of the factor on its noise. share, time: the places of its
+    lasting part in `_SHARES` and `_TIMES`."""
+
+    factor: float = 0.0
+    share: int = 0
+    time: int = 3
+
+    @property
+    def lasting(self) -> Lasting:
+        """The lasting part."""
+        return Lasting(_SHARES[self.share], _TIMES[self.time]) if self.share else WHITE
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """A hypothesis: the errors of headings and places, and the logarithm of the factor on the error of the prediction."""
+
+    heading: ErrorKind = ErrorKind()
+    place: ErrorKind = ErrorKind()
+    predicted: float = 0.0
+
+
+@dataclass(frozen=True)
+class ComparedPoses:
+    """n poses of the localisation against their prediction.
+
+    off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction. times:
+    (n,) s. apart: s, the time between two poses that were measured independently, 0 if all were. nominal: of headings, rad,
+    and places, m. free: whether the size of the noise is unknown. prior: the weight of the noise of the prediction, as a
+    number of residuals.
+    """
+
+    off: Floats
+    covariance: Floats
+    times: Floats
+    apart: float
+    nominal: tuple[float, float]
+    free: bool
+    prior: float
+
+    def take(self, poses: Ints) -> "ComparedPoses":
+        """Return the data of some poses."""
+        n = len(self.times)
+        at = np.concatenate([poses, n + poses, 2 * n + poses])
+        return replace(self, off=self.off[at], covariance=self.covariance[np.ix_(at, at)], times=self.times[poses])
+
+    @cached_property
+    def gaps(self) -> Floats:
+        """(n, n) s, the times between poses."""
+        return np.abs(self.times[:, None] - self.times)
+
+    @cached_property
+    def white(self) -> Floats:
+        """(n, n) the correlation of errors that are new in each measured pose."""
+        return np.maximum(1 - self.gaps / self.apart, 0.0) if self.apart else np.eye(len(self.times))
+
+    @cached_property
+    def alike(self) -> Floats:
+        """(m, n, n) the correlations of errors that last for each of `_TIMES`."""
+        return np.exp(-self.gaps / np.array(_TIMES)[:, None, None])
+
+    def expected(self, model: PoseErrors) -> Floats:
+        """Return the covariance (3 n, 3 n) of `off`."""
+        n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance
+        for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
+            variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
+            own = variance * (1 - lasting.share) * self.white
+            if lasting.share:
+                own = own + variance * lasting.share * self.alike[kind.time]
+            for part in (0,) if first == 0 else (1, 2):
+                found[part * n : (part + 1) * n, part * n : (part + 1) * n] += own
+        return found
+
+    def cost(self, model: PoseErrors) -> float:
+        """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction."""
+        root, failed = dpotrf(self.expected(model), lower=1, clean=0, overwrite_a=1)
+        if failed:
+            return np.inf
+        white, _ = dtrtrs(root, self.off, lower=1)
+        prior = self.prior * (2 * model.predicted + np.exp(-2 * model.predicted))
+        return float(white @ white + 2 * np.log(np.diagonal(root)).sum() + prior)
+
+
+def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
+    """Return the poses (m,) that agree with what all other poses predict, or all of them if too many do not."""
+    inner = np.linalg.inv(data.expected(model))
+    n = len(data.times)
+    at = np.arange(n)[:, None] + n * np.arange(3)
+    blocks, pull = inner[at[:, :, None], at[:, None, :]], (inner @ data.off)[at]
+    size = (pull * np.linalg.solve(blocks, pull[..., None])[..., 0]).sum(axis=1)
+    near = np.flatnonzero(size < SAME_POINT_WIDE)
+    return near if len(near) >= (1 - _MOST_STRAYS) * n else np.arange(n)
+
+
+def most_likely(data: ComparedPoses) -> PoseErrors:
+    """Return the simplest model that the data do not refute: the noise in the settings, more of it, the same part of both
+    errors that lasts, or a part of each.
+
+    If places err for seconds, headings probably do too, because both come from one filter. A short log may not show it.
+    """
+    most = _MOST_FACTOR if data.free else 0.0
+    usual, cost_usual = _searched(data, _begun(data, PoseErrors(), 0.0), 0.0, ())
+    best, least = _searched(data, _begun(data, usual, most), most, ())
+    lasting, cost = _searched(data, _begun_lasting(data, best), most, (_BOTH,))
+    if cost < least - _SIGNIFICANT:
+        best, least = lasting, cost
+        apart, cost = _searched(data, lasting, most, tuple((one,) for one in _BOTH))
+        if cost < least - _SIGNIFICANT:
+            best, least = apart, cost
+    return best if least < cost_usual - _SIGNIFICANT else usual
+
+
+def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasting], tuple[float, Lasting]]:
+    """Return the noise and the lasting parts of headings and places, averaged over their posterior if they last.
+
+    A log contains few independent samples of an error that lasts. The most likely values would promise too much. So the
+    variance of the error, and that of its mean over the log, are averaged. The time is the one that gives this mean.
+    """
+    duration = float(np.ptp(data.times))
+    found = dict[str, tuple[float, Lasting]]()
+    for name in _BOTH:
+        kind = getattr(model, name)
+        if not kind.share:
+            found[name] = max(float(np.exp(kind.factor)), 1.0), WHITE
+            continue
+        factors = np.minimum(kind.factor + np.array(_AROUND), _MOST_FACTOR if data.free else 0.0)
+        tried = [
+            [data.cost(_with(model, name, replace(kind, factor=f, time=t))) for t in range(len(_TIMES))]
+            for f in factors.tolist()
+        ]
+        weight = np.exp(-(np.array(tried) - np.min(tried)) / 2)
+        weight /= weight.sum()
+        variance = weight * np.exp(2 * factors)[:, None]
+        of_mean = float((variance * _variance_of_mean(np.array(_TIMES), duration)).sum() / variance.sum())
+        seconds = float(np.interp(of_mean, _variance_of_mean(_FINE, duration), _FINE))
+        total = float(variance.sum())
+        # Poses count as no better than the settings say. If they are, the rest of this noise is white.
+        found[name] = max(float(np.sqrt(total)), 1.0), Lasting(_SHARES[kind.share] * min(total, 1.0), seconds)
+    return found["heading"], found["place"]
+
+
+def _variance_of_mean(seconds: Floats, duration: float) -> Floats:
+    """Return the variances of the mean over `duration`, s, of errors of variance 1 that last for `seconds` (n,), s."""
+    share = seconds / max(duration, 1e-9)
+    return np.asarray(2 * share * (1 - share * (1 - np.exp(-1 / share))))
+
+
+def _with(model: PoseErrors, name: str, kind: ErrorKind) -> PoseErrors:
+    """Return a model with another error of this name."""
+    return replace(model, heading=kind) if name == "heading" else replace(model, place=kind)
+
+
+def _with_lasting(model: PoseErrors, names: tuple[str, ...], share: int, time: int) -> PoseErrors:
+    """Return a model in which the errors of these names have this lasting part."""
+    for name in names:
+        model = _with(model, name, replace(getattr(model, name), share=share, time=time))
+    return model
+
+
+def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
+    """Return the best of a few models with sizes of the errors up to `most`.
+
+    From a large error of the prediction, the steps of a search would not find small ones.
+    """
+    sizes = [size for size in _SIZES if size <= most]
+    tried = [
+        replace(model, heading=ErrorKind(heading), place=ErrorKind(place), predicted=predicted)
+        for heading in sizes
+        for place in sizes
+        for predicted in (0.0, model.predicted)
+    ]
+    return min(tried, key=data.cost)
+
+
+def _begun_lasting(data: ComparedPoses, model: PoseErrors) -> PoseErrors:
+    """Return the best of a few models in which both errors last."""
+    tried = [_with_lasting(model, _BOTH, share, time) for share in (3, 6) for time in (1, 3, 5, 7)]
+    return min(tried, key=data.cost)
+
+
+def _searched(
+    data: ComparedPoses, start: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...]
+) -> tuple[PoseErrors, float]:
+    """Return the model of the least cost, and this cost, by steps along the axes, then smaller ones.
+
+    most: the largest logarithm of a factor on noise. lasting: groups of errors whose lasting part changes. A group has one
+    part.
+    """
+    best, cost = start, data.cost(start)
+    for step in _STEPS:
+        moved = True
+        while moved:
+            moved = False
+            for other in _moves(best, most, lasting, step):
+                if (tried := data.cost(other)) < cost - 1e-6:
+                    best, cost, moved = other, tried, True
+    return best, cost
+
+
+def _moves(model: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...], step: float) -> list[PoseErrors]:
+    """Return the neighbours of a model. most, lasting: as in `_searched`."""
+    found = []
+    for sign in (1, -1):
+        found.append(replace(model, predicted=float(np.clip(model.predicted + sign * step, *_PREDICTED))))
+        for name in _BOTH:
+            kind = getattr(model, name)
+            found.append(
+                _with(
+                    model,
+                    name,
+                    replace(kind, factor=float(np.clip(kind.factor + sign * step, _LEAST_FACTOR, most))),
+                )
+            )
+        for names in lasting:
+            kind = getattr(model, names[0])
+            share = int(np.clip(kind.share + sign, 0, len(_SHARES) - 1))
+            time = int(np.clip(kind.time + sign, 0, len(_TIMES) - 1))
+            found.append(_with_lasting(model, names, share, kind.time))
+            found.append(_with_lasting(model, names, kind.share, time))
+    return [one for one in found if one != model]
