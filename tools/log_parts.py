@@ -4,24 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from objslam.core.types import Log, Trajectory
+from objslam.core.types import Log
+from objslam.frontend.log_part import part_of_log
 
 
 def part(log: Log, begin: float, end: float) -> Log:
     """The log between two times after its start, s."""
-    (camera,), path = log.cameras, log.odometry
-    assert path is not None
-    assert camera.detections is not None
-
-    def inside(stamps):
-        return (stamps >= path.stamps[0] + begin) & (stamps <= path.stamps[0] + end)
-
-    found, kept = camera.detections, inside(camera.detections.frame_stamps)
-    number, rows = np.cumsum(kept) - 1, kept[found.frame]
-    seen = replace(found.take(rows), frame_stamps=found.frame_stamps[kept], frame=number[found.frame[rows]])
-    there = inside(path.stamps)
-    odometry = Trajectory(path.stamps[there], path.poses[there])
-    return replace(log, odometry=odometry, cameras=(replace(camera, detections=seen),))
+    assert log.robot_path is not None
+    start = log.robot_path.stamps[0]
+    return part_of_log(log, start + begin, start + end)
 
 
 def without_names(log: Log) -> Log:

@@ -111,6 +111,10 @@ def read(path: Path, ledger: Ledger, options: SourceOptions | None = None) -> Lo
     for flag in unused(options, SourceOptions, names(source.options, AnyOptions)):
         ledger.warn(f"{path}: {flag} has no meaning for a {source.name} recording")
     log = replace(source.reads(path, ledger, options), path=path.resolve())
+    if options.begin is not None or options.end is not None:
+        from objslam.frontend.log_part import part_of_log
+
+        log = part_of_log(log, options.begin, options.end)
     if options.class_names is None:
         return log
     from objslam.frontend.class_names import with_names

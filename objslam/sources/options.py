@@ -41,11 +41,14 @@ _KINDS = "Kind of the recording: log, ros, mrclam, tum, tum_numbered, journal. [
 @dataclass(frozen=True)
 class AnyOptions:
     """The options of every source. format: the name of the source. None chooses the source by the recording's content.
-    class_names: of `frontend.class_names.load_names`, for labels that are numbers. None keeps the numbers.
+    class_names: of `frontend.class_names.load_names`, for labels that are numbers. None keeps the numbers. begin, end: the
+    stamps, s, between which the recording is used. None for no limit.
     """
 
     format: Annotated[str | None, Option("--format", _KINDS)] = None
     class_names: Annotated[str | None, NAMES] = None
+    begin: Annotated[float | None, Option("--begin", "Use the recording from this stamp on, s.", metavar="STAMP")] = None
+    end: Annotated[float | None, Option("--end", "Use the recording up to this stamp, s.", metavar="STAMP")] = None
 
 
 def names(*kinds: type[Any] | None) -> frozenset[str]:

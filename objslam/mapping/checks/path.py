@@ -88,7 +88,7 @@ def _find_restarts(odometry: Trajectory, max_gap: float) -> Iterator[Finding]:
             "odometry restarts",
             f"the odometry counts from zero again after a gap of {seconds[first]:.1f} s, at stamp "
             f"{odometry.stamps[first + 1]:.3f}{_and_more(len(restarts) - 1)}: poses before and after it do not belong "
-            "together; cut the log there, and join the two maps with objslam merge",
+            "together; map both parts of the log (--end, --begin), and join them with objslam merge",
         )
 
 
@@ -173,7 +173,8 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
             f"{name} jumps",
             f"the {name} jumps {jumps.sum()} time{'' if jumps.sum() == 1 else 's'} (first by {way[first]:.2f} m and "
             f"{np.degrees(angle[first]):.0f} deg at stamp {path.stamps[first + 1]:.3f}): "
-            "poses before and after a jump do not belong together",
+            "poses before and after a jump do not belong together"
+            + ("; map both parts of the log (--end, --begin)" if name == "odometry" and jumps.sum() == 1 else ""),
             spoils=name == "odometry" or log_is_split(way, jumps),
         )
 

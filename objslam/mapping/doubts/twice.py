@@ -38,7 +38,7 @@ class Twice:
         return (
             f"The {self.first} objects seen before stamp {self.stamp:.3f} and the {self.second} objects seen after it look "
             f"like one place mapped twice ({matches} match): the odometry or the localisation was lost there, or the robot "
-            "was carried. Cut the log there, and join both maps with `objslam merge`."
+            "was carried. Map both parts of the log (`--end`, `--begin`), and join them with `objslam merge`."
         )
 
 

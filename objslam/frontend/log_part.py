@@ -1,0 +1,70 @@
+"""Cut a part out of a log by time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.types import CameraLog, Detections, Images, Log, Trajectory, Truth
+from objslam.errors import LogError
+
+
+def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
+    """Return the part of a log from the stamp `begin`, s, to before the stamp `end`, s. None for no limit.
+
+    The poses, images and boxes outside are left out. The objects of the truth stay. LogError if no pose is inside.
+    """
+    low, high = -np.inf if begin is None else begin, np.inf if end is None else end
+
+    def inside(stamps: Floats) -> Bools:
+        return np.asarray((stamps >= low) & (stamps < high))
+
+    def path(whole: Trajectory | None) -> Trajectory | None:
+        if whole is None:
+            return None
+        there = inside(whole.stamps)
+        travel = None if whole.travel is None else whole.travel[there]
+        return replace(whole, stamps=whole.stamps[there], poses=whole.poses[there], travel=travel) if there.any() else None
+
+    def images(whole: Images | None) -> Images | None:
+        if whole is None:
+            return None
+        there = np.flatnonzero(inside(whole.stamps))
+        return Images(whole.stamps[there], tuple(whole.paths[i] for i in there.tolist()))
+
+    def boxes(whole: Detections | None) -> Detections | None:
+        if whole is None:
+            return None
+        there = inside(whole.frame_stamps)
+        number, rows = np.cumsum(there) - 1, there[whole.frame]
+        found = whole.take(rows)
+        # Both fields change at once, because the boxes must fit the frames.
+        return replace(found, frame_stamps=whole.frame_stamps[there], frame=number[whole.frame[rows]])
+
+    def camera(whole: CameraLog) -> CameraLog:
+        return replace(
+            whole,
+            detections=boxes(whole.detections),
+            rgb=images(whole.rgb),
+            depth=images(whole.depth),
+            mount=path(whole.mount),
+        )
+
+    truth = log.truth if log.truth is None else Truth(log.truth.objects, path(log.truth.trajectory))
+    found = replace(
+        log,
+        odometry=path(log.odometry),
+        localization=path(log.localization),
+        cameras=tuple(camera(one) for one in log.cameras),
+        truth=truth,
+    )
+    if found.robot_path is None and log.robot_path is not None:
+        first, last = log.robot_path.stamps[0], log.robot_path.stamps[-1]
+        raise LogError(
+            f"no pose lies in the asked part of the log: its poses have stamps from {first:.3f} to {last:.3f} s",
+            where=log.name,
+            hint="change --begin or --end",
+        )
+    return found
