@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -91,14 +92,15 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
 def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve from a known start, or from an exploration of the log."""
     if start is not None or state.keyframes.localized_every:
-        state = _relocalized(_from_start(state, start))
+        state = _improved(_from_start(state, start), JointState.relocalized)
     else:
         begin = _with_turns(state)
         explored = _from_start(*_explored(begin))
-        state, noisier = _relocalized(explored), _with_loose_odometry(explored, begin.theta)
+        state = _improved(explored, JointState.relocalized)
+        noisier = _with_loose_odometry(explored, begin.theta)
         if noisier is not None:
-            state = state.better(_relocalized(_from_start(*_explored(noisier))))
-        state = _split(state)
+            state = state.better(_improved(_from_start(*_explored(noisier)), JointState.relocalized))
+        state = _improved(state, JointState.split)
     if not state.settled:
         rounds = state.settings.joint.max_rounds
         state.ledger.warn(f"the association still changes after {rounds} rounds (joint.max_rounds)")
@@ -145,20 +147,10 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
     return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
 
 
-def _relocalized(state: JointState) -> JointState:
-    """Return the state after searches for the most likely path, until the rays are no better explained."""
+def _improved(state: JointState, step: Callable[[JointState], JointState]) -> JointState:
+    """Return the state after steps, until the rays are no better explained. step: it then returns the state itself."""
     for _ in range(state.settings.joint.max_rounds):
-        found = state.relocalized()
-        if found is state:
-            break
-        state = found
-    return state
-
-
-def _split(state: JointState) -> JointState:
-    """Return the state after objects that may be two were split, until the rays are no better explained."""
-    for _ in range(state.settings.joint.max_rounds):
-        found = state.split()
+        found = step(state)
         if found is state:
             break
         state = found
