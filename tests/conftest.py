@@ -9,6 +9,8 @@ import pytest
 from commands import Call
 from hypothesis import HealthCheck, settings
 
+from objslam.detection import onnx_model
+
 settings.register_profile(
     "objslam",
     deadline=None,  # No example is too slow. That depends on what else the machine does.
@@ -22,6 +24,12 @@ os.environ.pop("COLUMNS", None)
 
 # A suite in the background of a shell has SIGINT ignored. Commands that its tests start and interrupt would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def few_gigabytes() -> None:
+    """Damaged models may fill the pool of memory that all models of a process share, and it is made once."""
+    onnx_model._MOST_MEMORY = 1 << 30
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

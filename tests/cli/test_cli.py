@@ -10,6 +10,7 @@ import subprocess
 import sys
 import sysconfig
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -734,7 +735,8 @@ def test_an_interrupt_ends_a_run_without_a_traceback(log_folder, tmp_path):
 def test_a_run_that_is_ended_from_outside_leaves_nothing_half(log_folder, tmp_path, number):
     out = tmp_path / "out"
     command = [sys.executable, "-c", ENDLESS, "run", str(log_folder), "-o", str(out), *LEAN]
-    run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    heard = partial(signal.signal, number, signal.SIG_DFL)  # Under nohup, the suite and its children ignore SIGHUP.
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heard)
     assert run.stdout.readline() == "begun\n"
     run.send_signal(number)
     _, err = run.communicate(timeout=LIMIT)

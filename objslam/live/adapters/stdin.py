@@ -24,6 +24,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, pose_from_quaternion
+from objslam.core.validity import lengths
 from objslam.errors import LogError
 from objslam.io.box_collector import BoxCollector
 from objslam.io.camera_yaml import parse_camera
@@ -150,7 +151,7 @@ def _pose(message: dict[str, Any]) -> Floats:
         raise Malformed("no pose (x, y and yaw, or translation and rotation_xyzw)")
     place = _finite(message.get("translation"), "translation", 3)
     xyzw = _finite(message.get("rotation_xyzw"), "rotation_xyzw", 4)
-    if not abs(float(np.linalg.norm(xyzw)) - 1) < 0.01:
+    if not abs(float(lengths(np.array(xyzw))) - 1) < 0.01:
         raise Malformed("rotation_xyzw is not of length 1")
     return pose_from_quaternion(np.array([place]), np.array([xyzw]))[0]
 

@@ -30,6 +30,8 @@ def mixed_sizes(result: RunResult) -> list[Doubt]:
     other objects, and what the noise of the boxes explains. Boxes of two things have two sizes, also where their rays
     happen to meet. If a thing is put too far away, its boxes grow faster than its distance falls.
     """
+    if len(result.map) < _OTHERS:
+        return []
     mine = _boxes(result)
     number = np.bincount(result.association.object[mine], minlength=len(result.map))
     judged = np.flatnonzero((number >= _FEWEST) & np.array([o.status == "ok" for o in result.map.objects], dtype=bool))
@@ -46,9 +48,10 @@ def _boxes(result: RunResult) -> Ints:
     """Return the used rays (n,) whose boxes show a size."""
     sized = np.array([camera.sees_size for camera in result.cameras], dtype=bool)
     used = (result.association.object >= 0) & (result.weight > 0)
+    used &= np.isfinite(result.map.positions[result.association.object]).all(axis=1)
     used &= sized[result.keyframes.camera[result.rays.keyframe]]
-    sides = result.rays.box[:, 2:] - result.rays.box[:, :2]
-    return np.flatnonzero(used & (sides > 0).all(axis=1))
+    used &= (size_per_metre(result.rays, result.keyframes, result.cameras) > 0).all(axis=1)
+    return np.flatnonzero(used)
 
 
 def _scatter(result: RunResult, mine: Ints) -> tuple[Floats, Floats]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.association.registration.map_registration import Registration
-from objslam.association.registration.object_maps import placed, register
 from objslam.core.arrays import Floats
 from objslam.core.object_map import ObjectMap
+
+if TYPE_CHECKING:
+    from objslam.association.registration.map_registration import Registration
 
 _FEWEST = 4
 """The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number does
@@ -49,12 +51,14 @@ def find_twice(objects: ObjectMap) -> Twice | None:
     seen for the last time, and after which all are new. If the parts before and after it register to each other, they are
     one place.
     """
-    usable = placed(objects)
+    usable = [i for i, o in enumerate(objects.objects) if o.status == "ok" and o.covariance is not None]
     first = np.array([objects.objects[i].first_seen for i in usable])
     last = np.array([objects.objects[i].last_seen for i in usable])
     stamp = _cut(first, last)
     if stamp is None:
         return None
+    from objslam.association.registration.object_maps import register  # Few maps need scipy.spatial, which loads slowly.
+
     before = [objects.objects[i] for i, end in zip(usable, last, strict=True) if end <= stamp]
     after = [objects.objects[i] for i, begin in zip(usable, first, strict=True) if begin > stamp]
     found = register(*(replace(objects, objects=tuple(part), gone=()) for part in (before, after)))
