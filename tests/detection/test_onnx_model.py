@@ -43,6 +43,7 @@ def test_a_model_that_needs_more_memory_than_it_gets(tmp_path, count):
 
 
 def test_the_models_of_a_process_get_half_of_a_small_computer(monkeypatch):
+    monkeypatch.setattr(onnx_model, "_MOST_MEMORY", 8 * GIB)  # The tests have less.
     monkeypatch.setattr(onnx_model.os, "sysconf", {"SC_PHYS_PAGES": 1 << 20, "SC_PAGE_SIZE": 4096}.__getitem__)
     assert onnx_model._memory() == 2 * GIB
     monkeypatch.setattr(onnx_model.os, "sysconf", {"SC_PHYS_PAGES": 1 << 30, "SC_PAGE_SIZE": 4096}.__getitem__)
