@@ -76,8 +76,9 @@ def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -
     last."""
     if assessment["level"] == "bad" or not (doubles or lost):
         return assessment
-    others = assessment["reasons"][assessment["level"] == "good" :]  # The first reason of a good map praises it.
-    return {**assessment, "level": "check", "reasons": [*doubles, *others, *lost]}
+    if assessment["level"] == "good":  # Its first reason praises it, and the others are no reasons for a look.
+        return {**assessment, "level": "check", "reasons": [*doubles, *lost, *assessment["reasons"][1:]]}
+    return {**assessment, "reasons": [*doubles, *assessment["reasons"], *lost]}
 
 
 def _of_mixed(mixed: int) -> list[str]:
