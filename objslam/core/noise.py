@@ -76,12 +76,11 @@ class NoiseFactors:
         )
 
     def like(self, other: "NoiseFactors", tolerance: float) -> bool:
-        """Return whether all factors agree with the factors of `other` within a relative tolerance, and the same errors
-        last. The shrinkage is not compared."""
+        """Return whether all factors agree with the factors of `other` within a relative tolerance, and the errors
+        last alike. The shrinkage is not compared."""
         mine, its = self.factors, other.factors
-        return bool((np.abs(np.log(np.maximum(mine, 1e-9) / np.maximum(its, 1e-9))) < tolerance).all()) and (
-            self.lasting == other.lasting
-        )
+        lasting = all(one.like(two, tolerance) for one, two in zip(self.lasting, other.lasting, strict=True))
+        return lasting and bool((np.abs(np.log(np.maximum(mine, 1e-9) / np.maximum(its, 1e-9))) < tolerance).all())
 
     def to_dict(self, digits: int | None = 4) -> dict[str, float]:
         """Return the factors and the shrinkage by name, as in summary.json. If `digits` is not None, they are rounded to

@@ -71,6 +71,13 @@ class Lasting:
     share: float = 0.0
     seconds: float = 0.0
 
+    def like(self, other: "Lasting", tolerance: float) -> bool:
+        """Return whether the shares differ by less than a tolerance, and the times by less than this share of them."""
+        if not self.share or not other.share:
+            return self.share == other.share
+        times = abs(math.log(max(self.seconds, 1e-9) / max(other.seconds, 1e-9)))
+        return abs(self.share - other.share) < tolerance and times < tolerance
+
 
 WHITE = Lasting()
 """An error that is new in each pose."""

@@ -14,7 +14,8 @@ from objslam.errors import LogError
 def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
     """Return the part of a log from the stamp `begin`, s, to before the stamp `end`, s. None for no limit.
 
-    The poses, images and boxes outside are left out. The objects of the truth stay. LogError if no pose is inside.
+    The poses, images and boxes outside are left out. The objects of the truth stay. LogError if no pose, no
+    pose of a moving camera, or no detection frame is inside.
     """
     low, high = -np.inf if begin is None else begin, np.inf if end is None else end
 
@@ -61,10 +62,20 @@ def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
         truth=truth,
     )
     if found.robot_path is None and log.robot_path is not None:
-        first, last = log.robot_path.stamps[0], log.robot_path.stamps[-1]
-        raise LogError(
-            f"no pose lies in the asked part of the log: its poses have stamps from {first:.3f} to {last:.3f} s",
-            where=log.name,
-            hint="change --begin or --end",
-        )
+        raise _outside("pose", log, log.robot_path.stamps)
+    for one, whole in zip(found.cameras, log.cameras, strict=True):
+        if whole.mount is not None and one.mount is None:  # Without its poses, it would pass for a camera that is fixed.
+            raise _outside(f"pose of the camera {whole.camera.name}", log, whole.mount.stamps)
+    stamps = [one.detections.frame_stamps for one in log.cameras if one.detections is not None]
+    left = [one.detections.frame_stamps for one in found.cameras if one.detections is not None]
+    if any(len(some) for some in stamps) and not any(len(some) for some in left):
+        raise _outside("detection frame", log, np.sort(np.concatenate(stamps)))
     return found
+
+
+def _outside(what: str, log: Log, stamps: Floats) -> LogError:
+    return LogError(
+        f"no {what} lies in the asked part of the log; their stamps are from {stamps[0]:.3f} to {stamps[-1]:.3f} s",
+        where=log.name,
+        hint="change --begin or --end",
+    )

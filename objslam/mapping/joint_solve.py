@@ -221,8 +221,8 @@ def _with_loose_odometry(state: JointState, assumed: Floats | None) -> JointStat
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
     None if the noise is about nominal and the shared errors are about those `assumed` (P,) by the first exploration, if the
-    settings fix the noise, or if nearly all rays agree. The solve finds them, but the
-    exploration needs them before. A wrong map can hide the noise of the odometry in the noise of the rays.
+    settings fix the noise, or if nearly all rays agree. The solve finds them, but the exploration needs them before. A wrong
+    map can hide the noise of the odometry in the noise of the rays.
 
     The noise is at least nominal. A solve estimates the shared errors and the noise together, so the rest may be small. An
     exploration has the shared errors fixed, and those of a wrong map are wrong by more than their sigma. With half the noise

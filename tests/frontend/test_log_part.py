@@ -51,7 +51,15 @@ def test_no_limit_is_the_whole_log(log):
     assert len(same.cameras[0].detections) == len(log.cameras[0].detections)
 
 
-def test_a_part_without_a_pose_is_one_clear_error(log):
-    with pytest.raises(LogError, match=r"its poses have stamps from .* to .* s") as caught:
-        part_of_log(log, log.localization.stamps[-1] + 100, None)
+def test_a_part_without_poses_or_boxes_is_one_clear_error(log):
+    late = log.localization.stamps[-1] + 100
+    with pytest.raises(LogError, match=r"no pose lies in .* from .* to .* s") as caught:
+        part_of_log(log, late, None)
     assert "--begin" in str(caught.value)
+    (camera,), path = log.cameras, log.localization
+    longer = replace(path, stamps=np.append(path.stamps, late + 1), poses=path.poses[[*range(len(path)), -1]], travel=None)
+    on = replace(log, localization=longer)
+    with pytest.raises(LogError, match="no pose of the camera front lies"):
+        part_of_log(on, late, None)
+    with pytest.raises(LogError, match="no detection frame lies"):
+        part_of_log(replace(on, cameras=(replace(camera, mount=None),)), late, None)

@@ -483,7 +483,7 @@ def headings(rate: float, share: float, noise: float) -> Trajectory:
 )
 def test_a_robot_that_turns_now_and_then_shows_that_its_yaw_is_in_degrees(rate, share, noise, wrong):
     """Noise of headings is as fast between two poses, but it does not last."""
-    found = check_path(replace(drive("joint"), odometry=headings(rate, share, noise)), 1.0)
+    found = check_path(replace(drive("joint"), odometry=headings(rate, share, noise)), load_settings(None, ("mode=joint",)))
     assert any("degrees instead of rad" in finding.message for finding in found) == wrong
 
 

@@ -208,7 +208,10 @@ def test_an_object_whose_boxes_have_two_sizes():
 
 def test_a_camera_that_observes_no_sizes_tells_none():
     result = mapped(simulate(preset("rooms", false=0.0), 4))
-    box = result.rays.box * np.random.default_rng(0).uniform(0.5, 2, (len(result.rays), 1))
+    mine = np.flatnonzero(result.association.object == 0)
+    box = result.rays.box.copy()
+    box[mine[::2], 2:] += 4 * (box[mine[::2], 2:] - box[mine[::2], :2])
     odd = replace(result, rays=replace(result.rays, box=box))
+    assert len(mixed_sizes(odd)) == 1
     blind = tuple(replace(camera, sees_size=False) for camera in result.cameras)
     assert mixed_sizes(replace(odd, cameras=blind)) == []

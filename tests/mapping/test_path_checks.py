@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from objslam.config import load_settings
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.path import check_path
 from objslam.simulation import preset, simulate
 
+FIXED, JOINT = (load_settings(None, (f"mode={mode}",)) for mode in ("fixed", "joint"))
 RATE = 0.4  # rad/s, of a robot that drives along a circle with a radius of 1.5 m.
 
 
@@ -34,7 +36,7 @@ def jumped(path: Trajectory, after: float, way: float) -> Trajectory:
 
 
 def names(localization: Trajectory | None, odometry: Trajectory | None = None) -> list[str]:
-    return [one.name for one in check_path(Log("log", (), localization=localization, odometry=odometry), 1.0)]
+    return [one.name for one in check_path(Log("log", (), localization=localization, odometry=odometry), FIXED)]
 
 
 @pytest.mark.parametrize(("every", "noise"), [(0.1, 0.0), (0.1, 0.03), (0.05, 0.05), (0.5, 0.03), (1.0, 0.0)])
@@ -53,7 +55,7 @@ def test_a_jump_of_half_a_metre_is_named(back: float | None) -> None:
     """At 10 Hz it is slower than 5 m/s, but no robot accelerates and brakes so."""
     path = jumped(circle(0.1, 0.03), 30.0, 0.55)
     path = path if back is None else jumped(path, back, -0.55)
-    (found,) = check_path(Log("log", (), localization=path), 1.0)
+    (found,) = check_path(Log("log", (), localization=path), FIXED)
     assert found.name == "localisation jumps"
     assert not found.spoils
     assert f"jumps {1 if back is None else 2} time" in found.message
@@ -77,7 +79,9 @@ def test_odometry_that_restarts_in_a_gap_is_named(gap: float, restarts: bool, sa
         after = path.stamps > 28.0
         path = replace(path, poses=np.where(after[:, None, None], inverse(path.poses[after][:1]) @ path.poses, path.poses))
     assert names(None, path) == said
-    assert names(circle(0.1), path) == []  # With a localisation, each motion stands alone.
+    assert names(circle(0.1), path) == []  # In fixed mode with a localisation, the odometry is not used.
+    both = Log("log", (), localization=circle(0.1), odometry=path)
+    assert [one.name for one in check_path(both, JOINT)] == said
 
 
 def test_odometry_near_zero_before_a_gap_has_not_restarted() -> None:
@@ -92,6 +96,17 @@ def test_an_arm_that_moves_its_camera_does_not_freeze_the_base() -> None:
     assert path is not None
     still = replace(path, poses=np.broadcast_to(path.poses[0], path.poses.shape).copy())
     standing = replace(log, localization=still, odometry=None)
-    assert [one.name for one in check_path(standing, 1.0)] == ["localisation frozen"]
+    assert [one.name for one in check_path(standing, FIXED)] == ["localisation frozen"]
     moved = tuple(replace(one, mount=path) for one in standing.cameras)
-    assert check_path(replace(standing, cameras=moved), 1.0) == []
+    assert check_path(replace(standing, cameras=moved), FIXED) == []
+
+
+def test_a_jump_of_odometry_that_is_not_used_spoils_nothing() -> None:
+    """A slip between two poses of the localisation is none of its jumps."""
+    both = Log("log", (), localization=circle(0.5, 0.03), odometry=jumped(circle(0.05), 30.2, 0.6))
+    fixed, joint = check_path(both, FIXED), check_path(both, JOINT)
+    assert [one.name for one in fixed] == [one.name for one in joint] == ["odometry jumps"]
+    assert not fixed[0].spoils
+    assert joint[0].spoils
+    slow = Log("log", (), localization=circle(0.5, 0.03), odometry=jumped(circle(0.5), 30.2, 0.6))
+    assert check_path(slow, FIXED) == []

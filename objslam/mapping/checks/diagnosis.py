@@ -103,7 +103,7 @@ def diagnose(
     stamps = check_stamps(log)
     if stamps is not None and stamps.spoils:
         raise LogError(stamps.message, where=log.name, hint="write all stamps in s")
-    of_path = check_path(log, settings.poses.max_gap)
+    of_path = check_path(log, settings)
     impossible = any(finding.spoils for finding in of_path)
     findings = [*([stamps] if stamps else []), *of_path, *check_boxes(log, ledger)]
     if not any(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None):

@@ -1,9 +1,11 @@
 """Tests of the poses of a log: can a robot move in this way?"""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
+from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.rotation import rotation_vector
@@ -59,17 +61,19 @@ _BEFORE = 0.3
 """The time (s) over which the direction of motion is measured. A longer time suits noisy poses and slow turns."""
 
 
-def check_path(log: Log, max_gap: float) -> list[Finding]:
+def check_path(log: Log, settings: Settings) -> list[Finding]:
     """Return the findings about the poses of a log, from the poses and from the motion of the boxes.
 
-    max_gap: s, as in `poses.max_gap`.
+    In fixed mode with a localisation, the odometry is not used. Its speed and jumps then spoil nothing.
     """
+    max_gap, joint = settings.poses.max_gap, settings.mode == "joint"
     found: list[Finding] = []
     for name, path in (("localisation", log.localization), ("odometry", log.odometry)):
         if path is not None and len(path) > _FEWEST_STEPS:
-            found += _judge_speed(path, name)
+            used = joint or path is log.robot_path
+            found += (one if used else replace(one, spoils=False) for one in _judge_speed(path, name))
             found += _judge_stops(path, name, log)
-    if log.odometry is not None and log.localization is None:
+    if log.odometry is not None and (joint or log.localization is None):
         found += _find_restarts(log.odometry, max_gap)
     if log.localization is not None and log.odometry is not None:
         found += _compare_ways(log.localization, log.odometry)
@@ -104,10 +108,14 @@ def _compare_steps(localization: Trajectory, odometry: Trajectory, max_gap: floa
         return
     by_map, by_wheels = (inverse(poses[pair]) @ poses[pair + 1] for poses in (localization.poses, wheels))
     way = np.linalg.norm(by_map[:, :3, 3] - by_wheels[:, :3, 3], axis=1)
+    # A step that only the odometry makes is one of the odometry, such as a slip.
+    own = _beside(by_map[:, :3, 3]) > _beside(by_wheels[:, :3, 3])
+    own |= _beside(rotation_vector(by_map[:, :3, :3])) > _beside(rotation_vector(by_wheels[:, :3, :3]))
     angle = np.linalg.norm(rotation_vector(np.swapaxes(by_wheels[:, :3, :3], 1, 2) @ by_map[:, :3, :3]), axis=1)
     jumps = (way > max(_JUMP_WAY, _TIMES_ODD * float(np.quantile(way, 0.9)))) | (
         angle > max(_JUMP_ANGLE, _TIMES_ODD * float(np.quantile(angle, 0.9)))
     )
+    jumps &= own
     if jumps.any():
         first = int(np.argmax(jumps))
         yield Finding(
@@ -186,13 +194,20 @@ def _pulses(path: Trajectory, moving: Bools) -> Bools:
     """
     seconds = np.diff(path.stamps)
     velocity = np.diff(path.poses[:, :3, 3], axis=0) / seconds[:, None]
-    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
-    beside = np.minimum(np.append(change, np.inf), np.append(np.inf, change))
-    beside[[0, -1]] = 0.0  # The first and the last step have one neighbour only, as a start and a stop have.
+    beside = _beside(velocity)
     steady = seconds <= 2 * np.median(seconds)  # In a gap of the poses, a robot can do anything.
     off = np.where(steady, beside * seconds, 0.0)
     least = np.maximum(_JUMP_WAY + _ACCELERATION * seconds**2, _TIMES_ODD * np.quantile(off[moving], 0.9))
     return np.asarray(off > least)
+
+
+def _beside(steps: Floats) -> Floats:
+    """Return how far (N,) each of the steps (N, 3) differs from the more similar one beside it. The first and the last step
+    have one neighbour only, as a start and a stop have, and give 0."""
+    change = np.linalg.norm(np.diff(steps, axis=0), axis=1)
+    found = np.minimum(np.append(change, np.inf), np.append(np.inf, change))
+    found[[0, -1]] = 0.0
+    return np.asarray(found)
 
 
 def log_is_split(way: Floats, jumps: Bools) -> bool:
