@@ -124,8 +124,8 @@ def open_network(path: Path, settings: config.Detector) -> Network:
     options.intra_op_num_threads = settings.threads
     # Spinning threads would take the cores from the threads that decode the images.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    _limit_memory()
-    options.add_session_config_entry("session.use_env_allocators", "1")
+    if _limit_memory():
+        options.add_session_config_entry("session.use_env_allocators", "1")
     providers = _providers(onnxruntime, settings.device)
     try:
         # Without CUDA, the fallback of onnxruntime would only load the same file again, and print that.
@@ -171,14 +171,22 @@ def _memory() -> int:
 
 
 @cache
-def _limit_memory() -> None:
-    """Give onnxruntime the memory that the sessions of this process share. It raises an error where they need more."""
-    from onnxruntime.capi import _pybind_state as ort
+def _limit_memory() -> bool:
+    """Give onnxruntime the memory that the sessions of this process share. It raises an error where they need more.
 
-    # A size of -1 leaves the other choices to onnxruntime.
-    pool = ort.OrtArenaCfg(_memory(), -1, -1, -1)
-    place = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
-    ort.create_and_register_allocator(place, pool)
+    Returns whether it could: only a private module of onnxruntime offers this, and the next version may lack it. Without it,
+    the limits on images and outputs remain.
+    """
+    try:
+        from onnxruntime.capi import _pybind_state as ort
+
+        # A size of -1 leaves the other choices to onnxruntime.
+        pool = ort.OrtArenaCfg(_memory(), -1, -1, -1)
+        place = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
+        ort.create_and_register_allocator(place, pool)
+    except (ImportError, AttributeError, TypeError, RuntimeError):
+        return False
+    return True
 
 
 def _is_refused_memory(error: Exception) -> bool:
