@@ -334,3 +334,19 @@ def test_without_cyclonedds_one_line_says_so(domain, monkeypatch):
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     with pytest.raises(ObjslamError, match=r"not installed \(pip install"):
         open_network(domain)
+
+
+def test_no_thread_of_the_library_runs_when_the_interpreter_ends(domain):
+    script = """
+import atexit, pathlib, sys
+names = lambda: sorted(task.joinpath("comm").read_text().strip() for task in pathlib.Path("/proc/self/task").iterdir())
+atexit.register(lambda: print(*names()))  # The last function that runs, because it is registered first.
+from objslam.live.dds.network import open_network
+from objslam.live.dds.publisher import DdsPublisher
+publisher = DdsPublisher(open_network(int(sys.argv[1])))
+print(*names())
+"""
+    command = [sys.executable, "-c", script, str(domain)]
+    during, after = subprocess.run(command, capture_output=True, text=True, check=True, timeout=LIMIT).stdout.splitlines()
+    assert {"gc", "recv", "tev"} <= set(during.split())
+    assert not {"gc", "recv", "tev"} & set(after.split())

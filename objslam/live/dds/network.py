@@ -1,5 +1,6 @@
 """Joins DDS domains on a chosen network, and counts the payloads that the DDS library rejects."""
 
+import atexit
 import ctypes
 import ipaddress
 import os
@@ -95,8 +96,18 @@ def _join(domain: int, interface: str | None) -> Network:
     finally:
         os.close(writing)
     network = Network(domain, where, participant, (entity,))
+    atexit.register(_leave, entity)
     threading.Thread(target=_listen, args=(reading, network.unread), name="dds-log", daemon=True).start()
     return network
+
+
+def _leave(entity: Any) -> None:
+    """Leave a domain with all its entities, before the interpreter ends.
+
+    Threads of the DDS library release Python's types. A thread that asks for the interpreter while it ends is stopped for
+    ever. The library would wait for this thread, and so the process would never end.
+    """
+    entity.__del__()  # The binding has no other name for it. A second call does nothing.
 
 
 @contextmanager
