@@ -40,8 +40,8 @@ larger value loses more boxes of half hidden things."""
 @dataclass(frozen=True)
 class Edges:
     """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
-    degrees of freedom). vague: 2 ln of the area in the image where the landmark may appear, divided by the area of the ray's
-    own noise. cost: deviation + vague + the cost of the range."""
+    degrees of freedom). vague: 2 ln of the ratio of two areas in the image: the area where the landmark may appear, and the
+    area of the ray's own noise. cost: deviation + vague + the cost of the range."""
 
     ray: Ints
     landmark: Ints
@@ -229,9 +229,9 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
 def size_costs(state: State, edges: Edges) -> Floats:
     """Return the cost (E,), from 0 to `SIZE_LOSS`, of the size of the box in each match, in squared standard deviations.
 
-    Bearings do not tell a small thing from a large one in front of or behind it. If only one of them is detected, its box
-    fits both bearings, but only one size. A landmark has the median of the sizes of its boxes, and their spread. Boxes of
-    another size than usual cost more. A box without a size, and a landmark with few boxes, cost nothing.
+    Bearings do not tell a small thing from a large thing on the same line of sight. If only one of the two is detected, its
+    box fits the bearings of both, but only one of the sizes. A landmark has the median of the sizes of its boxes, and their
+    spread. Boxes of another size than usual cost more. A box without a size, and a landmark with few boxes, cost nothing.
     """
     obs, number = state.obs, state.ray_count
     if not (number >= _SIZED_BY).any():

@@ -122,9 +122,9 @@ def _learned(state: State) -> State:
 def _annealed(task: _Task, state: State) -> State:
     """Assign the rays of close landmarks again, first by their appearance and then more and more by their position.
 
-    Two close landmarks may have exchanged some rays. Then both lie between the objects, and no single ray fits the other one
-    better. With more noise of the rays than there is, the appearance decides (deterministic annealing, Rose 1998). Each
-    label keeps its earlier landmarks if the new ones explain its rays no better.
+    Two close landmarks may have exchanged some rays. Then both landmarks lie between the objects, and no single ray fits the
+    other landmark better. If the noise of the rays is assumed larger than it is, the appearance decides (deterministic
+    annealing, Rose 1998). Each label keeps its earlier landmarks if the new ones explain its rays no better.
     """
     obs, begin = state.obs, _learned(state)
     if begin.ratio is None:
@@ -168,9 +168,9 @@ def _seems_to_move(task: _Task, state: State, likely: Floats) -> Bools:
 def _at_rest(task: _Task, state: State, refuted: Bools, moving: State) -> tuple[State, Bools]:
     """Replace landmarks that seem to move by several at rest, if these explain nearly all of their rays.
 
-    The rays to one thing may cross those to another thing of its label between the two. If they come at different times, a
-    point there seems to move from one thing to the other. It can have more rays than each of them, so that a search finds
-    it each time. Points at rest explain only parts of the path of a thing that really moves.
+    The rays to two things of one label may cross between the two things. If the things are seen at different times, a point
+    at the crossing seems to move from one thing to the other. This point can have more rays than each thing, so every search
+    finds it. Points at rest explain only parts of the path of a thing that really moves.
     """
     left = state.keep(~_seems_to_move(task, state, existence(state, task.gate)))
     other, more, _ = _search(task, left, moving.landmarks)
@@ -227,11 +227,11 @@ def _alternate(task: _Task, state: State, times: int = 3) -> State:
 
 
 def _by_size(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats]:
-    """Assign the rays once more, by bearing and size. likely: (N,) of the landmarks. It is returned for those that keep
-    enough rays.
+    """Assign the rays once more, by bearing and size. likely: (N,) probability that each landmark exists. It is also
+    returned, for the landmarks that keep enough rays.
 
-    Sizes count only here. While the existence of an often hidden landmark is judged, it needs every ray. sized: (R,) whether
-    the camera of each ray sees sizes.
+    Sizes count only here, at the end. Before, an often hidden landmark needs every ray, or it would be dropped. sized: (R,)
+    whether the camera of each ray sees sizes.
     """
     obs = state.obs
     every = alternate(

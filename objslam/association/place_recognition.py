@@ -15,9 +15,9 @@ from objslam.core.geometry import lift_se2
 from objslam.core.statistics import POSSIBLE_MOTION, SAME_POINT_WIDE
 
 MIN_LANDMARKS = 2
-"""The fewest common landmarks for recognising a place."""
+"""The fewest common landmarks for recognising a place. A larger number recognises fewer places."""
 POSE_FLOOR = (0.02, 0.02, 0.01)
-"""The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
+"""The least standard deviations of a relative pose, in x, y (m) and yaw (rad). Larger values trust it less."""
 _BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood: a constant (m), and a part per metre from the pivot.
 _MARGIN = 2.0  # The margin (m) around the landmarks that is part of the area for their density.
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
@@ -59,8 +59,8 @@ class Recognition:
     """One constellation found in another.
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
-    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the second-best place,
-    which counts as at least 0.
+    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the second-best place.
+    The evidence of the second-best place counts as at least 0.
     """
 
     correction: Floats

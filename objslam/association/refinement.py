@@ -7,9 +7,11 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import HALF_RAY, grouped_quantiles
 
 RANGE_GAIN = 6.0
-"""A perfect range lowers the cost of a match by this. Another object would rarely have this range."""
+"""A perfect range lowers the cost of a match by this, because another object would rarely have this range. A larger value
+trusts ranges more."""
 RANGE_LOSS = 4.0
-"""A wrong range raises the cost of a match by at most this. About one correct box in ten has a wrong range."""
+"""A wrong range raises the cost of a match by at most this. About one correct box in ten has a wrong range. With a larger
+value, more correct boxes are lost."""
 BEHIND = 1e6
 """The deviation, in standard deviations, of a point behind the camera: large, but finite."""
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.

@@ -73,8 +73,8 @@ def frames_of(
 class DetectionHistory:
     """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
-    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, near enough for a
-    detection: within the usual distances of the class, or as near as a box of the object was.
+    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, and whose camera is
+    near enough to detect it: within the usual distances of the class, or no farther than the object's farthest box.
     """
 
     object: Ints

@@ -31,7 +31,7 @@ _POWER = 0.4
 """The log odds against strays are multiplied by this factor, and then become a probability. It is below 1, because boxes of
 near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes the
 probabilities about 0.1 too large. A larger factor makes them larger."""
-_SAMPLE = 512  # The most rays of one label in a search, in whole frames. A larger number costs time squared.
+_SAMPLE = 512  # The most rays of one label in a search. The time grows with the square of this number.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
 
@@ -84,8 +84,8 @@ def add_few_ray_objects(
 
 @dataclass(frozen=True)
 class _Few:
-    """A search for more landmarks beside known ones. free: (F,) the rays that may show others. strays: what is known of
-    stray rays. gate: the largest squared deviation of a match."""
+    """A search for more landmarks beside known ones. free: (F,) the rays that may show such landmarks. strays: the density
+    of stray rays. gate: the largest squared deviation of a match."""
 
     known: State
     free: Ints
@@ -132,7 +132,7 @@ class _Few:
         )
 
     def merged(self, found: State) -> State:
-        """Merge new landmarks that are one object. Drop those that are one object with a known landmark."""
+        """Merge new landmarks that are one object. Drop those whose object has a known landmark."""
         every, known = self.joined(found), self.known.count
         if every.count < 2:
             return found

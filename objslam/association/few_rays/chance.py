@@ -1,8 +1,9 @@
 """Estimate how unlikely it is that the rays of a landmark meet by chance.
 
-Two explanations of the rays are compared: one object, or as many stray boxes. The strays are as frequent, and lie in the
-images and in range, as the boxes of the label in this log. The odds need no least number of rays. They are the score of a
-track in multiple hypothesis tracking (Blackman, IEEE AES Magazine 19, 2004), with the unknown position integrated out.
+Two explanations of the rays are compared: all rays show one object, or each ray is from a stray box. Stray boxes are assumed
+to be distributed, over the images and over the ranges, like the boxes of their label in this log. The odds need no least
+number of rays. They are the score of a track in multiple hypothesis tracking (Blackman, IEEE AES Magazine 19, 2004), with
+the unknown position integrated out.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ MOST_ODDS = 20.0
 _BINS = 256
 """The number of bins of a density along one coordinate. A larger number resolves narrower densities, and is slower."""
 _OUTSIDE = 1e-6
-"""The density of boxes where no box of the log is near. It only keeps logarithms finite."""
+"""The density of boxes in the units of `_Density`, where no box of the log is near. It only keeps logarithms finite."""
 _LOG_RANGE = 4.6
 """The width of the uniform density of ln range if no range is known. It is a factor of 100 in range."""
 _WRONG_RANGE = 0.1
@@ -31,8 +32,9 @@ _WRONG_RANGE = 0.1
 _TRIED = 25
 """The number of tried values, for the share of strays and for the density of objects. A larger number is more exact."""
 _DENSITIES = (1e-4, 10.0)
-"""The limits of the factor on the density of objects that follows from the density of boxes. Objects do not lie everywhere
-where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
+"""The density of objects is first computed from the density of boxes, and then multiplied by a factor between these limits.
+The factor is needed because objects do not lie everywhere where boxes could show them. A larger upper limit keeps more
+landmarks with few rays."""
 _PRIOR_STRAYS = 1.0
 """The number of strays of each label that are assumed beside those of the log. A larger number keeps fewer landmarks."""
 _LOOK = np.radians(2.0)
@@ -156,7 +158,7 @@ def ray_odds(
     """Return the log odds (..., R) that each ray shows its point and is no stray, and the density of strays, m^-2.
 
     number: (..., R) strays of the label in the log. off2, distance: (..., R) m^2, m, of the point from the ray and from the
-    camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs no more.
+    camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs as much as one at the gate.
     """
     spread = noise**2 * ((obs.sigma * distance) ** 2 + obs.position_sigma**2)
     density = strays.per_frame(number) * strays.image / distance**2
@@ -213,7 +215,8 @@ def _looks(state: State) -> Floats:
     """Return the number (N,) of independent looks at each landmark.
 
     Strays from nearly one place are often one thing: an error that the detector repeats in the next image, or an object
-    that moves slowly. So a ray counts by the angle between it and the ray before it, seen from the landmark, up to 1.
+    that moves slowly. So the weight of a ray is the angle, seen from the landmark, between it and the ray before it, divided
+    by `_LOOK`. The weight is at most 1, and the first ray has the weight 1.
     """
     order = np.lexsort((state.obs.frame[state.assigned], state.owner))
     owner = state.owner[order]

@@ -26,7 +26,7 @@ _DAMPING = 1e-6
 
 @dataclass(frozen=True)
 class SparseSearch:
-    """The settings of a search. strays: what is known of stray rays. number: how many stray boxes the label has in the log.
+    """The settings of a search. strays: the density of stray rays. number: how many stray boxes the label has in the log.
     gate: largest squared deviation of a pair. parallax: least angle (rad) of a pair. least: the least log odds of a
     point."""
 
@@ -83,7 +83,7 @@ def _meetings(obs: Observations, search: SparseSearch) -> tuple[Ints, Ints, Floa
 
 
 def _odds(obs: Observations, search: SparseSearch, points: Floats, rays: Ints) -> Floats:
-    """Return the log odds (H,) of points (H, 3) m from a few rays (S, H) each."""
+    """Return the log odds (H,) of points (H, 3) m. rays: (S, H) the S rays from which each point was made."""
     total, objects, away = np.zeros((3, len(points)))
     information = np.zeros((len(points), 3, 3))
     for ray in rays:

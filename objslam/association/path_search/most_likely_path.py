@@ -1,10 +1,10 @@
 """Find the most likely path of a robot through a map of landmarks, when each ray may belong to any landmark.
 
-A path that is bent onto wrong landmarks fits them well, so no small change improves it. This search is global: it moves
-whole visits from landmarks to their neighbours. It is Markov localisation on a grid (Fox, Burgard and Thrun 1999). The
-states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays tell how well a state fits
-the map, and the odometry tells how well the states of two stretches fit together. Dynamic programming finds the most likely
-states of all stretches (Viterbi 1967).
+A path that is bent onto wrong landmarks fits them well, so no small change improves it. This search is global: it tries to
+move each stretch of the path from wrong landmarks to landmarks beside them. It is Markov localisation on a grid (Fox,
+Burgard and Thrun 1999). The states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays
+tell how well a state fits the map, and the odometry tells how well the states of two stretches fit together. Dynamic
+programming finds the most likely states of all stretches (Viterbi 1967).
 """
 
 from dataclasses import dataclass

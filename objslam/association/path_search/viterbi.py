@@ -107,8 +107,8 @@ def _steps_to(state: int, count: int) -> slice:
 def _least(total: Cells, cost: Cells) -> Cells:
     """Return the least sum (Y, X, n) of a state before and a step along the second axis, to each state.
 
-    The sum counts as at most `_SLIP`, so only the steps that cost less are tried. The odometry drifts by few grid steps
-    between two stretches, so they are few. All sums at once take three times as long.
+    The sum counts as at most `_SLIP`, so only the steps that cost less are tried. These are few steps, because the odometry
+    drifts little between two stretches. All sums at once take three times as long.
 
     Args:
         total: (Y, X, n) of the states before.

@@ -4,8 +4,8 @@ Each map measures its objects in a frame of its own. A frame has x, y, z and yaw
 frame is the frame of the result. All objects of a map share an error: a shift, a turn and a wrong size
 (`core.maps.shared_covariance`). It is a variable too, with its covariance as the prior. So a map whose size is uncertain
 takes the size of a map whose size is known. The time of a Gauss-Newton step grows with the number of measurements, and with
-the cube of the number of objects or of maps, whichever is smaller (`ArrowSystem`). Cauchy's weights limit what moved objects
-do.
+the cube of the number of objects or of maps, whichever is smaller (`ArrowSystem`). Cauchy's weights limit the effect of
+moved objects.
 
 The errors that are not shared may be larger than the covariances say: objects are nudged, and their boxes differ from day to
 day. The residuals show this. With at least three maps, the variance of each map is estimated against all others (variance
@@ -96,8 +96,8 @@ class _State:
 
 
 def solve_frames(measured: Measured, site_T_map: Floats, count: int, *, judged: bool = True) -> JointFrames:
-    """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object has a
-    measurement.
+    """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object has at least
+    one measurement.
 
     Each frame must share at least two objects with the first, directly or through other frames. If one does not, the
     covariances of all frames after the first are NaN. judged: whether the noise of the maps is estimated.
@@ -175,15 +175,17 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
     poses[:, 2, 3] = x[:, 2]
     covariance = own + correlated @ np.swapaxes(correlated, 1, 2)
     known = 4 + errors.shape[1] - np.diagonal(spread, axis1=1, axis2=2)[:, 4:].sum(axis=1)
-    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 / len(x)  # One frame is free to choose. No map is special in that.
+    # The frame of the result is a free choice, so its 4 coordinates are not taken from the residuals of any one map.
+    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 / len(x)
     found = JointFrames(poses, spread[:, :4, :4], positions, covariance, own, correlated, weight, noise)
     return _State(found, errors, taken)
 
 
 def _mean_weight(information: Floats, total: Floats, object_: Ints) -> Floats:
-    """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3). total: (N, 3, 3), its sums."""
+    """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3) of the measurements. total:
+    (N, 3, 3), its sum for each object."""
     share = np.trace(information @ np.linalg.inv(total)[object_], axis1=1, axis2=2)
-    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The fit of an object's position takes its share.
+    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The fit of the position makes residuals smaller.
     return np.asarray((1 / (1 + left / HALF_RAY)).mean(axis=1))
 
 

@@ -116,7 +116,9 @@ def own_errors(position: Floats, covariance: Floats, shared: Floats) -> Floats:
 
 
 def strain(position: Floats, shared: Floats) -> Floats:
-    """Return the covariances (N, 3, 3), m^2, of what the tilt and the size of a map do to objects at (N, 3) m from its
-    centre."""
+    """Return the covariances (N, 3, 3), m^2, of the errors that the tilt and the size of a map cause at objects.
+
+    position: (N, 3) m, relative to the centre of the map. shared: (7, 7) the covariance of the shared error.
+    """
     lever = jacobian(position)[:, :, _STRAIN]
     return np.asarray(lever @ shared[np.ix_(_STRAIN, _STRAIN)] @ np.swapaxes(lever, 1, 2))
