@@ -93,7 +93,7 @@ def settings_of(
     names: str | None = None,
 ) -> Settings:
     """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides the others, which override
-    --config. Files of a calibration and of names are read too, so that a wrong one fails before a long log is read."""
+    --config. Files of a calibration and of names are read too, so that a wrong file fails before a long log is read."""
     import yaml
 
     from objslam.config import load_settings
