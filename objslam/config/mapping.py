@@ -151,8 +151,8 @@ class Fixed(Section):
 
     loss: Loss = "l1"
     """Robust loss of a ray. l1 is Eq. 1, the sum of the distances between an object and its rays. It draws an object seen
-    from few sides towards the robot. The other losses are on the angle of a ray in units of its noise. They are better in
-    such drives, and no better in recorded ones."""
+    from few sides towards the robot. The other losses are on the angle of a ray in units of its noise. In such drives they
+    are better than l1. In recorded drives they are not."""
 
 
 class Joint(Section):
