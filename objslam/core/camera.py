@@ -19,7 +19,7 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 }
 """The numbers of distortion coefficients that each model accepts."""
 
-_STEPS, _FINER = 2000, 4  # The angles of the grid that finds the fold of a lens, and its refinements. More are more exact.
+_STEPS, _FINER = 2000, 4  # The angles in the grid that finds the fold of a lens, and the refinements. More are more exact.
 _ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More are more exact and slower.
 _LEAST = 1e-9  # The least solid angle of a camera, sr. It keeps a division by the solid angle finite.
 _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step to stop at (rad) and the least divisor.

@@ -19,8 +19,9 @@ class NoiseFactors:
     rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges: `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`.
     along: `odometry.x_per_m` and `odometry.xy_per_rad`. across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the
     odometry's noise of the heading. heading: `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a
-    joint solve makes all lengths too short. The other four are no factors: heading_share, place_share are the shares of the
-    variance of these errors that last, and heading_seconds, place_seconds how long (`Lasting`).
+    joint solve makes all lengths too short. The other four describe lasting errors (`Lasting`) of localised headings and
+    places. heading_share, place_share: the share of the variance that lasts. heading_seconds, place_seconds: how long it
+    lasts, s.
     """
 
     rays: float = 1.0

@@ -127,7 +127,8 @@ def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[flo
 def quantile(values: Floats, share: float) -> float:
     """Return the value at a share (0 to 1) of the sorted values (R,), at least one, interpolated between two neighbours.
 
-    `np.quantile` returns the same. For some tens of values it takes ten times as long, and a session asks at each keyframe.
+    `np.quantile` returns the same. For some tens of values it takes ten times as long, and a session needs it at each
+    keyframe.
     """
     ordered, at = np.sort(values), share * (len(values) - 1)
     below = int(at)

@@ -199,8 +199,9 @@ class Keyframes:
     parts of the errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the coordinate frame of
     the first odometry pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error
     since its start, in the frame of odom_T_base. stretch: (K,) the stretch of the odometry between two gaps, None means one
-    for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step, wander: (K,), (K, 6) by
-    `frontend.odometry_bridge`, None if the odometry is exact between its poses.
+    for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step: (K,) the place of each
+    keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are those of `OdometryBridge.at`
+    in `frontend`, and None if the odometry is exact between its poses.
     """
 
     stamps: Floats
@@ -273,7 +274,7 @@ class Rays:
     origin. corners: (R, 4, 3) unit, in the camera frame, the directions to the corners of a square fiducial, NaN for another
     object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
     the cut off boxes of the same images, None if they were not collected. feature: (R,) the row of each ray's appearance
-    vector in feature_table, -1 without one. Both are None if no ray has one.
+    vector in feature_table, -1 without a vector. feature and feature_table are None if no ray has a vector.
     """
 
     keyframe: Ints

@@ -108,7 +108,7 @@ def rigid_pose(pose: Floats) -> Floats | None:
 def _is_exact(pose: Floats) -> bool:
     """Return whether a pose (4, 4) is rigid, and its rotation exact up to rounding.
 
-    A session asks for every pose, and nearly all are. This function avoids numpy, and takes a tenth of the time of
+    A session checks every pose, and nearly all are exact. This function avoids numpy, and takes a tenth of the time of
     `rigid_poses`.
     """
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = pose.tolist()

@@ -14,8 +14,7 @@ MAX_FEATURES = 8192
 """The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. No common image
 encoder has more than half of it."""
 _COMPACT = 64
-"""The number of numbers to which long vectors are shortened in association. A larger number keeps finer differences, and is
-slower."""
+"""The length to which long vectors are shortened in association. A larger number keeps finer differences, and is slower."""
 _SAMPLE = 20_000
 """The most vectors from which the directions of the shortened vectors are found. A larger number takes longer."""
 _ROUNDING = 1e-6
