@@ -14,7 +14,8 @@ from objslam.core.types import TruthObject
 from objslam.evaluation.alignment import Transform
 
 _SQUARE = 1.1
-"""The ratio of true length and width below which an object has no heading to compare. A larger ratio compares fewer."""
+"""The ratio of true length and width below which an object has no heading to compare. A larger ratio compares fewer
+headings."""
 
 
 @dataclass(frozen=True)
