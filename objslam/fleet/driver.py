@@ -34,8 +34,8 @@ all."""
 class Mapped:
     """The driver's summary of a mapped log.
 
-    key: the key of the result. begin: the first stamp of the path, s. warnings: their number. seconds: how long the task
-    took, s. report: whether the result has a report.html. new: whether this run mapped the log.
+    key: the key of the result. begin: the first stamp of the path, s. warnings: the number of warnings. seconds: how long
+    the task took, s. report: whether the result has a report.html. new: whether this run mapped the log.
     """
 
     place: LogPlace
@@ -53,7 +53,7 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A log or a site that failed. name: the path of the log, or the site. place: of the log, None for a site.
+    """A log or a site that failed. name: the path of the log, or the site. place: where the log was found, None for a site.
 
     kind: `log` if something is wrong with the log, `site` for a site, else the kind of the task's `Answer`.
     """

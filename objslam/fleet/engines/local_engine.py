@@ -62,7 +62,7 @@ def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
 def local_engine(jobs: int, limits: Limits) -> Engine:
     """Return the engine of this machine, with `jobs` processes. Each does one task at a time.
 
-    Each process has a thread that waits for its answers, and computes nothing.
+    For each process, a thread of this program waits for the answers. It computes nothing.
     """
 
     def run(work: str, arguments: Iterable[Any]) -> Iterator[Answer]:
