@@ -37,9 +37,10 @@ class OdometryBridge:
 
         The mean velocities in two neighbouring steps of T and U seconds differ. If the velocity is white noise of density q,
         their difference has the variance q (1 / T + 1 / U), and the path wanders by q T. If the velocity is a random walk of
-        density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, the latter has the mean of p T^3
-        / 15 * s (1 - s). Between a step and the next but one, white noise gives the same variance as between neighbours, and
-        a random walk gives 2.5 times as much. This tells, for each axis, which share of the changes is a random walk.
+        density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, this second variance has the
+        same mean as p T^3 / 15 * s (1 - s), which is used instead. Between a step and the next but one, white noise gives
+        the same variance as between neighbours, and a random walk gives 2.5 times as much. This tells, for each axis, which
+        share of the changes is a random walk.
         """
         seconds = np.diff(odometry.stamps)[:, None]
         velocity = log_se3(inverse(odometry.poses[:-1]) @ odometry.poses[1:]) / seconds
