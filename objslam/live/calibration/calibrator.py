@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
 
 _GROWTH = 1.5
-"""A calibration begins when the number of keyframes has grown by this factor since the last one began. As the intervals
-grow, the time of all calibrations is proportional to the number of keyframes. A larger factor calibrates more rarely."""
+"""A calibration begins when the number of keyframes has grown by this factor since the last calibration began. As the
+intervals grow, the time of all calibrations is proportional to the number of keyframes. A larger factor calibrates more
+rarely."""
 _DELAY = 0.15
 """The map is corrected when the number of keyframes has grown by this share since the calibration began. If the worker is
 done by then, the map does not depend on the machine's speed. A larger share suits slower machines, but corrects later."""

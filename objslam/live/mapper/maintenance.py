@@ -36,8 +36,8 @@ _VISITS = 6
 """The least number of changes between inliers and outliers, in time order, that shows two objects of a label. Drift makes
 one run of outliers, which has two changes. A larger number needs more visits to both objects."""
 _DRIFT = 5.0
-"""The largest drift of a path, as a multiple of that in the settings, that may move an object. Real robots need up to 3.3. A
-larger value needs objects that are farther apart, or more visits to both."""
+"""The largest assumed drift of a path, as a multiple of the drift in the settings. Real robots drift by up to 3.3 times.
+With a larger value, two objects of a label are recognised as two only if they are farther apart, or visited more often."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The camera may soon see this share of the image beyond its edge. A larger share prepares more landmarks.
 _USUAL = 0.75  # Every landmark may be seen up to this quantile of all `far`. A larger value prepares more landmarks.
@@ -47,8 +47,8 @@ _USUAL = 0.75  # Every landmark may be seen up to this quantile of all `far`. A 
 class _SecondObject:
     """Another object of the label of a landmark.
 
-    row: of the landmark. rays: (n,) the rows of the rays that show it. fit: its position. obs: these rays in map. far: if
-    no drift of the path explains its distance.
+    row: of the landmark. rays: (n,) the rows of the rays that show it. fit: its position. obs: these rays in map. far:
+    whether no drift of the path explains its distance from the landmark.
     """
 
     row: int

@@ -12,8 +12,8 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is added
-to it, which overestimates it. A larger number overestimates it more."""
+"""Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is
+added, so the covariance is too large. With a larger number, it is larger still."""
 
 
 @dataclass(frozen=True)
