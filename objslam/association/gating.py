@@ -273,8 +273,8 @@ def alternate(
 ) -> State:
     """Alternate between assignment and refinement until no ray changes its landmark, at most `times` times.
 
-    plausible: returns which landmarks (N,) stay. unmatched: returns for each match the cost (E,) of its ray if it had no
-    landmark. If not given, this cost is the gate.
+    plausible: returns which landmarks (N,) stay. unmatched: returns for each match the cost (E,) of its ray if the ray had
+    no landmark. If not given, this cost is the gate.
     """
     for _ in range(times):
         obs, old, before = state.obs, state.landmarks, state.matched

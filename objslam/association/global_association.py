@@ -281,8 +281,8 @@ def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
 def _drop(task: _Task, state: State, likely: Floats) -> State:
     """Drop landmarks whose probability (N,) is below association.min_existence.
 
-    If two neighbours of one label both fail, the one with more rays is kept in this call. It may get boxes back from the
-    other one, and the next call judges it again.
+    If two neighbours of one label both fail, the neighbour with more rays is kept in this call. It may get boxes back from
+    the other neighbour, and the next call judges it again.
     """
     failing = likely < task.settings.min_existence
     if not failing.any():

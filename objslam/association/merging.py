@@ -92,7 +92,7 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 def _on_one_line(state: State, gate: float) -> Ints:
     """Return the pairs (P, 2) in which at least half of the first landmark's rays also pass the second landmark. This
-    happens with little parallax, or if one of them is a phantom."""
+    happens with little parallax, or if one of the landmarks is a phantom."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray]
     other = (own >= 0) & (own != edges.landmark)
@@ -115,7 +115,8 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
     """Return the decrease (P,) of -2 ln likelihood by one object instead of two.
 
     It counts the fit of the rays, second boxes in one frame, missed detections, the appearance, and the number of objects.
-    both_seen, both_expected: (P,) the numbers of frames in which both landmarks are detected, and in which both should be.
+    both_seen, both_expected: (P,) the numbers of frames in which both landmarks are detected, and in which both should be
+    detected.
     """
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise

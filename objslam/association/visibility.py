@@ -1,4 +1,4 @@
-"""Find in which frames each object should be detected, and in which it is."""
+"""Find in which frames each object should be detected, and in which it is detected."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -217,8 +217,8 @@ def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, ca
 def _in_image(
     position: Floats, extent: Floats, reach: Floats, camera: Camera, frames: Ints, view: CameraFrames
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box inside an image. reach: (N,) m, up
-    to which distance each object counts."""
+    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box inside an image. reach: (N,) m,
+    the distance up to which each object counts."""
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, poses[:, :3, 3] - centre, poses[:, :3, 2]

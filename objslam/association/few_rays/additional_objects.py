@@ -146,7 +146,8 @@ class _Few:
     def dropped(self, found: State, least: float) -> State:
         """Drop landmarks until all that are left are likely enough to exist.
 
-        If two neighbours both fail, the one with more rays stays for one more turn. It may get rays of the other one.
+        If two neighbours both fail, the neighbour with more rays stays for one more turn. It may get rays of the other
+        neighbour.
         """
         while (failing := self.existence(found) < least).any():
             number, label = found.ray_count, found.label

@@ -175,7 +175,7 @@ def ray_odds(
 
 
 def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> Floats:
-    """Return for each match the cost (E,) of its ray if it had no landmark.
+    """Return for each match the cost (E,) of its ray if the ray had no landmark.
 
     It is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most `gate`.
     So it matters only where strays are dense compared with the noise of the rays. Boxes within the gate of the landmark do

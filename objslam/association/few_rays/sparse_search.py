@@ -1,7 +1,7 @@
 """Search for objects with few rays: points on which free rays of one label agree more closely than by chance.
 
-The search for well seen objects counts the rays at a point. This one adds up their log odds against chance, so two rays, or
-one ray with a range, can be enough where strays are rare.
+The search for well seen objects counts the rays at a point. This search adds up their log odds against chance, so two rays,
+or one ray with a range, can be enough where strays are rare.
 """
 
 from dataclasses import dataclass

@@ -43,7 +43,7 @@ _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 gives the expectation of a weighted squared residual. More steps give it more exactly."""
 _STILL = 1e-6
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner. With Cauchy's weights, each step is about
-half of the one before. So at the end the positions are wrong by about this much, which is a thousandth of the errors of the
+half of the step before. So at the end the positions are wrong by about this much, which is a thousandth of the errors of the
 best maps."""
 
 
@@ -67,9 +67,9 @@ class JointFrames:
     """S frames and N objects in the frame of the first map.
 
     site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
-    (N, 3) m. covariance: (N, 3, 3) m^2. own: (N, 3, 3) m^2, the part of it that an object has alone. correlated: (N, 3, m)
-    m, the other part, as a factor of the joint covariance. weight: (R,) the weight of each measurement, in [0, 1]. noise:
-    (S,) the factor, at least 1, on the covariances of the errors that are not shared. 1 for one map alone.
+    (N, 3) m. covariance: (N, 3, 3) m^2. own: (N, 3, 3) m^2, the part of the covariance from errors that an object has alone.
+    correlated: (N, 3, m) m, the rest, as a factor of the joint covariance. weight: (R,) the weight of each measurement, in
+    [0, 1]. noise: (S,) the factor, at least 1, on the covariances of the errors that are not shared. 1 for one map alone.
     """
 
     site_T_map: Floats

@@ -40,7 +40,7 @@ _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
 fitted). Larger numbers find smaller overlaps and take longer."""
 _LIMITS = (SAME_POINT, SAME_POINT / 2)
 """The largest squared Mahalanobis distances of a match, one for each count of matches. The best count is the evidence. The
-first holds 99 % of true matches, the second 87 %. With tighter ones, simulated groups of three equal objects gave false
+first holds 99 % of true matches, the second 87 %. With tighter limits, simulated groups of three equal objects gave false
 alarms more often than the log odds say."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
@@ -140,7 +140,7 @@ def _nothing() -> Registration:
 
 def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
     """Fit the best transforms to the objects around their pair, then to more, then to all (`_STAGES`). Return the remaining
-    ones (H, 4). first: the first object of a in the pair of each transform."""
+    transforms (H, 4). first: the first object of a in the pair of each transform."""
     for size, entering in _STAGES:
         first, x = first[:entering], x[:entering]
         index = around(problem.a, first, size)

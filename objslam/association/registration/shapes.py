@@ -1,8 +1,8 @@
 """The shape of a map: how its objects lie to each other, and which of their errors a transform of the map can absorb.
 
 The error of object i is o_i + L_i e. o_i is its own, and e has the seven numbers that all objects of the map share
-(`core.maps.shared_covariance`): g, a shift and a yaw, and d, a tilt and a size. With J_i and D_i for the columns of L_i that
-belong to g and d, the offset y_i of a matched object from its partner is, to first order,
+(`core.maps.shared_covariance`): g is a shift and a yaw, and d is a tilt and a size. With J_i and D_i for the columns of L_i
+that belong to g and d, the offset y_i of a matched object from its partner is, to first order,
 
     y_i = J_i x + J_i g + D_i d + o_i.
 
@@ -10,7 +10,7 @@ x is the transform between the maps, about which nothing is known before. A chan
 Three things follow.
 
 1. The residuals of a fit of x do not depend on g. So only o_i + D_i d may widen gates, and only their covariance is that of
-   an offset. Anything else would take chance matches for true ones.
+   an offset. Anything else would take chance matches for true matches.
 2. The best estimate of x is the same with and without g in the covariance of the offsets (Rao 1967). For any weights, a fit
    is x + sum_i K_i (y_i - J_i x), and sum_i K_i J_i = 1. Its error is g + sum_i K_i (D_i d + o_i). So the covariance of x
    gets that of g back, whole, however many objects match.
