@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SPOILT = 1
 """The exit code if the input has an error that makes the positions of a map unreliable."""
-_ROWS = 8  # The most hypotheses in the table, besides the log as it is. The ones left out explain less.
+_ROWS = 8  # The most hypotheses in the table, besides the log as it is. Other hypotheses explain less.
 
 
 @with_options
