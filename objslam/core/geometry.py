@@ -161,7 +161,7 @@ def exp_se3(twist: Floats) -> Floats:
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
     """Return for rotation vectors (..., 3) three arrays (..., 1): the angles, whether each is so small that a series is
-    needed, and the angles as divisors, with 1 for the small ones."""
+    needed, and the angles as divisors, in which 1 replaces small angles."""
     angle = np.sqrt(np.einsum("...i,...i->...", omega, omega))[..., None]
     small = angle < _SMALL
     return angle, small, np.where(small, 1.0, angle)

@@ -12,7 +12,7 @@ from objslam.core.arrays import Array, Bools, Floats32
 
 MAX_FEATURES = 8192
 """The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. No common image
-encoder has more than half of it."""
+encoder has more than half of this number."""
 _COMPACT = 64
 """The length to which long vectors are shortened in association. A larger number keeps finer differences, and is slower."""
 _SAMPLE = 20_000
@@ -88,8 +88,8 @@ def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
 def ranked(vectors: Sequence[Floats32], query: ArrayLike, count: int) -> list[tuple[int, float]]:
     """Return the indices of the vectors (D,) with the largest cosines to a vector, and these cosines, the largest first.
 
-    Vectors of another length than that of the query are left out. count: the most vectors to return. ValueError if the query
-    is no vector, cannot be scaled, or if no vector has its length.
+    Vectors that have not the length of the query are left out. count: the most vectors to return. ValueError if the query is
+    no vector, cannot be scaled, or if no vector has its length.
     """
     given = np.asarray(query, dtype=np.float64)
     if given.ndim != 1 or not len(given):

@@ -60,7 +60,8 @@ class SpatialIndex:
         return np.asarray(near[((some >= low) & (some <= high)).all(axis=1)])
 
     def _near(self, place: Floats, radius: float, norm: float) -> Ints:
-        """Return a few more points than those at most `radius` m from a place, in order. norm: 2 or infinity."""
+        """Return all points at most `radius` m from a place, and a few that are slightly farther, in order. norm: 2 or
+        infinity."""
         found = self._tree(len(place)).query_ball_point(place, _wider(radius), p=norm)
         return self.finite[np.sort(np.asarray(found, dtype=np.int64))]
 
