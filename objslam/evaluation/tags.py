@@ -1,4 +1,4 @@
-"""Compare the rotations of fiducials with true ones."""
+"""Compare the rotations of fiducials with the true rotations."""
 
 from __future__ import annotations
 
