@@ -179,7 +179,7 @@ def lens_errors(error: Mapping[str, float], name: str) -> tuple[float, float, fl
 
 
 def inverse_lens(errors: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the errors `LENS` whose correction undoes the correction of the given ones."""
+    """Return the errors `LENS` whose correction undoes the correction of the given errors."""
     longer = 1 + errors[0]
     return 1 / longer - 1, -errors[1] / longer, -errors[2] / longer
 

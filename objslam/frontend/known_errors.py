@@ -69,8 +69,8 @@ def possible(log: Log, settings: Settings) -> list[str]:
     """Return the names of the errors of a log that the settings do not fix.
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
-    position have no errors, unless settings.calibration.use is true. Neither has its lens in fixed mode, because such poses
-    come from images of this lens, or were calibrated with it.
+    position have no errors, unless settings.calibration.use is true. In fixed mode its lens has no errors either, because
+    such poses come from images of this lens, or were calibrated with it.
     """
     asked = settings.calibration.use is True
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}

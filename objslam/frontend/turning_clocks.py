@@ -72,7 +72,8 @@ def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
 
 
 def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Floats) -> Floats:
-    """Return the mean angle (m,), rad, between second bearings and first ones that are turned opposite to the odometry.
+    """Return the mean angle (m,), rad, between the second bearing of each pair and the first bearing turned opposite to the
+    odometry.
 
     stamps: (n, 2) s and bearings: (n, 2, 3), of `_pairs`. offsets: (m,) s, of the clock.
     """

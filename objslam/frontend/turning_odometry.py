@@ -12,7 +12,7 @@ _LONGEST = 1.0
 """The longest time (s) between two boxes of a track that follow each other. Over a longer time, the robot drives past the
 thing, and the next box is not where the odometry expects it."""
 _NEAR = np.radians(6.0)
-"""The largest angle (rad) between a ray and the one before it in its track, turned by the odometry. A thing beside the robot
+"""The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
 moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
 _TURN, _TIME = 0.6, 4.0
 """A window ends after this turn (rad), or after this time (s). In a larger window, a track spans more of the turn, but the
@@ -35,10 +35,10 @@ _FLAT = 1e-4
 def with_turns_of_tracks(errors: SharedErrors, theta: Floats) -> Floats:
     """Return shared errors (P,), but with the error of the odometry's turns that the tracks of boxes show.
 
-    A track is a chain of boxes of one label, each where the odometry expects the one before. While the robot turns, its
-    rays meet in one point only at poses that turn by the right angles. Each window of the drive gives an estimate of the
-    error. The weighted median of these estimates is combined with the prior, weighted by their variances. The noise of the
-    median is the noise of turns in the settings, or more if the windows disagree by more.
+    A track is a chain of boxes of one label. Each box is near the place where the odometry expects the box before it. While
+    the robot turns, the rays of a track meet in one point only at poses that turn by the right angles. Each window of the
+    drive gives an estimate of the error. The weighted median of these estimates is combined with the prior, weighted by
+    their variances. The noise of the median is the noise of turns in the settings, or more if the windows disagree by more.
 
     The first association of a drive takes this error as given. With turns that err by 8 %, a half turn at the end of an
     aisle errs by 14 degrees. Things that are seen again from the next aisle are then taken for their neighbours.
