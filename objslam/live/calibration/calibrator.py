@@ -39,7 +39,7 @@ def observed(found: Calibration, now: Floats) -> Calibration:
     """Return a calibration in which errors that the session does not observe keep their present values, `now` (P,).
 
     Otherwise, noise would move the map with each calibration. Observed errors get their most probable values, given the
-    kept ones.
+    values that are kept.
     """
     stay = found.sigma > OBSERVABLE * found.prior
     if not stay.any():
@@ -72,15 +72,15 @@ class Calibrator:
         """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
-        # The number of keyframes when a calibration began, and its request. Once the worker has it, it is dropped to save
-        # memory.
+        # The number of keyframes when a calibration began, and its request. Once the worker has the request, it is dropped
+        # to save memory.
         self._asked: tuple[int, CalibrationRequest | None] | None = None
         self._worker: Worker[Calibration | None] = Worker()
         self._known: deque[CalibrationMessage] = deque()
         self._replaying = False
 
     def expect(self, known: Iterable[CalibrationMessage]) -> None:
-        """Apply the calibrations of a journal, each at its keyframe. Start no new ones until `begin`."""
+        """Apply the calibrations of a journal, each at its keyframe. Start no new calibrations until `begin`."""
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:

@@ -61,8 +61,8 @@ class Intake:
     It converts stamps to session time, in which the stamps of the path always increase. After a restart of the robot's
     odometry, it converts the new poses, so that they continue the old path.
 
-    deliver(message, arrival): takes one message at a time, in the thread that pushes. arrival: s, by `time.perf_counter`. It
-    returns whether it accepts the message, and counts the refused ones.
+    deliver(message, arrival): takes one message at a time, in the thread that pushes, and returns whether it accepts the
+    message. It counts the messages that it refuses. arrival: s, by `time.perf_counter`.
     """
 
     def __init__(self, settings: Settings, counters: Counters, deliver: Callable[[Message, float], bool]) -> None:
