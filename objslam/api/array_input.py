@@ -28,7 +28,7 @@ def as_camera(camera: Camera) -> Camera:
 
 
 def as_poses(values: ArrayLike) -> Floats:
-    """Return poses (N, 4, 4) from rows (N, 3) x, y, yaw, rows (N, 7) x, y, z, qx, qy, qz, qw, or matrices (N, 4, 4).
+    """Return poses (N, 4, 4) from matrices (N, 4, 4), or from rows (N, 3) of x, y, yaw or (N, 7) of x, y, z, qx, qy, qz, qw.
 
     Units are m and rad. ValueError for another shape, or if a pose is not finite and rigid.
     """

@@ -32,7 +32,8 @@ class Trajectory(types.Trajectory):
     def from_arrays(cls, stamps: ArrayLike, poses: ArrayLike) -> Self:
         """Make a trajectory from stamps (N,), s, and poses.
 
-        poses: (N, 3) x, y, yaw, (N, 7) x, y, z, qx, qy, qz, qw, or (N, 4, 4), in m and rad. ValueError names a wrong row.
+        poses: matrices (N, 4, 4), or rows (N, 3) of x, y, yaw or (N, 7) of x, y, z, qx, qy, qz, qw, in m and rad. ValueError
+        names a wrong row.
         """
         times, rows = as_stamps(stamps), as_poses(poses)
         if len(times) != len(rows):

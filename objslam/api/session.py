@@ -63,8 +63,8 @@ class Session(LiveSession):
         self.abort()
 
     def push_odometry(self, stamp: float, odom_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
-        """Push odom_T_base at a stamp, s: x, y, yaw, or x, y, z, qx, qy, qz, qw, or (4, 4), in m and rad. The covariance has
-        no effect: the drift comes from the settings."""
+        """Push odom_T_base at a stamp, s. It is a matrix (4, 4), or three numbers x, y, yaw, or seven numbers x, y, z, qx,
+        qy, qz, qw, in m and rad. The covariance has no effect: the drift comes from the settings."""
         return super().push_odometry(stamp, _pose(odom_T_base), covariance)
 
     def push_localization(self, stamp: float, map_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
