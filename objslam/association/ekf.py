@@ -75,7 +75,7 @@ class Expected:
 
     residual: (P, 3), two components across the ray (rad), and one for the range (m), which is 0 without a range. by_pose,
     by_landmark: (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) of the measurements. Without a range, the last
-    variance is 1 / (2 pi), which makes a likelihood factor of 1. ranged: (P,) whether there is a range.
+    variance is 1 / (2 pi), so that it multiplies the likelihood by 1. ranged: (P,) whether there is a range.
     """
 
     landmark: Ints

@@ -166,8 +166,8 @@ def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: In
     """Return the best edge of each value of `one`, and (E,) whether each edge is in a part without conflicts.
 
     one, other: (E,) the ray and the landmark in the frame of each edge, or the reverse. In a part without conflicts, no two
-    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the lowest landmark
-    wins.
+    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the landmark with the
+    lowest index wins.
     """
     order = np.lexsort((landmark, -gain, one))
     best = order[np.flatnonzero(np.diff(one[order], prepend=-1))]
@@ -205,8 +205,9 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
     """Return the cost reduction (E,) of each edge: `TRACK_GAIN` if the other boxes of the ray's track support it, else 0.
 
-    The track supports an edge if at least two of its other boxes have the landmark of the edge. These must be most of the
-    boxes with a landmark. track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
+    The track supports an edge if at least two of its other boxes have the landmark of the edge, and if most of its other
+    boxes with a landmark have this landmark. track, matched: (R,) the track and the previous landmark of each ray, -1 for
+    none.
     """
     bonus = np.zeros(len(edges.ray))
     known = np.flatnonzero((track >= 0) & (matched >= 0))

@@ -34,11 +34,11 @@ _MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits 
 _ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _CLEAR_MOTION = 3.0
-"""The log odds of a moving point over one at rest above which points at rest are tried for its rays. With smaller odds, they
-are tried more often, which takes time."""
+"""If the log odds of a moving point over a point at rest are above this, several points at rest are tried for its rays. With
+smaller odds, they are tried more often, which takes time."""
 _EXPLAINED = 0.9
-"""The share of the rays of moving points that points at rest must explain to replace them. With a smaller share, parts of
-the path of a moving thing become objects. With a larger one, wrong boxes keep things at rest from being found."""
+"""Points at rest replace moving points if they explain at least this share of their rays. With a smaller share, parts of the
+path of a moving thing become objects. With a larger share, wrong boxes keep things at rest from being found."""
 _COOLING = (20.0, 10.0, 5.0, 3.0, 2.0)
 """The factors on the noise of the rays while an association is annealed. A larger first factor lets the appearance move more
 rays, and more factors take longer. In simulated clusters, a first factor of 20 mends more exchanges than 10, and 10 more
@@ -160,7 +160,7 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
 
 
 def _seems_to_move(task: _Task, state: State, likely: Floats) -> Bools:
-    """Return which landmarks (N,) are unlikely to exist, and a moving point explains their rays clearly better."""
+    """Return which landmarks (N,) are unlikely to exist, while a moving point explains their rays clearly better."""
     unlikely = likely < task.settings.min_existence
     return unlikely & (rest_odds(state) < -_CLEAR_MOTION) if unlikely.any() else unlikely
 

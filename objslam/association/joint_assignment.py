@@ -1,8 +1,8 @@
 """Assign measurements to landmarks whose errors are correlated (joint compatibility; Neira and Tardos, JCBB, 2001).
 
 A pairing is a measurement and a landmark that it may show. A hypothesis is a set of pairings. One error of the pose shifts
-all measurements of a frame, so each accepted pairing predicts the others. A hypothesis grows from one pairing, always by the
-best further one. Its odds compare it with "all measurements are of new things".
+all measurements of a frame, so each accepted pairing predicts the others. A hypothesis begins with one pairing, and the best
+further pairing is added in each step. Its odds compare it with "all measurements are of new things".
 """
 
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
     """Return the hypothesis that has all pairings `which` (n,).
 
     None if a pairing is outside the gate given all others, or if the hypothesis is better without it. This needs one inverse
-    of the joint covariance. Growth needs one for each step.
+    of the joint covariance. The growth of a hypothesis needs one for each step.
     """
     residual, rarity = pairings.residual[which], pairings.rarity[which]
     size, dimension = residual.shape

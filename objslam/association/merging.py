@@ -44,7 +44,8 @@ class _Pairs:
 
 
 def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
-    """Return the landmark (N,) into which each one merges: itself, or the landmark with more rays if a pair is one object.
+    """Return the landmark (N,) into which each landmark merges: itself, or the landmark with more rays if a pair is one
+    object.
 
     across_labels: compare pairs of different labels instead of pairs with one label.
     """

@@ -21,7 +21,8 @@ _LEAST_APART = 0.3
 unit is the standard deviation of the cosine between a box and an object with many boxes. A larger value leaves more weak
 vectors unused. With random vectors, the difference is 0.1 in a log of a few hundred boxes."""
 _LEAST_SHARE = 1e-3
-"""The least share of `between` in the variance, and the least variance. It only keeps the ratio finite."""
+"""The least share of `between` in the variance, and the least standard deviation of the cosines. It only keeps the ratio
+finite."""
 MOST_RATIO = 3.0
 """The largest absolute log ratio of a ray and a landmark. A larger value trusts vectors more. An object can look different
 from behind, and some boxes show two objects."""
@@ -85,7 +86,7 @@ class CosineRatio:
         b = d.mean[label]
         a = np.maximum(s.mean[label], b)
         own, their = s.spread(label, one, other), d.spread(label, one, other)
-        # Of two Gaussians, the narrower one ends sooner on both sides. Beyond this turning point the ratio stays constant.
+        # The ratio of two Gaussians has a turning point. Beyond it, the ratio would turn back, so it is held constant.
         apart = np.where(own == their, 1.0, own - their)
         turn = (b * own - a * their) / apart
         x = np.where(own < their, np.minimum(cosine, turn), np.where(own > their, np.maximum(cosine, turn), cosine))

@@ -20,7 +20,7 @@ of different objects where a frame has many boxes, and takes longer."""
 _DUPLICATE = 0.5
 """The intersection over union above which two boxes of one frame may show one object. A larger value learns from more
 pairs."""
-_AT_ONCE = 1 << 24  # The most numbers of vectors that are multiplied at once. A larger value needs more memory.
+_AT_ONCE = 1 << 24  # The most elements of vectors that are multiplied at once. A larger value needs more memory.
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def _followers(boxes: Boxes, frame: Ints, group: Ints) -> tuple[Ints, Ints]:
 
 
 def _beside(boxes: Boxes, frame: Ints) -> tuple[Ints, Ints]:
-    """Return the pairs (P,) of boxes with vectors of one label in one frame that hardly overlap."""
+    """Return the pairs (P,) of boxes of one label in one frame that hardly overlap. Only boxes with a vector count."""
     feature, _ = _vectors(boxes)
     some = np.flatnonzero(feature >= 0)
     some = some[np.lexsort((boxes.label[some], frame[some]))]

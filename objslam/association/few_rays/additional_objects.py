@@ -1,6 +1,6 @@
 """Find objects from few rays, among the rays to which the global association gave no object.
 
-The objects of the global association stay as they are. A new object needs no least number of rays: it has to be likelier
+The objects of the global association stay as they are. A new object may have any number of rays, but it has to be likelier
 than stray boxes that meet by chance.
 """
 
@@ -28,9 +28,9 @@ _MOVING = 6
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
 _POWER = 0.4
-"""The log odds against strays are multiplied by this factor, and then become a probability. It is below 1, because boxes of
-near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes the
-probabilities about 0.1 too large. A larger factor makes them larger."""
+"""The log odds against strays are multiplied by this factor, and then become a probability. The factor is below 1, because
+boxes of near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes
+the probabilities about 0.1 too large. A larger factor makes the probabilities larger."""
 _SAMPLE = 512  # The most rays of one label in a search. The time grows with the square of this number.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 

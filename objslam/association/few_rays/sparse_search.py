@@ -68,7 +68,7 @@ def _propose(obs: Observations, search: SparseSearch) -> Floats:
 
 
 def _meetings(obs: Observations, search: SparseSearch) -> tuple[Ints, Ints, Floats]:
-    """Return the two rays of each pair that meets, and the points (P, 3) m where they do."""
+    """Return the two rays of each pair that meets, and the points (P, 3) m where they meet."""
     first, second = np.triu_indices(len(obs), 1)
     depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
     spread = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2

@@ -100,7 +100,7 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
 
 
 def _steps_to(state: int, count: int) -> slice:
-    """Return where `Motions.costs` has the steps from each of `count` states, in order, to a state."""
+    """Return the indices in `Motions.costs` of the steps from each of `count` states, in order, to one state."""
     return slice(state + count - 1, state - 1 if state else None, -1)
 
 

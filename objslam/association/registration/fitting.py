@@ -60,7 +60,7 @@ class Problem:
         height = np.clip(moved[..., 2], -self.apart, self.apart) + label * 4 * self.apart
         found = []
         nearest, nearest_alike = (min(k, len(self.b.label)) for k in (_DENSITY_NEIGHBOURS, _ALIKE_NEIGHBOURS))
-        others = max(nearest - 2, 1)  # Without the match and the farthest one, scattered objects have the right mean.
+        others = max(nearest - 2, 1)  # Without the match and the farthest object, the mean is right.
         counted = (
             (others / len(self.b.label), _farthest(self._level, everything, nearest)),
             (nearest_alike / self._count[label], _farthest(self._alike, alike, nearest_alike)),
@@ -74,7 +74,7 @@ class Problem:
 
 
 def _farthest(tree: KDTree, points: Floats, number: int) -> Floats:
-    """Return the distance (H, P), m, from each point (H, P, d) to its nearest object number `number`, counted from 1."""
+    """Return the distance (H, P), m, from each point (H, P, d) to the `number`-th nearest object."""
     distance = np.asarray(tree.query(points.reshape(-1, points.shape[-1]), k=[number])[0])
     return distance.reshape(points.shape[:-1])
 
@@ -182,7 +182,7 @@ def transform_covariance(problem: Problem, x: Floats, a: Ints, b: Ints) -> Float
 
 
 def one_each(partner: Ints, good: Bools) -> Bools:
-    """Return which matches (H, P) remain if an object of b may be matched only once in each row."""
+    """Return which matches (H, P) remain if each transform (row) may match an object of b only once."""
     marked = np.where(good, partner, -1 - np.arange(partner.shape[1]))
     order = np.argsort(marked, axis=1, kind="stable")
     ordered = np.take_along_axis(marked, order, axis=1)

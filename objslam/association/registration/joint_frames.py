@@ -200,7 +200,7 @@ def _moved(measured: Measured, x: Floats, errors: Floats, positions: Floats | No
     rotation = poses[:, :3, :3]
     at = measured.position
     if positions is not None:
-        # At the measured positions, a smaller world would have smaller residuals, and all maps would shrink.
+        # Derivatives at the measured positions would make all maps shrink, because a smaller world has smaller residuals.
         at = (np.swapaxes(rotation, 1, 2) @ (positions[measured.object] - x[measured.map, :3])[..., None])[..., 0]
     shared = jacobian(at) @ measured.roots[measured.map]
     local = measured.position - (shared @ errors[measured.map][..., None])[..., 0]

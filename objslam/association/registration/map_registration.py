@@ -45,7 +45,8 @@ alarms more often than the log odds say."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
-"""Two transforms that differ by less (m at the centre of the map, rad) are one place. Larger values hide repetitions."""
+"""Two transforms are one place if they differ by less than this shift (m, at the centre of the map) and this turn (rad).
+Larger values hide repetitions."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Registration:
 
     @property
     def lead(self) -> float:
-        """The log odds minus the log odds of the second-best place, which count as at least 0."""
+        """The log odds minus the log odds of the second-best place. Those of the second-best place count as at least 0."""
         return self.log_odds - max(self.second_log_odds, 0.0)
 
     @property
@@ -93,9 +94,10 @@ def register_maps(
 
     Both maps have z up. The log odds are -ln(T * P(X >= m - 2)) for T tried proposals and m matched objects. The two objects
     of the proposing pair do not count. X, the number of matches by chance, is Poisson distributed. Its mean is a sum over
-    the objects of a. Each adds the local density of objects in b, times the area of the gate, times the share of the objects
-    of b that have its label and height. True matches are close together, and chance matches are anywhere in the gate. So
-    several gates are tried, the best one counts, and T is the number of proposals times gates (Moisan & Stival 2004).
+    the objects of a. Each object adds the local density of objects in b, times the area of the gate, times the share of the
+    objects of b that have its label and height. True matches are close together, and chance matches are anywhere in the
+    gate. So several gates are tried, the best one counts, and T is the number of proposals times gates (Moisan & Stival
+    2004).
     """
     keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
     if min(len(keep_a), len(keep_b)) < 2:

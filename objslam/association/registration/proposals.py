@@ -77,7 +77,7 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
 
 
 def _reach(a: Vectors, b: Vectors, size_variance: float) -> Floats:
-    """Return by how much (m) the lengths of similar vectors in map b may differ from those (P,) of vectors in map a.
+    """Return by how much (m) the lengths of similar vectors in map b may differ from the lengths (P,) of vectors in map a.
 
     It is at least `_GATE` standard deviations. size_variance: the variance of the logarithm of the size of map b. The error
     of a length in b grows with this length. It is not known yet, but it is hardly more than the length in a.

@@ -12,8 +12,8 @@ Three things follow.
 1. The residuals of a fit of x do not depend on g. So only o_i + D_i d may widen gates, and only their covariance is that of
    an offset. Anything else would take chance matches for true matches.
 2. The best estimate of x is the same with and without g in the covariance of the offsets (Rao 1967). For any weights, a fit
-   is x + sum_i K_i (y_i - J_i x), and sum_i K_i J_i = 1. Its error is g + sum_i K_i (D_i d + o_i). So the covariance of x
-   gets that of g back, whole, however many objects match.
+   is x + sum_i K_i (y_i - J_i x), and sum_i K_i J_i = 1. Its error is g + sum_i K_i (D_i d + o_i). So the whole covariance
+   of g is added to the covariance of x, however many objects match.
 3. The vector p_j - p_i between two objects has the error o_j - o_i + turn x (p_j - p_i) + size (p_j - p_i). Its length and
    its rise contain neither the shift nor the yaw.
 """
@@ -29,7 +29,8 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.maps.shared_covariance import NUMBERS, SIZE, jacobian, moved, own_part, root_of
 
 _FLOOR = 0.01
-"""The standard deviation (m) added to each position, so that exact maps can be registered. A larger value matches more."""
+"""The standard deviation (m) added to each position, so that exact maps can be registered. A larger value matches more
+objects."""
 _STRAIN = [3, 4, SIZE]
 """The numbers of a shared error that a shift and a yaw do not absorb: the tilt about x and y, and the size."""
 
