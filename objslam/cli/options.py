@@ -92,8 +92,9 @@ def settings_of(
     calibration: Path | None = None,
     names: str | None = None,
 ) -> Settings:
-    """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides the others, which override
-    --config. Files of a calibration and of names are read too, so that a wrong file fails before a long log is read."""
+    """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides all others, and all others
+    override --config. Files of a calibration and of names are read too, so that a wrong file fails before a long log is
+    read."""
     import yaml
 
     from objslam.config import load_settings
