@@ -260,7 +260,7 @@ def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Flo
 
 
 def depths(camera: Camera, points: Floats) -> Floats:
-    """Return the depths (N,), m, to which the image sizes of objects at points (N, 3) are inversely proportional.
+    """Return the depths (N,), m, of points (N, 3). The image size of an object is inversely proportional to its depth.
 
     The points are in m, in the camera frame. The depth is z, or for a fisheye lens the distance from the camera.
     """

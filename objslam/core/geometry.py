@@ -24,7 +24,7 @@ _SMALL = 1e-4
 less exact. At this value, its relative error is below 1e-17."""
 _ON_A_LINE = 1e-9
 """Points lie on a line if the second singular value of their cross-covariance is at most this share of the first. A larger
-share takes more point sets for lines. Rounding leaves about 1e-15."""
+share treats more point sets as lines. Rounding leaves about 1e-15."""
 _FEW_POINTS = 100
 """Up to this number of points, all distances between them are computed. For more points, a search tree takes less time. Few
 points need no tree, and so no import of scipy.spatial, which takes 0.07 s."""

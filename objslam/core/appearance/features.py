@@ -48,7 +48,7 @@ class FeatureTable:
 def unit_vectors(values: Array) -> tuple[Floats32, Bools]:
     """Return vectors (M, D) scaled to length 1, and which of the vectors (M,) can be scaled.
 
-    A vector that is zero, or has a number that is not finite, cannot. Its row is NaN.
+    A vector that is zero, or has a number that is not finite, cannot be scaled. Its row is NaN.
     """
     given = np.asarray(values, dtype=np.float64)
     with np.errstate(invalid="ignore"):
@@ -74,8 +74,8 @@ def short_numbers(vector: Floats32) -> list[float] | None:
 
 
 def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
-    """Return the unit vector (D,) under the key `features` of a JSON object, None without one. ValueError if it is no such
-    vector."""
+    """Return the unit vector (D,) under the key `features` of a JSON object, None without this key. ValueError if the value
+    is no unit vector."""
     value = entry.get("features")
     if value is None:
         return None
@@ -88,8 +88,8 @@ def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
 def ranked(vectors: Sequence[Floats32], query: ArrayLike, count: int) -> list[tuple[int, float]]:
     """Return the indices of the vectors (D,) with the largest cosines to a vector, and these cosines, the largest first.
 
-    Vectors that have not the length of the query are left out. count: the most vectors to return. ValueError if the query is
-    no vector, cannot be scaled, or if no vector has its length.
+    Only vectors of the length of the query count. count: the most vectors to return. ValueError if the query is no vector or
+    cannot be scaled, or if no vector has its length.
     """
     given = np.asarray(query, dtype=np.float64)
     if given.ndim != 1 or not len(given):
