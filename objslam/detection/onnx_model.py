@@ -190,7 +190,7 @@ def _limit_memory() -> bool:
 
 
 def _is_refused_memory(error: Exception) -> bool:
-    """Whether onnxruntime ends a run because its pool of memory, or the computer, has too little."""
+    """Whether onnxruntime ends a run because the computer, or its own pool, has too little memory."""
     return any(text in str(error) for text in ("is smaller than requested bytes", "Failed to allocate memory", "bad_alloc"))
 
 
