@@ -2,8 +2,8 @@
 
 The interpolation assumes a constant velocity from pose to pose. A real robot changes its velocity in between, so it is
 elsewhere, except at the poses themselves. Such an error is a bridge. At the share s of a step, a random walk that is held at
-both ends has the variance `wander` * s * (1 - s). The odometry shows how large it is: by how much the velocity changes from
-one step to the next.
+both ends has the variance `wander` * s * (1 - s). The odometry shows how large `wander` is: by how much the velocity changes
+from one step to the next.
 """
 
 from dataclasses import dataclass

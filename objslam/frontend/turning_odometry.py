@@ -23,7 +23,7 @@ _MOST, _STEP = 0.3, 0.02
 """The largest error that is tried, as a share of the turns, and the step between errors. The cost of a window is a parabola
 around the best error, so a smaller step is only slower."""
 _CLIP = 9.0
-"""The largest squared deviation of a ray that counts. A larger one gives a false link of a track more influence."""
+"""A larger squared deviation of a ray counts as this. With a larger value, a false link of a track has more influence."""
 _FEWEST = 3
 """The fewest rays of a track in a window. Two rays nearly always meet."""
 _WINDOWS = 5
