@@ -42,5 +42,5 @@ class Sink(Protocol):
         """Push all boxes of one image. Push images without boxes too, because they show that an expected object is absent.
 
         stamp: s. boxes: (B, 4) x1, y1, x2, y2, raw px. labels: B names. scores: (B,). depths: (B,) z in m, NaN where
-        unknown. track_ids: B ids, -1 where unknown. whole: True if no box is cut off at the image's edge, as of fiducials.
+        unknown. track_ids: B ids, -1 where unknown. whole: True if no box is cut off at the image's edge, as with fiducials.
         """

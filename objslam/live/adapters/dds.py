@@ -210,7 +210,8 @@ class DdsAdapter:
             where = f"{self.network.where}, domain {self.network.domain}{hint}"
             self.ledger.warn(f"no publisher of odometry, tf or detections on {where}")
         for reader in self._readers.values():
-            others = (p for p in self._publications.values() if not p.own)  # A reader is never matched with its own tf.
+            # The session's own tf is no publisher that a reader could be matched with.
+            others = (p for p in self._publications.values() if not p.own)
             present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in others)
             if not reader.warned and present and now - reader.since > _LONELY:
                 reader.warned = True

@@ -43,7 +43,7 @@ class StdinAdapter:
     """Pushes the messages of a stream. Malformed lines are counted with their line numbers.
 
     wait: the function that is called after each frame of a recorded stream. It returns once the map contains the frame. None
-    if a running robot writes the stream, which never waits for the map. clock: returns the time, s.
+    if a running robot writes the stream, because a robot never waits for the map. clock: returns the time, s.
     """
 
     sink: Sink

@@ -9,7 +9,8 @@ from objslam.core.rotation import skew
 
 HORIZON = 0.06
 """A landmark is long unseen if the heading has drifted by more than this (rad, one sigma) since the last sight. This drift
-moves a landmark at 5 m by 0.3 m, perhaps onto a neighbour. With a larger value, single boxes match for longer."""
+moves a landmark at 5 m by 0.3 m, perhaps onto a neighbour. With a larger value, single boxes match landmarks after a longer
+absence."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which long unseen tracks match. A larger value matches more.
 
 

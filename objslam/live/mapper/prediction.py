@@ -21,8 +21,8 @@ class PosePrediction:
     """The predicted camera pose (4, 4) of a frame in map, and its uncertainty.
 
     camera_T_start: (4, 4) start of the course in the camera frame. motion: the id of the previous keyframe, the motion
-    (4, 4) from its camera to the new one, and the covariance (6, 6) of this motion in the new camera frame. None without a
-    previous keyframe, or if the pose is from localisation.
+    (4, 4) from its camera to the new camera, and the covariance (6, 6) of this motion in the new camera frame. None without
+    a previous keyframe, or if the pose is from localisation.
     """
 
     map_T_camera: Floats

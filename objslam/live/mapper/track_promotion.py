@@ -109,7 +109,7 @@ def prune_tracks(m: MapState) -> None:
     """Remove and count the tracks above the limit.
 
     The labels with the most tracks lose tracks first. Of one label, tracks with fewer than live.min_rays rays go first, then
-    the longest unseen ones.
+    the tracks that were unseen for longest.
     """
     if len(m.tracks) <= _MOST_TRACKS:
         return

@@ -112,8 +112,8 @@ def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], setti
 
 
 def _may_have_several(solution: Solution, settings: Settings) -> bool:
-    """Return whether a label may have several objects, which no frame showed together. solution: with one object for each
-    label."""
+    """Return whether a label may have several objects, which no frame showed together. solution: the solution with one
+    object for each label."""
     if settings.association.method == "by_label":
         return False
     if not labels_tell(solution.association, solution.estimate):
