@@ -105,7 +105,8 @@ def _steps_to(state: int, count: int) -> slice:
 
 
 def _least(total: Cells, cost: Cells) -> Cells:
-    """Return the least sum (Y, X, n) of a state before and a step along the second axis, to each state.
+    """Return for each state the least sum (Y, X, n) of the costs of a state before and of the step from it along the second
+    axis.
 
     The sum counts as at most `_SLIP`, so only the steps that cost less are tried. These are few steps, because the odometry
     drifts little between two stretches. All sums at once take three times as long.
@@ -123,7 +124,8 @@ def _least(total: Cells, cost: Cells) -> Cells:
 
 
 def _least_turn(total: Cells, cost: Cells) -> Cells:
-    """Return the least sum (Y, X, X) of a state before and a turn, as `_least` does. cost: (2 Y - 1,)."""
+    """Return for each state the least sum (Y, X, X) of the costs of a state before and of the turn from it. cost: (2 Y -
+    1,)."""
     total = np.ascontiguousarray(total)
     least, count = np.full_like(total, _SLIP), len(total)
     for i in np.flatnonzero(cost < _SLIP).tolist():

@@ -33,8 +33,8 @@ _FEWEST_MAPS = 3
 """With at least this number of maps, each map has a noise of its own. With fewer, all have one noise, because the residuals
 of two maps do not tell which map is worse. A larger number gives more maps one noise."""
 _POOLED = 10.0
-"""A map's given covariances weigh as much as this number of residuals. A larger number trusts them more. At 10, a map of a
-few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
+"""A map's given covariances weigh as much as this number of residuals. A larger number trusts the covariances more. At 10, a
+map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
 _AGAIN = 0.01
 """The standard deviation (m) that each map adds to the errors that are not shared. A larger value trusts small distances in
 maps less. Without it, one pair of nearly exact objects would fix the shared errors."""
