@@ -182,7 +182,7 @@ def _possible(noise: RangeNoise) -> bool:
 
 
 def is_date(stamp: float) -> bool:
-    """Return whether a stamp, s, is Unix time. Other clocks start at 0 and stay below the limit of about three years."""
+    """Return whether a stamp, s, is Unix time: above about three years. Other clocks start at 0 and stay below this."""
     return 1e8 < stamp < _LAST_DATE
 
 
