@@ -1,4 +1,5 @@
-"""The keys of a fleet: what a result depends on, as a hash, so that a second run does only what is missing or changed."""
+"""The keys of a fleet. A key is a hash of all that a result depends on, so a second run does only what is missing or
+changed."""
 
 from __future__ import annotations
 
