@@ -55,9 +55,10 @@ class OdometryBridge:
         return cls(odometry.stamps, (1 - walk) * white + walk * walked)
 
     def at(self, stamps: Floats) -> tuple[Floats, Floats]:
-        """Return where stamps (K,), s, are among the steps, and the variance (K, 6) of the step of each.
+        """Return the places of stamps (K,), s, among the steps, and the variance (K, 6) of the step at each place.
 
-        A place is the number of the steps before, plus the share of the own step. A stamp beyond an end is at that end.
+        A place is the number of whole steps before the stamp, plus the share of the step in which the stamp lies. A stamp
+        beyond an end is at that end.
         """
         last = len(self.stamps) - 1
         step = np.interp(stamps, self.stamps, np.arange(last + 1.0))

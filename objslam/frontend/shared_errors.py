@@ -278,7 +278,7 @@ class SharedErrors:
         return poses_near(path, stamps, self.settings.poses.max_gap)
 
     def _of_odometry(self, error: Mapping[str, float]) -> dict[str, float]:
-        """The errors of the odometry. Its distances compensate the shrinkage of the map, as the ranges do."""
+        """The errors of the odometry, which also correct its distances for the shrinkage of the map."""
         return dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
 
     def _correctable(self) -> CorrectablePath:
