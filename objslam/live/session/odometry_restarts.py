@@ -18,7 +18,7 @@ _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A
 class OdometryRestarts:
     """Finds restarts of the robot's odometry, and moves the poses after them so that they continue the old path.
 
-    start_T_odom: (4, 4), moves poses from the odometry's present frame into its first one.
+    start_T_odom: (4, 4) moves poses from the odometry's present frame into its first one.
     """
 
     def __init__(self, settings: Settings, counters: Counters) -> None:

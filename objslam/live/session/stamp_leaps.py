@@ -108,7 +108,7 @@ class StampLeaps(Generic[T]):
         return [*earlier, message, *s.near(s.reach(stamp))], s.empty()
 
     def confirmed(self, clock: float) -> list[T]:
-        """Return the waiting messages of all streams whose stamps another stream has reached. clock: its newest stamp, s."""
+        """Return, from all streams, the waiting messages that another stream has reached. clock: its newest stamp, s."""
         return [message for s in self._streams.values() if s.waiting for message in s.near(clock + _LAG)]
 
     def recall(self, stream: str, stamp: float) -> None:
