@@ -57,7 +57,7 @@ class Worker(Generic[Answer]):
 
     @property
     def done(self) -> bool:
-        """Whether the answer to a request has come, so that `result` returns at once."""
+        """Whether a request has ended, so that `result` returns at once."""
         return self._thread is not None and not self._thread.is_alive()
 
     def result(self) -> Answer | None:
