@@ -110,7 +110,7 @@ def _density(pairs: Pairs, prior: tuple[float, float], labels: int) -> Density:
 
 
 def _intraclass_correlation(off: Floats, group: Ints) -> float:
-    """Return the correlation between the deviations (P,) of one group.
+    """Return the correlation between deviations of one group. off, group: (P,) the deviations and their groups.
 
     With few pairs it is near 1. Then many boxes of an object count as much as one box.
     """
