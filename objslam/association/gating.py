@@ -17,7 +17,8 @@ TRACK_GAIN = 2.0
 """The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
 trusts the tracker more."""
 _ALTERNATIONS = 3  # The most alternations after a change. A larger value converges further.
-_FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
+_FAR = 1e6
+"""The distance (m) from the first camera beyond which only parallel rays meet. A larger distance keeps farther landmarks."""
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.

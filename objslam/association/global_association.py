@@ -25,13 +25,21 @@ from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_quantile
 from objslam.core.types import Association, Keyframes, Rays
 
-_TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
+_TURNS = 8
+"""The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
-_SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames. Later searches use other frames.
-_FRAMES = 12  # The fewest frames that a search uses. An object is where rays of several frames meet.
+_SAMPLE = 4096
+"""The most rays of one label that a search uses, in whole frames. Later searches use other frames. A larger number costs
+time."""
+_FRAMES = 12
+"""The fewest frames that a search uses. An object is where rays of several frames meet. A larger number costs time."""
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
-_MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
-_ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
+_MIN_SUPPORT = 2.5
+"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger support finds fewer, surer
+points."""
+_ABOVE_CHANCE = 3.0
+"""The least excess of a point's support over the support by stray rays, in standard deviations. A larger excess finds fewer,
+surer points."""
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _CLEAR_MOTION = 3.0
 """If the log odds of a moving point over a point at rest are above this, several points at rest are tried for its rays. With

@@ -13,7 +13,9 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
 _MIN_ODDS = 4.5  # The least log odds of "the ray's landmark" over "an unknown object". Larger odds keep fewer rays.
-_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
+_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0
+"""The least length or width (m), and the least height (m), of a room with objects. With larger values, unknown objects are
+sparser in small rooms, so more rays are kept."""
 _MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 
 

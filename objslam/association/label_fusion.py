@@ -12,7 +12,8 @@ from objslam.core.statistics import grouped_median, poisson_tail
 
 SIZE_RATIO = 2.0
 """The largest ratio between the sizes of boxes of two labels that show one object. A larger ratio fuses more labels."""
-_MIN_BOXES = 3  # The fewest boxes of another label that a landmark needs to accept the label.
+_MIN_BOXES = 3
+"""The fewest boxes of another label that a landmark needs to accept the label. A larger number fuses fewer labels."""
 _MOST_BY_CHANCE = 1e-3  # The most labels accepted by chance in a log, on average. A larger value fuses more labels.
 
 

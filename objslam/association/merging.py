@@ -23,8 +23,12 @@ the larger size. Larger shares merge more landmarks."""
 _MOST_APART = 0.1
 """The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, or of the
 frames that should show both landmarks. A larger share merges more landmarks."""
-_MIN_EXPECTED = 5.0  # The number of frames that should show both landmarks is assumed to be at least this.
-_DUPLICATE_OVERLAP = 0.5  # The least intersection over union of two boxes in one frame that show one object.
+_MIN_EXPECTED = 5.0
+"""The number of frames that should show both landmarks is assumed to be at least this. A larger number merges more
+landmarks."""
+_DUPLICATE_OVERLAP = 0.5
+"""The least intersection over union of two boxes in one frame that show one object. A larger overlap merges fewer
+landmarks."""
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
 _REACH_GATES = 2.0
 """The distance up to which two landmarks are compared, in gates of the noise of their rays. It is large because one object

@@ -15,7 +15,9 @@ value, more correct boxes are lost."""
 BEHIND = 1e6
 """The deviation, in standard deviations, of a point behind the camera: large, but finite."""
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
-_DAMPING = 1e-6  # The share of the information added in all directions. Unobserved directions then stay unchanged.
+_DAMPING = 1e-6
+"""The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
+refinement down."""
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
 _FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 """The rows and the columns of the six entries that determine a symmetric 3 x 3 matrix. The diagonal comes first."""

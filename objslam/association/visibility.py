@@ -16,11 +16,14 @@ from objslam.core.statistics import grouped_median, grouped_quantile, grouped_qu
 from objslam.core.types import Keyframes
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
-_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
+_USUAL_DISTANCES = (0.02, 0.98)
+"""The quantiles of a class's detection distances. Outside them, a miss tells nothing. A wider range counts more misses."""
 _CORE_SHARE = 0.8
 """The usual distances of a class come from this share of its boxes: those of the objects with the most boxes. Objects with
 few boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
-_FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
+_FRONT_SHARE = 0.95
+"""An object has a front if at least this share of its boxes is from one half space. A larger share gives fewer objects a
+front."""
 _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
 counts. Larger values hide fewer objects."""

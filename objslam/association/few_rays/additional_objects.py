@@ -26,7 +26,8 @@ from objslam.core.types import Association, Keyframes, Rays
 _MOVING = 6
 """The number of coordinates of a moving point: those of its position and of its velocity. So it explains any three rays."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
-_TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
+_TURNS = 8
+"""The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
 _POWER = 0.4
 """The log odds against strays are multiplied by this factor, and then become a probability. The factor is below 1, because
 boxes of near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes

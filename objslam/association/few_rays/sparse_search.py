@@ -21,7 +21,8 @@ _MORE_RAYS = 3.0
 _REFINEMENTS = 2
 """How often each point moves to the best fit of its rays. A larger number costs time."""
 _DAMPING = 1e-6
-"""The share of the information added in all directions. Unobserved directions then stay unchanged."""
+"""The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
+refinement down."""
 
 
 @dataclass(frozen=True)
