@@ -24,7 +24,7 @@ FATES: tuple[Fate, ...] = ("new", "confirmed", "moved", "gone")
 """The states that an object can have after several sessions."""
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
-_SHOWN = 20  # The most objects in the text of a map.
+_SHOWN = 20  # The most objects in the text of a map. A larger number makes the text longer.
 _UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Entries of the covariance in a table row.
 
 COLUMNS: dict[str, str] = {
