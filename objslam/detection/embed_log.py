@@ -17,7 +17,7 @@ from objslam.errors import LogError
 from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps
 from objslam.io.prefetch import ahead
 
-_AHEAD = 8  # The number of images that are decoded before the network needs them.
+_AHEAD = 8  # The number of images that are decoded before the network needs them. A larger number needs more memory.
 
 
 def embed_log(log: Log, encoder: Encoder, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> Log:
