@@ -23,7 +23,7 @@ OPTION_FILES = ("class_names", "camera_info")
 _LETTERS = 32
 """The hexadecimal digits of a key. A larger number makes longer names. With 32, two contents never have one key by
 chance."""
-_BLOCK = 1 << 20  # The bytes that are read at once.
+_BLOCK = 1 << 20  # The bytes that are read at once. A larger number needs more memory.
 
 
 def hash_log(path: Path) -> str:
