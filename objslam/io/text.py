@@ -19,7 +19,8 @@ from objslam.errors import LogError
 _IN_ORDER = 0.5
 """The least share of the rows of a file that are in the order of time. A larger share also rejects files of a robot whose
 clock was set back. In a file in another order, the share is far smaller."""
-_PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason.
+_PLACES = 3
+"""The most places (file:line) of dropped rows that the ledger gets for a reason. A larger number gives more examples."""
 _SHOWN = 80  # The most characters of a line that a message shows. A larger number makes the message longer.
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
