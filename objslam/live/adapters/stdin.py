@@ -35,7 +35,7 @@ _CAMERA = "camera"
 _LONGEST = 1 << 20  # The longest line, bytes. Longer lines are dropped. A larger number costs memory.
 _CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
 _FASTER = 1.5  # Stamps that run faster than the clock by this factor are of a recording. A larger number finds fewer.
-_WAIT = 0.1  # The longest time until a stop is noticed, s.
+_WAIT = 0.1  # The longest time until a stop is noticed, s. A larger value costs less, and notices it later.
 
 
 @dataclass
