@@ -159,5 +159,5 @@ def _parameter(name: str, type_: Any, option: Option, default: Any) -> inspect.P
 
 
 def _is_negated(option: Option, default: Any) -> bool:
-    """Return whether the flag sets a value to False that is True by default, as --without-range does."""
+    """Return whether the flag turns off what is on by default, as --without-range does."""
     return default is True and "/" not in option.flag
