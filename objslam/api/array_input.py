@@ -28,7 +28,7 @@ def as_camera(camera: Camera) -> Camera:
 
 
 def as_poses(values: ArrayLike) -> Floats:
-    """Return poses (N, 4, 4) from rows (N, 3) x, y, yaw, rows (N, 7) x, y, z, qx, qy, qz, qw, or matrices (N, 4, 4).
+    """Return poses (N, 4, 4) from matrices (N, 4, 4), or from rows (N, 3) of x, y, yaw or (N, 7) of x, y, z, qx, qy, qz, qw.
 
     Units are m and rad. ValueError for another shape, or if a pose is not finite and rigid.
     """
@@ -71,9 +71,10 @@ def as_boxes(values: ArrayLike, where: str) -> Floats:
 
 
 def per_box(values: Sequence[ArrayLike] | None, counts: Sequence[int], unknown: float, name: str) -> Floats:
-    """Return one number for each box (M,) from one list for each frame. Without `values`, each number is `unknown`.
+    """Return the numbers (M,) of all M boxes. values: one list for each frame, with one number for each of its boxes.
 
-    counts: the number of boxes of each frame. ValueError, with `name`, if the lists have other lengths.
+    Without `values`, each number is `unknown`. counts: the number of boxes of each frame. ValueError, with `name`, if the
+    lists have other lengths.
     """
     if values is None:
         return np.full(sum(counts), unknown)

@@ -32,7 +32,8 @@ class Trajectory(types.Trajectory):
     def from_arrays(cls, stamps: ArrayLike, poses: ArrayLike) -> Self:
         """Make a trajectory from stamps (N,), s, and poses.
 
-        poses: (N, 3) x, y, yaw, (N, 7) x, y, z, qx, qy, qz, qw, or (N, 4, 4), in m and rad. ValueError names a wrong row.
+        poses: matrices (N, 4, 4), or rows (N, 3) of x, y, yaw or (N, 7) of x, y, z, qx, qy, qz, qw, in m and rad. ValueError
+        names a wrong row.
         """
         times, rows = as_stamps(stamps), as_poses(poses)
         if len(times) != len(rows):
@@ -76,10 +77,9 @@ class Detections(types.Detections):
 
         stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names.
         scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z in m, NaN where unknown.
-        track_ids: for each frame B integers, -1 where unknown. features: for each frame (B, D) appearance vectors of any
-        length but 0, such as the embedding of a network, a row of NaN where unknown. whole: True if boxes are not cut off at
-        the image's edge.
-        ValueError names what is wrong.
+        track_ids: for each frame B integers, -1 where unknown. features: for each frame (B, D) appearance vectors, such as
+        the embeddings of a network. D is at least 1. An unknown vector is a row of NaN. whole: True if boxes are not cut off
+        at the image's edge. ValueError names what is wrong.
         """
         frames = [as_boxes(one, f"frame {k}") for k, one in enumerate(boxes)]
         counts = [len(one) for one in frames]

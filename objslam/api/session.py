@@ -34,11 +34,11 @@ class Session(LiveSession):
             result = session.result()
 
     settings, changes: as in `objslam.run`. The mode is always joint. journal: a file that keeps every accepted message, so
-    that a killed program loses nothing. resume: whether to continue an existing journal. name: of the log, in the result.
-    patient: for data that do not come from a running robot. A push then waits while the session has too much to do, and the
-    session waits for calibrations, so that nothing is dropped for lack of time. Push in the order of the stamps. map: the
-    map of another day, or its file or result folder. Once the session is found in this map, `snapshot().in_map` says so, and
-    snapshots and result are in the frame of the map.
+    that a killed program loses nothing. resume: whether to continue an existing journal. name: the name of the log in the
+    result. patient: for data that do not come from a running robot. A push then waits while the session has too much to do,
+    and the session waits for calibrations, so that nothing is dropped for lack of time. Push in the order of the stamps.
+    map: the map of another day, or its file or result folder. Once the session is found in this map, `snapshot().in_map`
+    says so, and snapshots and result are in the frame of the map.
     """
 
     def __init__(
@@ -63,8 +63,8 @@ class Session(LiveSession):
         self.abort()
 
     def push_odometry(self, stamp: float, odom_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
-        """Push odom_T_base at a stamp, s: x, y, yaw, or x, y, z, qx, qy, qz, qw, or (4, 4), in m and rad. The covariance has
-        no effect: the drift comes from the settings."""
+        """Push odom_T_base at a stamp, s. It is a matrix (4, 4), or three numbers x, y, yaw, or seven numbers x, y, z, qx,
+        qy, qz, qw, in m and rad. The covariance has no effect: the drift comes from the settings."""
         return super().push_odometry(stamp, _pose(odom_T_base), covariance)
 
     def push_localization(self, stamp: float, map_T_base: ArrayLike, covariance: Floats | None = None) -> bool:
@@ -79,8 +79,8 @@ class Session(LiveSession):
         return super().push_mount(stamp, camera, _pose(base_T_camera))
 
     def snapshot(self) -> Snapshot:
-        """Return the present map, path and counts, usually in milliseconds. It is the last snapshot if the session has
-        stopped or is busy for 5 s."""
+        """Return the present map, path and counts, usually in milliseconds. If the session has stopped, or is busy for 5 s,
+        return its last snapshot."""
         found = super().snapshot()
         return replace(found, map=ObjectMap.of(found.map))
 

@@ -7,13 +7,18 @@ from objslam.core.geometry import lift_se2
 from objslam.core.statistics import STRAY_RAY
 from objslam.core.types import Rays
 
-_GRID_SIGMAS = 3.0  # The half width of the grid of corrections, in standard deviations of the drift.
+_GRID_SIGMAS = 3.0
+"""The half width of the grid of corrections, in standard deviations of the drift. A larger value reaches farther."""
 _MOST_TURNS, _MOST_SHIFTS = 25, 9  # The most grid steps in yaw and along x or y. A larger value costs time.
 _FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m). Finer corrections are left to association.
-_LANDMARK_SIGMA = 0.03  # The assumed standard deviation (m) of a landmark's position.
-_MIN_LEVEL = 0.1  # The least cosine of an elevation. A ray's heading noise is its noise divided by this cosine.
+_LANDMARK_SIGMA = 0.03
+"""The assumed standard deviation (m) of a landmark's position. A larger value accepts rays farther from landmarks."""
+_MIN_LEVEL = 0.1
+"""The least cosine of an elevation. A ray's heading noise is its noise divided by this cosine. A larger value trusts steep
+rays more."""
 _AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
-_MOST_RANGE_COST = 9.0  # The most that a range adds to a cost, in squared deviations. Some ranges are wrong.
+_MOST_RANGE_COST = 9.0
+"""The most that a range adds to a cost, in squared deviations. Some ranges are wrong. A larger value trusts ranges more."""
 
 
 def align(

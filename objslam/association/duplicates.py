@@ -18,5 +18,6 @@ def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, In
 
 
 def seen_as_two(together: int, frames: int) -> bool:
-    """Return whether two objects differ. frames: how many frames show the rarer one. together: how many show both."""
+    """Return whether two objects differ. frames: how many frames show the rarer object. together: how many show both
+    objects."""
     return together > TOGETHER * frames

@@ -26,7 +26,8 @@ _LEAST_DISTANCE = 1e-3
 @dataclass
 class Filter:
     """The state of the filter. map_T_base: (4, 4). shared: (S,) errors that all motions share. position: (N, 3) m of
-    landmarks. covariance: (3 + S + 3N)^2, of yaw, x and y, then the shared errors, then the positions."""
+    landmarks. covariance: (D, D) with D = 3 + S + 3 N. Its order is yaw, x and y, then the shared errors, then the
+    positions."""
 
     map_T_base: Floats
     shared: Floats
@@ -74,7 +75,7 @@ class Expected:
 
     residual: (P, 3), two components across the ray (rad), and one for the range (m), which is 0 without a range. by_pose,
     by_landmark: (P, 3, 3) the Jacobians of the expected ray. variance: (P, 3) of the measurements. Without a range, the last
-    variance is 1 / (2 pi), which makes a likelihood factor of 1. ranged: (P,) whether there is a range.
+    variance is 1 / (2 pi), so that it multiplies the likelihood by 1. ranged: (P,) whether there is a range.
     """
 
     landmark: Ints
@@ -203,7 +204,7 @@ def tie(f: Filter, one: Ints, two: Ints, sigma: float) -> None:
 
 
 def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
-    """Return the Jacobian (3P, D) by the state. It belongs to the offsets of landmarks `one` from landmarks `two`."""
+    """Return the Jacobian (3P, D), by the state, of the positions of landmarks `one` minus those of landmarks `two`."""
     jacobian = np.zeros((len(one), 3, len(f.covariance)))
     for which, sign in ((one, 1.0), (two, -1.0)):
         jacobian[np.arange(len(one))[:, None], np.arange(3), f.columns(which)] = sign

@@ -17,7 +17,8 @@ TRACK_GAIN = 2.0
 """The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
 trusts the tracker more."""
 _ALTERNATIONS = 3  # The most alternations after a change. A larger value converges further.
-_FAR = 1e6  # The distance (m) from the first camera beyond which only parallel rays meet.
+_FAR = 1e6
+"""The distance (m) from the first camera beyond which only parallel rays meet. A larger distance keeps farther landmarks."""
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
@@ -40,8 +41,8 @@ larger value loses more boxes of half hidden things."""
 @dataclass(frozen=True)
 class Edges:
     """Possible matches (E,), sorted by ray, then by landmark. deviation: squared deviation of the bearing, in variances (2
-    degrees of freedom). vague: 2 ln of the area in the image where the landmark may appear, divided by the area of the ray's
-    own noise. cost: deviation + vague + the cost of the range."""
+    degrees of freedom). vague: 2 ln of the ratio of two areas in the image: the area where the landmark may appear, and the
+    area of the ray's own noise. cost: deviation + vague + the cost of the range."""
 
     ray: Ints
     landmark: Ints
@@ -166,8 +167,8 @@ def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: In
     """Return the best edge of each value of `one`, and (E,) whether each edge is in a part without conflicts.
 
     one, other: (E,) the ray and the landmark in the frame of each edge, or the reverse. In a part without conflicts, no two
-    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the lowest landmark
-    wins.
+    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the landmark with the
+    lowest index wins.
     """
     order = np.lexsort((landmark, -gain, one))
     best = order[np.flatnonzero(np.diff(one[order], prepend=-1))]
@@ -205,8 +206,9 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
     """Return the cost reduction (E,) of each edge: `TRACK_GAIN` if the other boxes of the ray's track support it, else 0.
 
-    The track supports an edge if at least two of its other boxes have the landmark of the edge. These must be most of the
-    boxes with a landmark. track, matched: (R,) the track and the previous landmark of each ray, -1 for none.
+    The track supports an edge if at least two of its other boxes have the landmark of the edge, and if most of its other
+    boxes with a landmark have this landmark. track, matched: (R,) the track and the previous landmark of each ray, -1 for
+    none.
     """
     bonus = np.zeros(len(edges.ray))
     known = np.flatnonzero((track >= 0) & (matched >= 0))
@@ -229,9 +231,9 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
 def size_costs(state: State, edges: Edges) -> Floats:
     """Return the cost (E,), from 0 to `SIZE_LOSS`, of the size of the box in each match, in squared standard deviations.
 
-    Bearings do not tell a small thing from a large one in front of or behind it. If only one of them is detected, its box
-    fits both bearings, but only one size. A landmark has the median of the sizes of its boxes, and their spread. Boxes of
-    another size than usual cost more. A box without a size, and a landmark with few boxes, cost nothing.
+    Bearings do not tell a small thing from a large thing on the same line of sight. If only one of the two is detected, its
+    box fits the bearings of both, but only one of the sizes. A landmark has the median of the sizes of its boxes, and their
+    spread. Boxes of another size than usual cost more. A box without a size, and a landmark with few boxes, cost nothing.
     """
     obs, number = state.obs, state.ray_count
     if not (number >= _SIZED_BY).any():
@@ -273,8 +275,8 @@ def alternate(
 ) -> State:
     """Alternate between assignment and refinement until no ray changes its landmark, at most `times` times.
 
-    plausible: returns which landmarks (N,) stay. unmatched: returns for each match the cost (E,) of its ray if it had no
-    landmark. If not given, this cost is the gate.
+    plausible: returns which landmarks (N,) stay. unmatched: returns for each match the cost (E,) of its ray if the ray had
+    no landmark. If not given, this cost is the gate.
     """
     for _ in range(times):
         obs, old, before = state.obs, state.landmarks, state.matched

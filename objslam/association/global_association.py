@@ -25,20 +25,28 @@ from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_quantile
 from objslam.core.types import Association, Keyframes, Rays
 
-_TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
+_TURNS = 8
+"""The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
-_SAMPLE = 4096  # The most rays of one label that a search uses, in whole frames. Later searches use other frames.
-_FRAMES = 12  # The fewest frames that a search uses. An object is where rays of several frames meet.
+_SAMPLE = 4096
+"""The most rays of one label that a search uses, in whole frames. Later searches use other frames. A larger number costs
+time."""
+_FRAMES = 12
+"""The fewest frames that a search uses. An object is where rays of several frames meet. A larger number costs time."""
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
-_MIN_SUPPORT = 2.5  # The least support of a point in a search. A ray that fits perfectly counts 1.
-_ABOVE_CHANCE = 3.0  # The least excess of a point's support over the support by stray rays, in standard deviations.
+_MIN_SUPPORT = 2.5
+"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger support finds fewer, surer
+points."""
+_ABOVE_CHANCE = 3.0
+"""The least excess of a point's support over the support by stray rays, in standard deviations. A larger excess finds fewer,
+surer points."""
 _CHANCE_ODDS = 3.0  # The least log odds of a landmark against stray rays during the search. A larger one drops weak objects.
 _CLEAR_MOTION = 3.0
-"""The log odds of a moving point over one at rest above which points at rest are tried for its rays. With smaller odds, they
-are tried more often, which takes time."""
+"""If the log odds of a moving point over a point at rest are above this, several points at rest are tried for its rays. With
+smaller odds, they are tried more often, which takes time."""
 _EXPLAINED = 0.9
-"""The share of the rays of moving points that points at rest must explain to replace them. With a smaller share, parts of
-the path of a moving thing become objects. With a larger one, wrong boxes keep things at rest from being found."""
+"""Points at rest replace moving points if they explain at least this share of their rays. With a smaller share, parts of the
+path of a moving thing become objects. With a larger share, wrong boxes keep things at rest from being found."""
 _COOLING = (20.0, 10.0, 5.0, 3.0, 2.0)
 """The factors on the noise of the rays while an association is annealed. A larger first factor lets the appearance move more
 rays, and more factors take longer. In simulated clusters, a first factor of 20 mends more exchanges than 10, and 10 more
@@ -122,9 +130,9 @@ def _learned(state: State) -> State:
 def _annealed(task: _Task, state: State) -> State:
     """Assign the rays of close landmarks again, first by their appearance and then more and more by their position.
 
-    Two close landmarks may have exchanged some rays. Then both lie between the objects, and no single ray fits the other one
-    better. With more noise of the rays than there is, the appearance decides (deterministic annealing, Rose 1998). Each
-    label keeps its earlier landmarks if the new ones explain its rays no better.
+    Two close landmarks may have exchanged some rays. Then both landmarks lie between the objects, and no single ray fits the
+    other landmark better. If the noise of the rays is assumed larger than it is, the appearance decides (deterministic
+    annealing, Rose 1998). Each label keeps its earlier landmarks if the new ones explain its rays no better.
     """
     obs, begin = state.obs, _learned(state)
     if begin.ratio is None:
@@ -160,7 +168,7 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
 
 
 def _seems_to_move(task: _Task, state: State, likely: Floats) -> Bools:
-    """Return which landmarks (N,) are unlikely to exist, and a moving point explains their rays clearly better."""
+    """Return which landmarks (N,) are unlikely to exist, while a moving point explains their rays clearly better."""
     unlikely = likely < task.settings.min_existence
     return unlikely & (rest_odds(state) < -_CLEAR_MOTION) if unlikely.any() else unlikely
 
@@ -168,9 +176,9 @@ def _seems_to_move(task: _Task, state: State, likely: Floats) -> Bools:
 def _at_rest(task: _Task, state: State, refuted: Bools, moving: State) -> tuple[State, Bools]:
     """Replace landmarks that seem to move by several at rest, if these explain nearly all of their rays.
 
-    The rays to one thing may cross those to another thing of its label between the two. If they come at different times, a
-    point there seems to move from one thing to the other. It can have more rays than each of them, so that a search finds
-    it each time. Points at rest explain only parts of the path of a thing that really moves.
+    The rays to two things of one label may cross between the two things. If the things are seen at different times, a point
+    at the crossing seems to move from one thing to the other. This point can have more rays than each thing, so every search
+    finds it. Points at rest explain only parts of the path of a thing that really moves.
     """
     left = state.keep(~_seems_to_move(task, state, existence(state, task.gate)))
     other, more, _ = _search(task, left, moving.landmarks)
@@ -227,11 +235,11 @@ def _alternate(task: _Task, state: State, times: int = 3) -> State:
 
 
 def _by_size(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats]:
-    """Assign the rays once more, by bearing and size. likely: (N,) of the landmarks. It is returned for those that keep
-    enough rays.
+    """Assign the rays once more, by bearing and size. likely: (N,) probability that each landmark exists. It is also
+    returned, for the landmarks that keep enough rays.
 
-    Sizes count only here. While the existence of an often hidden landmark is judged, it needs every ray. sized: (R,) whether
-    the camera of each ray sees sizes.
+    Sizes count only here, at the end. Before, an often hidden landmark needs every ray, or it would be dropped. sized: (R,)
+    whether the camera of each ray sees sizes.
     """
     obs = state.obs
     every = alternate(
@@ -281,8 +289,8 @@ def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
 def _drop(task: _Task, state: State, likely: Floats) -> State:
     """Drop landmarks whose probability (N,) is below association.min_existence.
 
-    If two neighbours of one label both fail, the one with more rays is kept in this call. It may get boxes back from the
-    other one, and the next call judges it again.
+    If two neighbours of one label both fail, the neighbour with more rays is kept in this call. It may get boxes back from
+    the other neighbour, and the next call judges it again.
     """
     failing = likely < task.settings.min_existence
     if not failing.any():

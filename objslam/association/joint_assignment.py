@@ -1,8 +1,8 @@
 """Assign measurements to landmarks whose errors are correlated (joint compatibility; Neira and Tardos, JCBB, 2001).
 
-A pairing is a measurement and a landmark that may be the same, a hypothesis is a set of pairings. One error of the pose
-shifts all measurements of a frame, so each accepted pairing predicts the others. A hypothesis grows from one pairing, always
-by the best further one. Its odds compare it with "all measurements are of new things".
+A pairing is a measurement and a landmark that it may show. A hypothesis is a set of pairings. One error of the pose shifts
+all measurements of a frame, so each accepted pairing predicts the others. A hypothesis begins with one pairing, and the best
+further pairing is added in each step. Its odds compare it with "all measurements are of new things".
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,8 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 
 _SEEDS = 6
-"""The number of pairings from each of which a hypothesis grows. A larger number is slower, and finds rarer hypotheses."""
+"""The number of hypotheses that are grown, each from another pairing. A larger number is slower, and finds rarer
+hypotheses."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,9 @@ class Pairings:
 
 @dataclass(frozen=True)
 class JointAssignment:
-    """The best hypothesis. chosen: (n,) its pairings. odds: its log odds over "everything is new". margin: (n,) these log
-    odds minus those of the second hypothesis, which is the best one without this pairing. rival: (n,) whether the second
-    hypothesis pairs the measurement with another landmark."""
+    """The best hypothesis. chosen: (n,) its pairings. odds: its log odds over "everything is new". margin: (n,) `odds` minus
+    the log odds of the best hypothesis without this pairing. rival: (n,) whether that hypothesis pairs the measurement with
+    another landmark."""
 
     chosen: Ints
     margin: Floats
@@ -76,7 +77,7 @@ def _whole(pairings: Pairings, which: Ints) -> JointAssignment | None:
     """Return the hypothesis that has all pairings `which` (n,).
 
     None if a pairing is outside the gate given all others, or if the hypothesis is better without it. This needs one inverse
-    of the joint covariance. Growth needs one for each step.
+    of the joint covariance. The growth of a hypothesis needs one for each step.
     """
     residual, rarity = pairings.residual[which], pairings.rarity[which]
     size, dimension = residual.shape

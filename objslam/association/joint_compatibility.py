@@ -13,7 +13,9 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
 
 _MIN_ODDS = 4.5  # The least log odds of "the ray's landmark" over "an unknown object". Larger odds keep fewer rays.
-_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0  # The least length or width (m), and the least height (m), of a room with objects.
+_MIN_ROOM, _MIN_HEIGHT = 4.0, 1.0
+"""The least length or width (m), and the least height (m), of a room with objects. With larger values, unknown objects are
+sparser in small rooms, so more rays are kept."""
 _MIN_SLOPE = 1e-6  # The least component of a direction used as a divisor.
 
 
@@ -56,8 +58,8 @@ def unknown_density(obs: Observations, rows: Ints, expected: PredictedLandmarks,
     """Return the expected number (n,) of unknown objects with the label of the ray's landmark, per steradian along each ray.
 
     Unknown objects are assumed to be everywhere in the room, and to be visible as far as a landmark was seen. rows: (n,) the
-    landmark of each ray. novelty: the recent number of boxes of unknown objects for each box of a known one. It stands for
-    the ratio of unknown to known objects.
+    landmark of each ray. novelty: the recent number of boxes of unknown objects for each box of a known object. It stands
+    for the ratio of unknown to known objects.
     """
     position, label = expected.position[: expected.landmarks], expected.label[: expected.landmarks]
     low, high = position.min(axis=0), position.max(axis=0)

@@ -11,8 +11,9 @@ from objslam.core.arrays import Bools
 from objslam.core.statistics import grouped_median, poisson_tail
 
 SIZE_RATIO = 2.0
-"""The largest ratio between the sizes of boxes of two labels that show one object."""
-_MIN_BOXES = 3  # The fewest boxes of another label that a landmark needs to accept the label.
+"""The largest ratio between the sizes of boxes of two labels that show one object. A larger ratio fuses more labels."""
+_MIN_BOXES = 3
+"""The fewest boxes of another label that a landmark needs to accept the label. A larger number fuses fewer labels."""
 _MOST_BY_CHANCE = 1e-3  # The most labels accepted by chance in a log, on average. A larger value fuses more labels.
 
 
@@ -20,7 +21,8 @@ def fused_labels(state: State, gate: float) -> Bools:
     """Return which labels (N, L) each landmark accepts: its own label, and labels whose unassigned boxes it explains.
 
     An explained box lies on the landmark, in a frame in which the landmark has no box of its own. The explained boxes of a
-    label must have the landmark's size. There must be more of them than by chance, and fewer than the landmark's own boxes.
+    label must have the landmark's size. There must be more explained boxes than by chance, and fewer than the landmark's own
+    boxes.
     """
     obs, accepts = state.obs, state.landmarks.accepts
     count, labels = accepts.shape

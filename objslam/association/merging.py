@@ -23,8 +23,12 @@ the larger size. Larger shares merge more landmarks."""
 _MOST_APART = 0.1
 """The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, or of the
 frames that should show both landmarks. A larger share merges more landmarks."""
-_MIN_EXPECTED = 5.0  # The number of frames that should show both landmarks is assumed to be at least this.
-_DUPLICATE_OVERLAP = 0.5  # The least intersection over union of two boxes in one frame that show one object.
+_MIN_EXPECTED = 5.0
+"""The number of frames that should show both landmarks is assumed to be at least this. A larger number merges more
+landmarks."""
+_DUPLICATE_OVERLAP = 0.5
+"""The least intersection over union of two boxes in one frame that show one object. A larger overlap merges fewer
+landmarks."""
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
 _REACH_GATES = 2.0
 """The distance up to which two landmarks are compared, in gates of the noise of their rays. It is large because one object
@@ -44,7 +48,8 @@ class _Pairs:
 
 
 def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
-    """Return the landmark (N,) into which each one merges: itself, or the landmark with more rays if a pair is one object.
+    """Return the landmark (N,) into which each landmark merges: itself, or the landmark with more rays if a pair is one
+    object.
 
     across_labels: compare pairs of different labels instead of pairs with one label.
     """
@@ -92,7 +97,7 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
 
 def _on_one_line(state: State, gate: float) -> Ints:
     """Return the pairs (P, 2) in which at least half of the first landmark's rays also pass the second landmark. This
-    happens with little parallax, or if one of them is a phantom."""
+    happens with little parallax, or if one of the landmarks is a phantom."""
     edges = gated_edges(state.obs, state.landmarks, gate)
     own = state.matched[edges.ray]
     other = (own >= 0) & (own != edges.landmark)
@@ -115,7 +120,8 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
     """Return the decrease (P,) of -2 ln likelihood by one object instead of two.
 
     It counts the fit of the rays, second boxes in one frame, missed detections, the appearance, and the number of objects.
-    both_seen, both_expected: (P,) the numbers of frames in which both landmarks are detected, and in which both should be.
+    both_seen, both_expected: (P,) the numbers of frames in which both landmarks are detected, and in which both should be
+    detected.
     """
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise

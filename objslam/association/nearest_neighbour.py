@@ -58,7 +58,7 @@ def assign(
 def associate_by_label(rays: Rays, off: Floats | None = None) -> Association:
     """Make one object for each label with a ray, in the order of label_names.
 
-    In each frame, one box of each label gets the object: the nearest one if `off` is given, else the one with the highest
+    In each frame, one box of each label gets the object: the nearest one if `off` is given, else the box with the highest
     score. Of equal scores, the first box wins. All other boxes get no object. off: (R,) the angle between each ray and the
     object of its label, NaN if it is not known.
     """

@@ -23,7 +23,7 @@ class Observations:
     map. sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if
     unknown. range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px.
     track: (R,) id of the track, -1 if unknown. feature: (R,) the row of the box's appearance vector in feature_table, -1
-    without one. Both are None if no box has one."""
+    without one. feature and feature_table are None if no box has a vector."""
 
     frame: Ints
     label: Ints
@@ -138,7 +138,7 @@ def extents(
 
 
 def overlap(one: Floats, two: Floats) -> Floats:
-    """Return the intersection over union of boxes (..., 4), for shapes that fit together."""
+    """Return the intersection over union of boxes (..., 4) whose shapes broadcast together."""
     low, high = np.maximum(one[..., :2], two[..., :2]), np.minimum(one[..., 2:], two[..., 2:])
     common = np.maximum(high - low, 0.0).prod(axis=-1)
     total = (one[..., 2:] - one[..., :2]).prod(axis=-1) + (two[..., 2:] - two[..., :2]).prod(axis=-1) - common

@@ -11,7 +11,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 
 LIFETIME = 60.0
 """The mean time (days) that an object stays where it is. A larger value needs more misses before an object is gone. At 60
-days, a tenth of the objects change in a week, which is a lived-in place."""
+days, a tenth of the objects change in a week, as in a place where people live."""
 _OVERLOOKED = 0.03
 """The probability that all looks of a session miss an object in view for one reason: an error of the map, bad light, or a
 person in the way. A larger value needs more misses before an object is gone."""

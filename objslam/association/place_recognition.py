@@ -15,18 +15,26 @@ from objslam.core.geometry import lift_se2
 from objslam.core.statistics import POSSIBLE_MOTION, SAME_POINT_WIDE
 
 MIN_LANDMARKS = 2
-"""The fewest common landmarks for recognising a place."""
+"""The fewest common landmarks for recognising a place. A larger number recognises fewer places."""
 POSE_FLOOR = (0.02, 0.02, 0.01)
-"""The least standard deviations of a relative pose, in x, y (m) and yaw (rad)."""
-_BENT, _BENT_PER_M = 0.07, 0.02  # The deformation of a neighbourhood: a constant (m), and a part per metre from the pivot.
-_MARGIN = 2.0  # The margin (m) around the landmarks that is part of the area for their density.
+"""The least standard deviations of a relative pose, in x, y (m) and yaw (rad). Larger values trust it less."""
+_BENT, _BENT_PER_M = 0.07, 0.02
+"""The deformation of a neighbourhood: a constant (m), and a part per metre from the pivot. Larger values accept pairs that
+fit less well."""
+_MARGIN = 2.0
+"""The margin (m) around the landmarks that is part of the area for their density. With a larger margin, landmarks count as
+sparser, so a match is more evidence."""
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
-_CANDIDATES = 3000  # The most pairs of a landmark here and one there. Two pairs form a hypothesis.
+_CANDIDATES = 3000
+"""The most pairs of a landmark here and one there. Two pairs form a hypothesis. A larger number costs time."""
 _HYPOTHESES = 2000  # The most hypotheses of two pairs, those with the longest bases. A larger number costs time.
 _VERIFIED = 20  # The number of hypotheses with the best quick scores that get an assignment. A larger number costs time.
 _GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
-_MIN_BASE = 0.3  # The least distance (m) between two landmarks that determine a heading.
-_SAME_SHIFT, _SAME_TURN = 0.5, 0.2  # The largest difference (m, rad) of two corrections that count as one place.
+_MIN_BASE = 0.3
+"""The least distance (m) between two landmarks that determine a heading. A larger distance leaves fewer hypotheses of two
+pairs."""
+_SAME_SHIFT, _SAME_TURN = 0.5, 0.2
+"""The largest difference (m, rad) of two corrections that count as one place. Larger values hide repetitions."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +67,8 @@ class Recognition:
     """One constellation found in another.
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
-    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the second-best place,
-    which counts as at least 0.
+    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the second-best place.
+    The evidence of the second-best place counts as at least 0.
     """
 
     correction: Floats

@@ -7,18 +7,22 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import HALF_RAY, grouped_quantiles
 
 RANGE_GAIN = 6.0
-"""A perfect range lowers the cost of a match by this. Another object would rarely have this range."""
+"""A perfect range lowers the cost of a match by this, because another object would rarely have this range. A larger value
+trusts ranges more."""
 RANGE_LOSS = 4.0
-"""A wrong range raises the cost of a match by at most this. About one correct box in ten has a wrong range."""
+"""A wrong range raises the cost of a match by at most this. About one correct box in ten has a wrong range. With a larger
+value, more correct boxes are lost."""
 BEHIND = 1e6
 """The deviation, in standard deviations, of a point behind the camera: large, but finite."""
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
-_DAMPING = 1e-6  # The share of the information added in all directions. Unobserved directions then stay unchanged.
+_DAMPING = 1e-6
+"""The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
+refinement down."""
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
 _FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-"""The row and the column of each of the six entries that give a symmetric matrix. Those of the diagonal come first."""
+"""The rows and the columns of the six entries that determine a symmetric 3 x 3 matrix. The diagonal comes first."""
 _MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
-"""The place of each entry of the matrix among the six."""
+"""For each entry of the matrix, its index among these six entries."""
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:

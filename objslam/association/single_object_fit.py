@@ -14,8 +14,9 @@ from objslam.core.geometry import widest_angle
 from objslam.core.statistics import OUTLIER_RAY
 
 _MOST_PAIRS = 300  # The most ray pairs that are tried. A larger value costs time.
-_MOST_RAYS = 60  # The most rays from which pairs and the parallax are taken.
-_MIN_ANGLE = np.radians(1.0)  # The least angle (rad) between the two rays of a pair.
+_MOST_RAYS = 60  # The most rays from which pairs and the parallax are taken. A larger number costs time.
+_MIN_ANGLE = np.radians(1.0)
+"""The least angle (rad) between the two rays of a pair. A larger angle needs more parallax for a point."""
 _FREE_INFORMATION = 1e-4  # The information (m^-2) added to each axis: a prior of 100 m, for directions that no ray fixes.
 
 

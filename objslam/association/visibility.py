@@ -1,4 +1,4 @@
-"""Find in which frames each object should be detected, and in which it is."""
+"""Find in which frames each object should be detected, and in which it is detected."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,11 +16,14 @@ from objslam.core.statistics import grouped_median, grouped_quantile, grouped_qu
 from objslam.core.types import Keyframes
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
-_USUAL_DISTANCES = (0.02, 0.98)  # The quantiles of a class's detection distances. Outside them, a miss tells nothing.
+_USUAL_DISTANCES = (0.02, 0.98)
+"""The quantiles of a class's detection distances. Outside them, a miss tells nothing. A wider range counts more misses."""
 _CORE_SHARE = 0.8
 """The usual distances of a class come from this share of its boxes: those of the objects with the most boxes. Objects with
 few boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
-_FRONT_SHARE = 0.95  # An object has a front if at least this share of its boxes is from one half space.
+_FRONT_SHARE = 0.95
+"""An object has a front if at least this share of its boxes is from one half space. A larger share gives fewer objects a
+front."""
 _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
 counts. Larger values hide fewer objects."""
@@ -73,8 +76,8 @@ def frames_of(
 class DetectionHistory:
     """V pairs of an object and a frame in which it is or should be detected, sorted by object, then by frame.
 
-    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, near enough for a
-    detection: within the usual distances of the class, or as near as a box of the object was.
+    object, frame, detected: (V,). inside: (N,) number of frames whose image contains each object's box, and whose camera is
+    near enough to detect it: within the usual distances of the class, or no farther than the object's farthest box.
     """
 
     object: Ints
@@ -217,8 +220,8 @@ def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, ca
 def _in_image(
     position: Floats, extent: Floats, reach: Floats, camera: Camera, frames: Ints, view: CameraFrames
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box inside an image. reach: (N,) m, up
-    to which distance each object counts."""
+    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box inside an image. reach: (N,) m,
+    the distance up to which each object counts."""
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, poses[:, :3, 3] - centre, poses[:, :3, 2]

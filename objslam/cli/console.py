@@ -92,14 +92,15 @@ def console_of(stderr: bool, /) -> Console:
 
 
 def width(*, stderr: bool = False) -> int | None:
-    """Return the characters of a line of stdout or stderr: those of the terminal, or COLUMNS. None for any other pipe."""
+    """Return how many characters a line of stdout or stderr has: the width of the terminal, or COLUMNS. None for any other
+    pipe."""
     return console(stderr=stderr).width if _is_narrow(stderr) else None
 
 
 def say(text: str, *, stderr: bool = False, style: str | None = None) -> None:
     """Print a sentence, wrapped between words if lines have a width (`width`).
 
-    A longer word, such as a path, stays whole, which rich cannot do. style: as rich names it, such as "bold".
+    A longer word, such as a path, stays whole. rich would cut it. style: as rich names it, such as "bold".
     """
     most = width(stderr=stderr)
     lines = text.split("\n")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SPOILT = 1
 """The exit code if the input has an error that makes the positions of a map unreliable."""
-_ROWS = 8  # The most hypotheses in the table, besides the log as it is. The ones left out explain less.
+_ROWS = 8  # The most hypotheses in the table, besides the log as it is. Other hypotheses explain less.
 
 
 @with_options
@@ -55,7 +55,7 @@ def doctor(
     wrong = [finding.to_dict() for finding in found.findings] if solved is None else solved
     for finding in wrong:
         say(f"wrong: {finding['message']}")
-    # The boxes show whether a calibration is right. Without enough boxes, its unusual properties are all there is to show.
+    # The boxes show whether a calibration is right. Without enough boxes, only its unusual properties can be shown.
     doubts = [] if found.trials else [doubt for c in given.cameras for doubt in doubts_of(c.camera)]
     for doubt in doubts:
         say(f"check: {doubt}")

@@ -129,7 +129,7 @@ def fleet(
 
 
 def _ray_engines(memory: float | None, seconds: float, retries: int, jobs: int | None, gpus: float) -> tuple[Engine, Engine]:
-    """Return the engines of the mapping and of the merges. A memory that the user gave is also reserved on a node."""
+    """Return the engines of the mapping and of the merges. A memory limit that the user gave is also reserved on a node."""
     from objslam.fleet.engines.ray_engine import ray_engine
     from objslam.fleet.engines.worker import Limits
 

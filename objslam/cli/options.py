@@ -92,8 +92,9 @@ def settings_of(
     calibration: Path | None = None,
     names: str | None = None,
 ) -> Settings:
-    """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides the others, which override
-    --config. Files of a calibration and of names are read too, so that a wrong one fails before a long log is read."""
+    """Load the settings from --config, --set, --calibration, --names and --mode. --set overrides all others, and all others
+    override --config. Files of a calibration and of names are read too, so that a wrong file fails before a long log is
+    read."""
     import yaml
 
     from objslam.config import load_settings
@@ -158,5 +159,5 @@ def _parameter(name: str, type_: Any, option: Option, default: Any) -> inspect.P
 
 
 def _is_negated(option: Option, default: Any) -> bool:
-    """Return whether the flag sets a value to False that is True by default, as --without-range does."""
+    """Return whether the flag turns off what is on by default, as --without-range does."""
     return default is True and "/" not in option.flag

@@ -64,7 +64,8 @@ _NOISE: Final = {
     "heading": "heading of the poses",
     "place": "place of the poses",
 }
-"""The words for the factors of the noise. A factor of 1 is not shown: the log does not tell it, or confirms the settings."""
+"""The words for the factors of the noise. A factor of 1 is not shown: the log does not determine it, or confirms the
+settings."""
 NOT_LOCALISED = 3
 """The exit code of a run that wrote its result, but was not found in the map that --map names."""
 _WIDE = 10_000  # The width, in characters, of a terminal on which no table is cut, to measure the full width of a table.

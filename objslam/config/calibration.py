@@ -22,7 +22,7 @@ class CalibrationSettings(Section):
     """share by which all turns of the odometry are too large or too small."""
     turn_bias: NotNegative = 0.003
     """rad/s; the turn rate that the odometry adds at all times. At 0.3 m/s, a wheel that is 0.3 % larger than the other adds
-    0.003 rad/s if they are 0.3 m apart. A gyroscope without calibration adds as much."""
+    0.003 rad/s if the wheels are 0.3 m apart. A gyroscope without calibration adds as much."""
     clock: NotNegative = 0.1
     """s; the offset of each camera's clock against the clock of the poses."""
     max_clock: Positive = 0.5

@@ -25,8 +25,8 @@ class Detector(Section):
     class (v10, v26). yolox: raw grid. yolox_decoded: grid that the exported model decodes. detr: boxes, logits."""
     outputs: dict[Role, str] | None = None
     """Name of the model output for each role. In ssd, the roles are boxes, labels and scores. Without an output for scores,
-    they are the fifth column of boxes. In detr, the roles are boxes and logits, or predictions alone. In every other layout,
-    the only role is predictions."""
+    the scores are the fifth column of boxes. In detr, the roles are boxes and logits, or predictions alone. In every other
+    layout, the only role is predictions."""
     names: Annotated[tuple[str, ...], Field(min_length=1)] | str | None = None
     """Class names in the order of the model: a list, a file, coco (80 names) or coco91 (91 names with gaps). The file has
     one name per line, or is YAML or JSON with the key `names`. A relative path may start from the folder of the settings

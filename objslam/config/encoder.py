@@ -10,8 +10,8 @@ from objslam.config.section import Count, Finite, NotNegative, Positive, Section
 
 class Encoder(Section):
     """Configure the ONNX model that makes an appearance vector of each box (--embed). A setting of null is inferred from the
-    model's metadata or shapes, or is that of most encoders: the normalisation of ImageNet. The model runs on
-    detector.device."""
+    model's metadata or shapes. Else it has the value of most encoders, such as the normalisation of ImageNet. The model runs
+    on detector.device."""
 
     output: str | None = None
     """Name of the model output with one vector per image, if several outputs could be that."""

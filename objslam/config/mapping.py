@@ -151,8 +151,8 @@ class Fixed(Section):
 
     loss: Loss = "l1"
     """Robust loss of a ray. l1 is Eq. 1, the sum of the distances between an object and its rays. It draws an object seen
-    from few sides towards the robot. The other losses are on the angle of a ray in units of its noise. They are better in
-    such drives, and no better in recorded ones."""
+    from few sides towards the robot. The other losses are on the angle of a ray in units of its noise. In such drives they
+    are better than l1. In recorded drives they are not."""
 
 
 class Joint(Section):
@@ -209,7 +209,7 @@ class Live(Section):
     """Size in MB at which a segment of the journal is closed and compressed, and the next one begins."""
     journal_free_mb: NotNegative = 200.0
     """Free space in MB at which the journal stops, so that the robot's disk does not fill up. The mapping goes on. On a disk
-    of less than 50 times this size, it is 2 % of the disk."""
+    of less than 50 times this size, the limit is 2 % of the disk."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
     """Maximum number of boxes with which a session repeats the offline association at its end. This takes a few seconds."""
     calibrate_from: Annotated[int, Field(ge=0)] = 200

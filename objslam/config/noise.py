@@ -25,8 +25,9 @@ class Noise(Section):
     """the noise of the odometry along, across and in turning, with a factor for each."""
     localization: Estimated = "auto"
     """the noise of localised poses, with a factor for localization.yaw and one for localization.xy, each at least 1. In
-    fixed mode, frames that show several objects tell it. In joint mode, odometry and rays do, and how long errors last is
-    estimated too, even if localization.* is set. false: in joint mode, the error of each pose is new."""
+    fixed mode, it is estimated from frames that show several objects. In joint mode, it is estimated from odometry and rays,
+    and how long errors last is estimated too, even if localization.* is set. false: in joint mode, the error of each pose is
+    new."""
     prior: Positive = 10.0
     """the weight of the noise in the settings, as a number of residuals. With a larger weight, short logs change the noise
     less."""

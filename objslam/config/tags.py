@@ -17,7 +17,7 @@ class Tags(Section):
     null: the size of each fiducial is estimated, in the scale that the poses have."""
     sizes: dict[int | str, Positive | None] = Field(default_factory=dict)
     """Sides in m of single fiducials, instead of `size`. A key is the number in the label (12 for tag_12) or a whole label.
-    null: the size of this one is estimated."""
+    null: the size of this fiducial is estimated."""
     corner_sigma: Positive = 1.0
     """Standard deviation of a corner per axis in px. It covers the error of the detector, which is smaller, and the error
     that a lens calibration leaves. An estimated factor on the noise of rays also multiplies this noise."""

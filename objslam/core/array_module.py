@@ -1,7 +1,7 @@
 """Functions that work on numpy arrays and on torch tensors alike, and the choice between the two libraries.
 
-Such code takes the library of an array from `module_of`, and gives it `axis=` and positional arguments, which both accept.
-torch is imported only if it may be used.
+Such code takes the library of an array from `module_of`, and calls its functions with `axis=` and positional arguments,
+which both libraries accept. torch is imported only if it may be used.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def array_backend(device: str, large: bool) -> Iterator[Backend]:
     with "auto" on CUDA if torch sees a CUDA device, else on the CPU. If torch is not installed, every batch runs in numpy.
     The setting "cuda" always gives CUDA, and raises ConfigError if torch is not installed or sees no CUDA device.
 
-    numpy gives no warnings of divisions by zero, overflows and invalid values, because torch gives none. torch gets one
-    thread, because the threads of a pool use their cores even while they wait. With one of two cores busy, a run took 4 s
-    with one thread and up to 18 s with two.
+    The warnings of numpy about divisions by zero, overflows and invalid values are switched off, because torch has none.
+    torch gets one thread, because the threads of a pool use their cores even while they wait. With one of two cores busy, a
+    run took 4 s with one thread and up to 18 s with two.
     """
     installed = find_spec("torch") is not None
     if device == "cuda" and not installed:

@@ -19,7 +19,7 @@ COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
 }
 """The numbers of distortion coefficients that each model accepts."""
 
-_STEPS, _FINER = 2000, 4  # The angles of the grid that finds the fold of a lens, and its refinements. More are more exact.
+_STEPS, _FINER = 2000, 4  # The angles in the grid that finds the fold of a lens, and the refinements. More are more exact.
 _ALONG = 200  # The number of pieces of an image side in the sum for the solid angle. More are more exact and slower.
 _LEAST = 1e-9  # The least solid angle of a camera, sr. It keeps a division by the solid angle finite.
 _TURNS, _EXACT, _FLAT = 60, 1e-14, 1e-12  # The most Newton iterations, the step to stop at (rad) and the least divisor.
@@ -260,7 +260,7 @@ def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Flo
 
 
 def depths(camera: Camera, points: Floats) -> Floats:
-    """Return the depths (N,), m, to which the image sizes of objects at points (N, 3) are inversely proportional.
+    """Return the depths (N,), m, of points (N, 3). The image size of an object is inversely proportional to its depth.
 
     The points are in m, in the camera frame. The depth is z, or for a fisheye lens the distance from the camera.
     """

@@ -23,8 +23,8 @@ class Estimate:
     box_offset: the standard deviation of the error that all box centres of an object share, divided by the object's size.
     None if boxes have no size. correlated: (N, 3, m) m, the part of the errors that is correlated between objects, as a
     factor of their joint covariance. It is 0 for an object that was not solved, and None if all objects are independent.
-    tags: the rotation and the size of each fiducial that has them, by the index of its object. log_evidence: of the
-    association, up to a constant. It compares associations of the same rays. -inf if it is not known.
+    tags: the rotation and the size of each fiducial that has them, by the index of its object. log_evidence: the log
+    evidence of the association, up to a constant. It compares associations of the same rays. -inf if it is not known.
     """
 
     map_T_base: Floats

@@ -24,10 +24,10 @@ _SMALL = 1e-4
 less exact. At this value, its relative error is below 1e-17."""
 _ON_A_LINE = 1e-9
 """Points lie on a line if the second singular value of their cross-covariance is at most this share of the first. A larger
-share takes more point sets for lines. Rounding leaves about 1e-15."""
+share treats more point sets as lines. Rounding leaves about 1e-15."""
 _FEW_POINTS = 100
-"""Up to this number of points, all distances between them are computed. With more, a search tree takes less time. But a log
-with few objects then needs no import of scipy.spatial, which takes 0.07 s."""
+"""Up to this number of points, all distances between them are computed. For more points, a search tree takes less time. Few
+points need no tree, and so no import of scipy.spatial, which takes 0.07 s."""
 
 
 def make_pose(rotation: Floats, translation: Floats) -> Floats:
@@ -116,7 +116,7 @@ def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
 class Motion(NamedTuple):
     """The motion between two poses (4, 4), as floats, in the frame of the map and not of the body.
 
-    axis: of the rotation, times the sine of its angle. angle: rad, in [0, pi]. way: m.
+    axis: the unit axis of the rotation, times the sine of its angle. angle: rad, in [0, pi]. way: m, the shift.
     """
 
     axis: tuple[float, float, float]
@@ -125,7 +125,8 @@ class Motion(NamedTuple):
 
 
 def motion_between(before: Floats, after: Floats) -> Motion:
-    """Return the motion between two poses (4, 4), in a tenth of the time that numpy takes. A session asks for every pose."""
+    """Return the motion between two poses (4, 4), in a tenth of the time that numpy takes. A session needs it for every
+    pose."""
     (a0, a1, a2, ax), (b0, b1, b2, by), (c0, c1, c2, cz) = before[:3].tolist()
     (d0, d1, d2, dx), (e0, e1, e2, ey), (f0, f1, f2, fz) = after[:3].tolist()
     trace = a0 * d0 + b0 * e0 + c0 * f0 + a1 * d1 + b1 * e1 + c1 * f1 + a2 * d2 + b2 * e2 + c2 * f2
@@ -160,7 +161,7 @@ def exp_se3(twist: Floats) -> Floats:
 
 def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
     """Return for rotation vectors (..., 3) three arrays (..., 1): the angles, whether each is so small that a series is
-    needed, and the angles as divisors, with 1 for the small ones."""
+    needed, and the angles as divisors, in which 1 replaces small angles."""
     angle = np.sqrt(np.einsum("...i,...i->...", omega, omega))[..., None]
     small = angle < _SMALL
     return angle, small, np.where(small, 1.0, angle)
@@ -202,7 +203,7 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
 def interpolate_pair(first: Floats, second: Floats, share: float) -> Floats:
     """Return the pose (4, 4) at a share, 0 to 1, of the way between two poses (4, 4), as `interpolate`.
 
-    A session asks for every image. This function avoids numpy, and takes a tenth of the time of `interpolate`.
+    A session needs it for every image. This function avoids numpy, and takes a tenth of the time of `interpolate`.
     """
     axis, angle, way = motion_between(first, second)
     if angle >= math.pi / 2:  # The sine of an angle near pi is small, so that the axis would be inexact.
@@ -311,7 +312,8 @@ def evenly_spread(number: int) -> Floats:
 
 
 def nearest_points(points: Floats, count: int) -> Ints:
-    """Return the `count` nearest of points (N, 3) to each of them, itself included, as indices (N, count) in any order."""
+    """Return for each of the points (N, 3) the indices (N, count) of the `count` nearest points, in any order. The point
+    itself is one of them."""
     if len(points) <= _FEW_POINTS:
         squared = sum((points[:, [axis]] - points[:, axis]) ** 2 for axis in range(3))
         return np.argpartition(squared, count - 1, axis=1)[:, :count]

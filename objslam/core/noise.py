@@ -19,8 +19,9 @@ class NoiseFactors:
     rays: `rays.pixel_sigma` and `rays.box_sigma`. ranges: `depth.sigma` and `depth.sigma_per_m`. range_bias: `depth.bias`.
     along: `odometry.x_per_m` and `odometry.xy_per_rad`. across: `odometry.y_per_m` and `odometry.floor_xy`. turning: the
     odometry's noise of the heading. heading: `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a
-    joint solve makes all lengths too short. The other four are no factors: heading_share, place_share are the shares of the
-    variance of these errors that last, and heading_seconds, place_seconds how long (`Lasting`).
+    joint solve makes all lengths too short. The other four describe lasting errors (`Lasting`) of localised headings and
+    places. heading_share, place_share: the share of the variance that lasts. heading_seconds, place_seconds: how long it
+    lasts, s.
     """
 
     rays: float = 1.0
@@ -76,8 +77,8 @@ class NoiseFactors:
         )
 
     def like(self, other: "NoiseFactors", tolerance: float) -> bool:
-        """Return whether all factors agree with the factors of `other` within a relative tolerance, and the errors
-        last alike. The shrinkage is not compared."""
+        """Return whether all factors agree with the factors of `other` within a relative tolerance, and whether the lasting
+        errors agree (`Lasting.like`). The shrinkage is not compared."""
         mine, its = self.factors, other.factors
         lasting = all(one.like(two, tolerance) for one, two in zip(self.lasting, other.lasting, strict=True))
         return lasting and bool((np.abs(np.log(np.maximum(mine, 1e-9) / np.maximum(its, 1e-9))) < tolerance).all())
@@ -92,12 +93,13 @@ FACTORS = ("rays", "ranges", "range_bias", "along", "across", "turning", "headin
 """The fields of `NoiseFactors` that are factors on standard deviations."""
 
 MOST_NOISE = 20.0
-"""The largest estimated factor on a noise. With a larger factor, measurements with wrong units or axes fit as noise. Real
-robots have up to 6.3, for odometry that is only the commanded speed."""
+"""The largest estimated factor on a noise. With a larger factor, wrong units or axes of measurements are taken for noise.
+Real robots have up to 6.3, for odometry that is only the commanded speed."""
 
 MOST_POSE_NOISE = 100.0
-"""The largest estimated factor on `localization.xy` and `localization.yaw`, in joint mode. With their defaults, this is the
-2 m of a GPS without corrections, and half a radian. A larger factor lets a path with wrong units fit as noise."""
+"""The largest estimated factor on `localization.xy` and `localization.yaw`, in joint mode. With the defaults of these
+settings, it allows 2 m, as of a GPS without corrections, and half a radian. With a larger factor, wrong units of a path are
+taken for noise."""
 
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""

@@ -24,7 +24,7 @@ FATES: tuple[Fate, ...] = ("new", "confirmed", "moved", "gone")
 """The states that an object can have after several sessions."""
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
-_SHOWN = 20  # The most objects in the text of a map.
+_SHOWN = 20  # The most objects in the text of a map. A larger number makes the text longer.
 _UPPER_TRIANGLE = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # Entries of the covariance in a table row.
 
 COLUMNS: dict[str, str] = {
@@ -158,8 +158,8 @@ def _life_row(life: Life | None) -> tuple[str | float | None, ...]:
 class ObjectMap:
     """The objects of one map, in the coordinate frame that `frame` names.
 
-    A map is a sequence of its objects. Spatial queries return resolved objects only. The first query makes an index, and the
-    next ones are quick in large maps too. A point is x, y, z in m, or x, y to ignore heights. gone: objects of earlier
+    A map is a sequence of its objects. Spatial queries return resolved objects only. The first query makes an index, so that
+    later queries are quick in large maps too. A point is x, y, z in m, or x, y to ignore heights. gone: objects of earlier
     sessions that are no longer there. shared_covariance: (7, 7) of the error that all objects share
     (`core.maps.shared_covariance`). The covariances of the objects contain it. None if it is not known.
     """
@@ -238,7 +238,7 @@ class ObjectMap:
         """Return the k objects that look most like an appearance vector (D,), and their cosines to it, the largest first.
 
         Unresolved objects are found too, objects without a vector are not. The vector must come from the encoder that made
-        those of the map. ValueError if it has another length, or is zero or not finite.
+        the vectors of the map. ValueError if it has another length, or is zero or not finite.
         """
         seen = [(o, o.features) for o in self.objects if o.features is not None]
         return tuple((seen[i][0], cosine) for i, cosine in ranked([look for _, look in seen], vector, k))

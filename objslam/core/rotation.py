@@ -1,6 +1,6 @@
 """Rotations as matrices (..., 3, 3), as vectors (..., 3) and as unit quaternions (..., 4) x, y, z, w, in batches.
 
-They are plain arrays. `scipy.spatial.transform` does the same, but its import takes longer than the map of a small log.
+They are plain arrays. `scipy.spatial.transform` does the same, but its import takes longer than the mapping of a small log.
 """
 
 import numpy as np
@@ -92,7 +92,7 @@ def rotation_from_quaternion(xyzw: Floats) -> Floats:
 def quaternion_from_rotation(rotation: Floats) -> Floats:
     """Return the unit quaternions (..., 4) x, y, z, w with w >= 0 of rotations (..., 3, 3) (Shepperd 1978).
 
-    If w = 0, both q and -q have w >= 0. The result is the one whose first number other than 0 is positive.
+    If w = 0, both q and -q have w >= 0. Then the first number of the result that is not 0 is positive.
     """
     # Row i is 4 q[i] q, where q is the quaternion. The row with the largest diagonal entry is the most exact one.
     outer = np.empty((*rotation.shape[:-2], 4, 4))

@@ -19,7 +19,8 @@ SAME_POINT_WIDE = 16.266
 (chi-squared, 3 degrees of freedom). A larger value lets more pairs compete for an assignment."""
 POSSIBLE_MOTION = 14.156
 """The squared deviation of 99.73 % of planar motions in x, y and yaw is below this value (chi-squared, 3 degrees of
-freedom). It is the share of a Gaussian within 3 standard deviations. A larger value tries less likely motions."""
+freedom). This percentage is the share of a Gaussian within 3 standard deviations. A larger value tries less likely
+motions."""
 STRAY_RAY = 13.816
 """The squared deviation of 99.9 % of an object's own rays is below this value (chi-squared, 2 degrees of freedom). It is
 also the cost of a ray that fits no object. A larger deviation gives rays of other things more influence on the solution."""
@@ -27,8 +28,8 @@ OUTLIER_RAY = 4.0
 """The deviation above which a ray is rejected. 3e-4 of an object's own rays exceed it (Rayleigh, exp(-4^2 / 2)). A larger
 deviation keeps more false boxes."""
 CLIPPED_RAY = 6.0
-"""A ray with a larger deviation counts as one with this deviation in the measured noise of its object. A larger value lets a
-false box raise this noise more."""
+"""In the measured noise of an object, a ray with a larger deviation counts as if it had this deviation. A larger value lets
+a false box raise this noise more."""
 HALF_RAY = 6.0
 """The squared deviation at which a ray has half of its full weight in a fit of points (Cauchy's weight, about `CAUCHY_K`
 squared). A larger deviation gives rays of other things more influence."""
@@ -64,15 +65,16 @@ keeps objects near the nominal noise for longer."""
 class Lasting:
     """The part of an error that a first-order Gauss-Markov process describes. The rest of the error is white.
 
-    share: of the variance, 0 for an error that is new in each pose, 1 for one that only lasts. seconds: the time (s) after
-    which the correlation of the lasting part is 1/e.
+    share: the share of this part in the variance, 0 for an error that is new in each pose, 1 for an error without a white
+    part. seconds: the time (s) after which the correlation of the lasting part is 1/e.
     """
 
     share: float = 0.0
     seconds: float = 0.0
 
     def like(self, other: "Lasting", tolerance: float) -> bool:
-        """Return whether the shares differ by less than a tolerance, and the times by less than this share of them."""
+        """Return whether the shares differ by less than a tolerance, and the times relatively by less than this
+        tolerance."""
         if not self.share or not other.share:
             return self.share == other.share
         times = abs(math.log(max(self.seconds, 1e-9) / max(other.seconds, 1e-9)))
@@ -127,7 +129,8 @@ def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[flo
 def quantile(values: Floats, share: float) -> float:
     """Return the value at a share (0 to 1) of the sorted values (R,), at least one, interpolated between two neighbours.
 
-    `np.quantile` returns the same. For some tens of values it takes ten times as long, and a session asks at each keyframe.
+    `np.quantile` returns the same. For some tens of values it takes ten times as long, and a session needs it at each
+    keyframe.
     """
     ordered, at = np.sort(values), share * (len(values) - 1)
     below = int(at)

@@ -90,6 +90,6 @@ class Trace:
         self._iterations += attempt._iterations
 
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:
-        """End a round. It gets all iterations since the end of the round before."""
+        """End a round. It gets all iterations since the end of the previous round."""
         iterations, self._iterations = tuple(self._iterations), []
         self.rounds.append(Round(why, association, iterations, estimate.map_T_base, estimate.positions, estimate.weight))

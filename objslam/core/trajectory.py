@@ -29,7 +29,7 @@ def travel(poses: Floats) -> Floats:
     """Return how far a path with poses (N, 4, 4) goes from each pose to the next: (N - 1, 3).
 
     The columns are the length of the way, m, the size of the turn, rad, and the turn about the vertical axis with its sign,
-    rad. A step over left out poses has the sum of the rows of the short steps that it replaces.
+    rad. If poses are left out, the row of the longer step is the sum of the rows of the steps that it replaces.
     """
     turn, way = twist_lengths(inverse(poses[:-1]) @ poses[1:])
     rotation = poses[:, :3, :3]

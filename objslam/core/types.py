@@ -18,7 +18,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.statistics import WHITE, Lasting
 
 MAX_BOXES = 10_000
-"""The most boxes of a frame. A frame with more is rejected: no detector finds so many, and association would be too slow."""
+"""The most boxes of a frame. A frame with more is rejected, because no detector finds so many. With a larger number,
+association could be too slow."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a map's frame that points up in the world, with its sign."""
 
@@ -62,10 +63,10 @@ class Detections:
     frame_stamps: (F,) s, strictly increasing. frame: (M,) index into frame_stamps, non-decreasing. boxes: (M, 4) x1, y1, x2,
     y2 in px of the raw (distorted) image. label: (M,) index into label_names. scores: (M,) in [0, 1]. depths: (M,) z along
     the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge,
-    as with fiducials, of which a detector needs all corners. Then box centres are valid up to the edge. corners: (M, 4, 2)
-    px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if no box has corners.
-    features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box has one. ValueError if a
-    shape, an index or the order is wrong.
+    as with fiducials, because a detector needs all their corners. Then box centres are valid up to the edge. corners:
+    (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if no box has
+    corners. features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box has one. ValueError
+    if a shape, an index or the order is wrong.
     """
 
     frame_stamps: Floats
@@ -198,9 +199,10 @@ class Keyframes:
     the factors on `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. lasting: the
     parts of the errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the coordinate frame of
     the first odometry pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error
-    since its start, in the frame of odom_T_base. stretch: (K,) the stretch of the odometry between two gaps, None means one
-    for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step, wander: (K,), (K, 6) by
-    `frontend.odometry_bridge`, None if the odometry is exact between its poses.
+    since its start, in the frame of odom_T_base. stretch: (K,) the number of each keyframe's stretch of the odometry between
+    two gaps, None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no
+    meaning. step: (K,) the place of each keyframe among the steps of the odometry. wander: (K, 6) the variance of that step.
+    Both are those of `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses.
     """
 
     stamps: Floats
@@ -273,7 +275,7 @@ class Rays:
     origin. corners: (R, 4, 3) unit, in the camera frame, the directions to the corners of a square fiducial, NaN for another
     object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
     the cut off boxes of the same images, None if they were not collected. feature: (R,) the row of each ray's appearance
-    vector in feature_table, -1 without one. Both are None if no ray has one.
+    vector in feature_table, -1 without a vector. feature and feature_table are None if no ray has a vector.
     """
 
     keyframe: Ints

@@ -44,8 +44,8 @@ _NOTHING = 1e-200
 """The largest variance, in the square of any unit, that counts as 0. Products of smaller numbers have few digits left. A
 larger value leaves more correlations unchecked."""
 _NEGATIVE = 1e-6
-"""How far below zero the least eigenvalue of a correlation matrix may be, and how far beyond 1 a correlation. A larger value
-accepts numbers that were rounded to fewer digits."""
+"""The least eigenvalue of a correlation matrix may be this far below 0, and a correlation may be this far beyond 1. A larger
+value accepts numbers that were rounded to fewer digits."""
 
 
 def valid_stamps(stamps: Floats, bound: float = MAX_STAMP) -> Bools:
@@ -70,7 +70,7 @@ def lengths(vectors: Floats) -> Floats:
 
 
 def valid_pose_rows(rows: Floats) -> Bools:
-    """Return which rows (N, 7) of x, y, z, m, and a quaternion qx, qy, qz, qw of any length are poses."""
+    """Return which rows (N, 7) are poses: x, y, z, m, and a quaternion qx, qy, qz, qw of any length."""
     turns = np.asarray((np.abs(rows[:, 3:]) < _LONGEST).all(axis=1))
     turns &= np.linalg.norm(np.where(turns[:, None], rows[:, 3:], 0.0), axis=1) > _SHORTEST
     return turns & valid_positions(rows[:, :3])
@@ -108,7 +108,7 @@ def rigid_pose(pose: Floats) -> Floats | None:
 def _is_exact(pose: Floats) -> bool:
     """Return whether a pose (4, 4) is rigid, and its rotation exact up to rounding.
 
-    A session asks for every pose, and nearly all are. This function avoids numpy, and takes a tenth of the time of
+    A session checks every pose, and nearly all are exact. This function avoids numpy, and takes a tenth of the time of
     `rigid_poses`.
     """
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = pose.tolist()
@@ -182,7 +182,7 @@ def _possible(noise: RangeNoise) -> bool:
 
 
 def is_date(stamp: float) -> bool:
-    """Return whether a stamp, s, is Unix time. Other clocks start at 0 and stay below the limit of about three years."""
+    """Return whether a stamp, s, is Unix time: above about three years. Other clocks start at 0 and stay below this."""
     return 1e8 < stamp < _LAST_DATE
 
 
@@ -192,7 +192,8 @@ def is_name(value: object) -> bool:
 
 
 def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools, str], ...]:
-    """Return the rules for boxes (M, 4), px. Each has a mask (M,) of the boxes that keep it, and the reason to drop others.
+    """Return the rules for boxes (M, 4), px. Each has a mask (M,) of the boxes that obey the rule, and the reason to drop
+    the others.
 
     scores: (M,). names: (M,) whether the label of each box `is_name`.
     """

@@ -23,7 +23,9 @@ from objslam.io.images import decode_colour
 from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
 
-_AHEAD = 8  # The number of images, in addition to a batch, that are decoded before the network needs them.
+_AHEAD = 8
+"""The number of images, in addition to a batch, that are decoded before the network needs them. A larger number needs more
+memory."""
 
 Progress = Callable[[str, int, int], None]
 """A callback with the name of the stage, the number of finished items, and the total (0 if unknown)."""

@@ -18,7 +18,7 @@ from objslam.errors import ConfigError, DetectorError
 DESCRIPTION = "objslam.encoder"
 """The metadata key of a model's own description, which is JSON with keys of the `encoder` settings."""
 _USER_ONLY = frozenset({"margin", "batch", "size"})
-_SIZE = 224  # The width and height of an input of free size, px, if the settings have no size. Most encoders learnt at it.
+_SIZE = 224  # The width and height, px, of an input of free size without a setting. Most encoders are trained with it.
 _VECTOR_OUTPUTS = ("image_embeds", "image_features", "pooler_output", "embeddings", "embedding", "features")
 """The names that exporters give to the output with the vector, the surest first."""
 

@@ -31,13 +31,13 @@ _KINDS: dict[str, type[np.generic]] = {
 _PIXELS = ("float", "float16", "double", "uint8")
 _MASK, _SIZES = "pixel_mask", "orig_target_sizes"
 _FED = {_MASK: 3, _SIZES: 2}  # The numbers of axes of the inputs that exported DETR models need besides the image.
-_NOT_A_MODEL = "INVALID_PROTOBUF"  # What onnxruntime calls a file of another kind. Its text says no more.
+_NOT_A_MODEL = "INVALID_PROTOBUF"  # The error of onnxruntime for a file that is no ONNX model. Its text says no more.
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _GIB = 1 << 30  # bytes
 _MOST_MEMORY = 8 * _GIB
-"""The most memory of the computer, bytes, that the models of a process take together. On a computer with less than twice as
-much, they get the half of it. A larger value allows larger models, but a damaged model can then take the memory from all
-other programs. YOLO12n with images of 640 px takes 0.1 GiB."""
+"""The most memory of the computer, bytes, that the models of a process take together. On a computer with less than 16 GiB,
+they take at most half of its memory. A larger value allows larger models, but a damaged model can then take the memory from
+all other programs. YOLO12n with images of 640 px takes 0.1 GiB."""
 _MOST_PIXELS = 1 << 26
 """The most pixels of the images of a run, if the model fixes their size and number: an image of 8192x8192. A larger value
 takes more memory before the model runs."""
@@ -111,8 +111,8 @@ class Network:
 
 def open_network(path: Path, settings: config.Detector) -> Network:
     """Load an ONNX model. The settings give the device and the number of threads. Raises DetectorError if the file is
-    missing, is no ONNX model, or needs other inputs than an image or a too large one, and ConfigError if cuda is set but
-    missing."""
+    missing or is no ONNX model, or if the model needs other inputs than an image, or a too large image. Raises ConfigError
+    if cuda is set but missing."""
     import onnxruntime
 
     try:
@@ -174,8 +174,8 @@ def _memory() -> int:
 def _limit_memory() -> bool:
     """Give onnxruntime the memory that the sessions of this process share. It raises an error where they need more.
 
-    Returns whether it could: only a private module of onnxruntime offers this, and the next version may lack it. Without it,
-    the limits on images and outputs remain.
+    Returns whether this was possible: only a private module of onnxruntime offers it, and the next version may lack it.
+    Without it, the limits on images and outputs remain.
     """
     try:
         from onnxruntime.capi import _pybind_state as ort
@@ -190,7 +190,7 @@ def _limit_memory() -> bool:
 
 
 def _is_refused_memory(error: Exception) -> bool:
-    """Whether onnxruntime ends a run because its pool of memory, or the computer, has too little."""
+    """Whether onnxruntime ends a run because the computer, or its own pool, has too little memory."""
     return any(text in str(error) for text in ("is smaller than requested bytes", "Failed to allocate memory", "bad_alloc"))
 
 

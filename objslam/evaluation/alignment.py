@@ -23,7 +23,8 @@ _MAX_STARTS = 3000  # The most initial transforms that are scored. More are slow
 _MAX_TRIPLES = 1000  # The most initial transforms from triples. Triples are right more often than pairs, so fewer suffice.
 _DISTANCES = 1_000_000  # The number of distances that are computed at once. More take more memory: 24 MB for a million.
 _MAX_REFINED = 12  # The number of the best initial transforms that are refined. A larger number is more reliable and slower.
-_MAX_ROUNDS = 50  # The maximum number of rounds of matching and aligning, if the matches do not converge.
+_MAX_ROUNDS = 50
+"""The maximum number of rounds of matching and aligning, if the matches do not converge. A larger number takes longer."""
 _ON_A_LINE = 0.02
 """The corners of a triangle are on a line if the sine of an angle is at most this. Position errors of 2 % of the triangle's
 length leave its turn about this line open. A larger value leaves more triples out."""

@@ -14,14 +14,15 @@ from objslam.core.types import TruthObject
 from objslam.evaluation.alignment import Transform
 
 _SQUARE = 1.1
-"""The ratio of true length and width below which an object has no heading to compare. A larger ratio compares fewer."""
+"""The ratio of true length and width below which an object has no heading to compare. A larger ratio compares fewer
+headings."""
 
 
 @dataclass(frozen=True)
 class BodyMatch:
     """A body against a true body, after the alignment.
 
-    size_error: (3,) length, width and height, as shares of the true ones. yaw_error: rad in [0, pi/2], None if the true
+    size_error: (3,) length, width and height, as shares of the true sizes. yaw_error: rad in [0, pi/2], None if the true
     object is about square or has no yaw. iou: the intersection over union of the two upright boxes, None without a true yaw.
     """
 
@@ -36,7 +37,7 @@ class BodyMatch:
 
 
 def match_bodies(found: MapObject, true: TruthObject, transform: Transform) -> BodyMatch | None:
-    """Return how the body of a map object fits the true one, None if one of them has no size."""
+    """Return how the body of a map object fits the true body, None if one of the two has no size."""
     if found.body is None or true.size is None:
         return None
     size = found.body.size * transform.scale

@@ -1,4 +1,4 @@
-"""Compare the rotations of fiducials with true ones."""
+"""Compare the rotations of fiducials with the true rotations."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ of freedom)."""
 
 @dataclass(frozen=True)
 class TagMatch:
-    """A fiducial against a true one, after the alignment. error: rad, the angle between both rotations. squared: the squared
-    Mahalanobis distance of the nearer of its rotations."""
+    """A fiducial against a true fiducial, after the alignment. error: rad, the angle between its rotation and the true
+    rotation. squared: the squared Mahalanobis distance of the rotations. If the fiducial may have a second rotation, the
+    nearer one of the two counts."""
 
     error: float
     squared: float
 
 
 def match_tags(found: MapObject, true: TruthObject, transform: Transform) -> TagMatch | None:
-    """Compare the rotation of a fiducial with the true one. Returns None if the map or the truth has no rotation of it."""
+    """Compare the rotation of a fiducial with the true rotation. Returns None if the map or the truth has no rotation of
+    it."""
     if found.tag is None or true.tag_xyzw is None:
         return None
     truth = transform.pose[:3, :3].T @ rotation_from_quaternion(true.tag_xyzw[None])[0]

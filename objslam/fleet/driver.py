@@ -26,16 +26,16 @@ _CHUNK = 500
 
 Stage = Literal["mapping", "merging"]
 Tell = Callable[[Stage, int, int, int, int], None]
-"""A function that is called with the stage, and with the numbers of its tasks that succeeded, failed, are running, and of
-all."""
+"""A function that is called with the stage, and with four numbers: how many of its tasks succeeded, failed and are running,
+and how many there are."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mapped:
     """The driver's summary of a mapped log.
 
-    key: the key of the result. begin: the first stamp of the path, s. warnings: their number. seconds: how long the task
-    took, s. report: whether the result has a report.html. new: whether this run mapped the log.
+    key: the key of the result. begin: the first stamp of the path, s. warnings: the number of warnings. seconds: how long
+    the task took, s. report: whether the result has a report.html. new: whether this run mapped the log.
     """
 
     place: LogPlace
@@ -53,7 +53,7 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A log or a site that failed. name: the path of the log, or the site. place: of the log, None for a site.
+    """A log or a site that failed. name: the path of the log, or the site. place: where the log was found, None for a site.
 
     kind: `log` if something is wrong with the log, `site` for a site, else the kind of the task's `Answer`.
     """
@@ -234,7 +234,7 @@ def _with_earlier(members: dict[str, Member], state: bytes | None, digest: str, 
     """Return the sessions of a site by key, in the order of time: `members`, and those of earlier runs with other logs.
 
     state: the content of the file `state_name` of the site. digest: the hash of the job. paths: where the logs of
-    this run are, mapped or not. An earlier session with one of them is left out, because this run replaces it.
+    this run are, mapped or not. An earlier session with one of these paths is left out, because this run replaces it.
     """
     before = {one.key: one for one in site_task.earlier_members(state, digest) if one.path not in paths}
     return dict(sorted((before | members).items(), key=lambda entry: (entry[1].begin, entry[1].path)))

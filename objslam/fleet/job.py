@@ -21,9 +21,9 @@ _INPUTS = "inputs"
 def make_job(store: str, settings: Settings, options: SourceOptions, detector: Path | None, *, report: bool) -> Job:
     """Return the job of a fleet. If the store is remote, workers get the files of the settings through it.
 
-    The content of the files that settings and options name counts in the key of the results, and their paths do not.
-    store: the path or URL of the output. detector: the file of a model. report: whether each log gets a report.html.
-    ConfigError if a file cannot be read, StoreError if the store refuses.
+    The key of the results depends on the content of the files that settings and options name, and not on their paths. store:
+    the path or URL of the output. detector: the file of a model. report: whether each log gets a report.html. ConfigError if
+    a file cannot be read, StoreError if the store refuses.
     """
     files: dict[str, Path] = {}
     if settings.calibration.file is not None:

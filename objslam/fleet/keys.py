@@ -1,4 +1,5 @@
-"""The keys of a fleet: what a result depends on, as a hash, so that a second run does only what is missing or changed."""
+"""The keys of a fleet. A key is a hash of all that a result depends on, so a second run does only what is missing or
+changed."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ OPTION_FILES = ("class_names", "camera_info")
 _LETTERS = 32
 """The hexadecimal digits of a key. A larger number makes longer names. With 32, two contents never have one key by
 chance."""
-_BLOCK = 1 << 20  # The bytes that are read at once.
+_BLOCK = 1 << 20  # The bytes that are read at once. A larger number needs more memory.
 
 
 def hash_log(path: Path) -> str:

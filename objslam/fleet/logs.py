@@ -21,7 +21,7 @@ _LOG_MARKS = {
 }
 """Names that make a folder a log. Each kind of recording in `objslam.sources` that is a folder has one of them."""
 _BAGS = (".bag", ".mcap", ".db3")
-"""The endings of ROS bags. Each is also known with .zstd or .zst behind it."""
+"""The endings of ROS bags. Each may be followed by .zstd or .zst."""
 _BAG_FOLDER = "metadata.yaml"
 """The file that makes all bags of a folder one recording."""
 

@@ -123,7 +123,7 @@ def _corner_rays(boxes: Detections, camera: Camera, settings: Settings, ledger: 
 def _features(boxes: Detections, before: list[Floats32 | None], camera: Camera, ledger: Ledger) -> Floats32 | None:
     """Return the appearance vectors (M, D) of boxes, None if they have none.
 
-    Vectors of another length than those of the cameras before cannot be compared with them. The ledger counts them.
+    Vectors whose length differs from those of earlier cameras cannot be compared with them. The ledger counts such vectors.
     """
     if boxes.features is None:
         return None

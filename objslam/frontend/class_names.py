@@ -73,7 +73,8 @@ def numbered(data: Any) -> dict[int, str] | None:
 
 
 def checked(names: dict[int, str], where: str) -> dict[int, str]:
-    """Return the names. ConfigError if there is none, or one is empty or not printable. where: their origin, for errors."""
+    """Return the names. ConfigError if there is no name, or a name is empty or not printable. where: their origin, for
+    errors."""
     for number, name in names.items():
         if not name.strip() or not name.isprintable():
             raise ConfigError(f"the name of class {number} is empty or not printable", where=where)
@@ -83,7 +84,8 @@ def checked(names: dict[int, str], where: str) -> dict[int, str]:
 
 
 def named(label: str, names: Mapping[int, str]) -> str | None:
-    """Return the name of a label that is a class number, None if it has none. Other labels are returned as they are."""
+    """Return the name of a label that is a class number, None if the number has no name. Other labels are returned as they
+    are."""
     if not (label.isascii() and label.isdigit()):
         return label
     return names.get(int(label)) if len(label) < len(str(_MOST)) else None

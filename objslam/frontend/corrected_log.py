@@ -61,7 +61,7 @@ class CorrectablePath:
 
     @cached_property
     def bridge(self) -> OdometryBridge:
-        """How far the path may be from the interpolated one. The errors hardly change this."""
+        """How far the path may be from the interpolated path. The errors hardly change this."""
         return OdometryBridge.of(self.odometry)
 
     def path(self, error: Mapping[str, float]) -> Trajectory:
@@ -166,7 +166,7 @@ def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str
 
 @lru_cache(maxsize=64)
 def _turn(roll: float, tilt: float, yaw: float) -> Floats:
-    """Return the rotation (3, 3) by the errors `AXES`. Derivatives by other errors ask for the same one many times."""
+    """Return the rotation (3, 3) by the errors `AXES`. Derivatives by other errors need the same rotation many times."""
     turn = rotation_from_vector(np.array([roll, tilt, yaw]))
     turn.setflags(write=False)  # All callers get this array.
     return turn
@@ -179,7 +179,7 @@ def lens_errors(error: Mapping[str, float], name: str) -> tuple[float, float, fl
 
 
 def inverse_lens(errors: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return the errors `LENS` whose correction undoes the correction of the given ones."""
+    """Return the errors `LENS` whose correction undoes the correction of the given errors."""
     longer = 1 + errors[0]
     return 1 / longer - 1, -errors[1] / longer, -errors[2] / longer
 
@@ -220,7 +220,7 @@ def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:
 
 
 def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajectory | None = None) -> CameraLog:
-    """Return a camera and its data, corrected by the errors. path: on this path its stamps stay (see `later`)."""
+    """Return a camera and its data, corrected by the errors. path: the path on which its stamps stay (see `later`)."""
     camera, name = one.camera, one.camera.name
     clock, (focal, cx, cy) = error.get(f"{name}.clock", 0.0), lens_errors(error, name)
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]

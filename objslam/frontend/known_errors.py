@@ -16,10 +16,10 @@ from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
 from objslam.io.calibration_yaml import load_calibration
 
 _PRIORS = {"translation": 0.05, "focal": 0.02, "centre": 0.02}
-"""The prior standard deviations that `auto` means in fixed mode. The first one (m) is that of a place that somebody measured
-with a ruler. The second one (a share) is that of a field of view from a data sheet. The third one (a share of the focal
-length) is that of an image centre taken as the middle of the image. A calibrated camera errs less. With larger values, a log
-must show more before an error counts as known."""
+"""The prior standard deviations that `auto` means in fixed mode. The first (m) is for a place that was measured with a
+ruler. The second (a share) is for a field of view from a data sheet. The third (a share of the focal length) is for an image
+centre that is assumed in the middle of the image. A calibrated camera errs less. With larger values, a log must show more
+before an error counts as known."""
 COARSE = 0.3
 """Given poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
@@ -69,8 +69,8 @@ def possible(log: Log, settings: Settings) -> list[str]:
     """Return the names of the errors of a log that the settings do not fix.
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
-    position have no errors, unless settings.calibration.use is true. Neither has its lens in fixed mode, because such poses
-    come from images of this lens, or were calibrated with it.
+    position have no errors, unless settings.calibration.use is true. In fixed mode its lens has no errors either, because
+    such poses come from images of this lens, or were calibrated with it.
     """
     asked = settings.calibration.use is True
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}

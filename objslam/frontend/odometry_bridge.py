@@ -2,8 +2,8 @@
 
 The interpolation assumes a constant velocity from pose to pose. A real robot changes its velocity in between, so it is
 elsewhere, except at the poses themselves. Such an error is a bridge. At the share s of a step, a random walk that is held at
-both ends has the variance `wander` * s * (1 - s). The odometry shows how large it is: by how much the velocity changes from
-one step to the next.
+both ends has the variance `wander` * s * (1 - s). The odometry shows how large `wander` is: by how much the velocity changes
+from one step to the next.
 """
 
 from dataclasses import dataclass
@@ -37,9 +37,10 @@ class OdometryBridge:
 
         The mean velocities in two neighbouring steps of T and U seconds differ. If the velocity is white noise of density q,
         their difference has the variance q (1 / T + 1 / U), and the path wanders by q T. If the velocity is a random walk of
-        density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, the latter has the mean of p T^3
-        / 15 * s (1 - s). Between a step and the next but one, white noise gives the same variance as between neighbours, and
-        a random walk gives 2.5 times as much. This tells, for each axis, which share of the changes is a random walk.
+        density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, this second variance has the
+        same mean as p T^3 / 15 * s (1 - s), which is used instead. Between a step and the next but one, white noise gives
+        the same variance as between neighbours, and a random walk gives 2.5 times as much. This tells, for each axis, which
+        share of the changes is a random walk.
         """
         seconds = np.diff(odometry.stamps)[:, None]
         velocity = log_se3(inverse(odometry.poses[:-1]) @ odometry.poses[1:]) / seconds
@@ -54,9 +55,10 @@ class OdometryBridge:
         return cls(odometry.stamps, (1 - walk) * white + walk * walked)
 
     def at(self, stamps: Floats) -> tuple[Floats, Floats]:
-        """Return where stamps (K,), s, are among the steps, and the variance (K, 6) of the step of each.
+        """Return the places of stamps (K,), s, among the steps, and the variance (K, 6) of the step at each place.
 
-        A place is the number of the steps before, plus the share of the own step. A stamp beyond an end is at that end.
+        A place is the number of whole steps before the stamp, plus the share of the step in which the stamp lies. A stamp
+        beyond an end is at that end.
         """
         last = len(self.stamps) - 1
         step = np.interp(stamps, self.stamps, np.arange(last + 1.0))

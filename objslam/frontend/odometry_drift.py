@@ -109,7 +109,7 @@ def step_drift(
 
     The covariance is in the frame `start`. The noise of a step grows with its length and with its angle. If `planar`, it
     affects x, y and yaw of the base. If not, it affects all six directions. lengths: (N-1,) rad and (N-1,) m, of each step.
-    Without them, they are those of the poses.
+    By default, they are computed from the poses.
     """
     turn, way = lengths or twist_lengths(inverse(start_T_base[:-1]) @ start_T_base[1:])
     angle, x, y = _step_variances(turn, way, settings)

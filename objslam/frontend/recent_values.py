@@ -15,8 +15,7 @@ class RecentValues(Generic[Value]):
         self._values: dict[tuple[float, ...], Value] = {}
 
     def get(self, key: tuple[float, ...], compute: Callable[[], Value]) -> Value:
-        """Return the value of a key, computed if it is not kept. The value that was not used for longest is dropped
-        first."""
+        """Return the value of a key, computed if it is not kept. The least recently used value is dropped first."""
         found = self._values.pop(key) if key in self._values else compute()
         self._values[key] = found
         if len(self._values) > self._most:

@@ -144,10 +144,10 @@ class SharedErrors:
         """Return keyframes, rays and settings corrected by the errors (P,).
 
         The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. The noise of
-        directions follows the focal length for the same reason: with a longer one, all angles are smaller. Keyframes stay
-        on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
-        pose. drift: whether the drift is computed for the corrected odometry. If not, the drift and the variance of the
-        interpolated path stay as measured.
+        directions follows the focal length for the same reason: with a longer focal length, all angles are smaller.
+        Keyframes stay on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap
+        takes the nearest pose. drift: whether the drift is computed for the corrected odometry. If not, the drift and the
+        variance of the interpolated path stay as measured.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
@@ -278,7 +278,7 @@ class SharedErrors:
         return poses_near(path, stamps, self.settings.poses.max_gap)
 
     def _of_odometry(self, error: Mapping[str, float]) -> dict[str, float]:
-        """The errors of the odometry. Its distances compensate the shrinkage of the map, as the ranges do."""
+        """The errors of the odometry, which also correct its distances for the shrinkage of the map."""
         return dict(zip(ODOMETRY, self._odometry_key(error), strict=True))
 
     def _correctable(self) -> CorrectablePath:

@@ -15,8 +15,8 @@ bearing changes without a turn."""
 _MOST = 3000
 """The most pairs of bearings of a camera that are compared, spread over the log. A larger number is slower."""
 _SURE = 5.0
-"""The least log odds of a found offset against the expected one. With a smaller value, robots that hardly turn begin at an
-offset that fits by chance. With a larger value, short drives begin at a wrong clock."""
+"""The least log odds of a found offset against the expected offset. With a smaller value, robots that hardly turn begin at
+an offset that fits by chance. With a larger value, short drives begin at a wrong clock."""
 
 
 def clocks_of_turns(errors: SharedErrors) -> Floats:
@@ -51,8 +51,8 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
 def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
     """Return the stamps (n, 2), s, of pairs of bearings of one label, and the bearings (n, 2, 3), unit, in base.
 
-    The last value is the number of independent pairs. It is smaller, because pairs of the same images share the turn, and
-    each image is compared with two others. Labels with several boxes in an image have no pairs there.
+    The last value is the number of independent pairs. It is smaller than n, because pairs of the same images share the turn,
+    and each image is compared with two others. Labels with several boxes in an image have no pairs there.
     """
     keyframes, rays = errors.keyframes, errors.rays
     mine = np.flatnonzero(keyframes.camera[rays.keyframe] == camera)
@@ -72,7 +72,8 @@ def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:
 
 
 def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Floats) -> Floats:
-    """Return the mean angle (m,), rad, between second bearings and first ones that are turned opposite to the odometry.
+    """Return the mean angle (m,), rad, between the second bearing of each pair and the first bearing turned opposite to the
+    odometry.
 
     stamps: (n, 2) s and bearings: (n, 2, 3), of `_pairs`. offsets: (m,) s, of the clock.
     """
@@ -89,7 +90,7 @@ def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Flo
 def _turned(odometry: Trajectory, stamps: Floats) -> Floats:
     """Return the rotations (n, 3, 3) of the odometry at stamps (n,), s, interpolated linearly between its poses.
 
-    The result is a little shorter than a rotation, which an angle does not show. It takes a tenth of the time.
+    The result shortens vectors a little, which does not change their angles. This takes a tenth of the time of a rotation.
     """
     after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, len(odometry) - 1)
     begin, end = odometry.stamps[after - 1], odometry.stamps[after]

@@ -12,7 +12,7 @@ _LONGEST = 1.0
 """The longest time (s) between two boxes of a track that follow each other. Over a longer time, the robot drives past the
 thing, and the next box is not where the odometry expects it."""
 _NEAR = np.radians(6.0)
-"""The largest angle (rad) between a ray and the one before it in its track, turned by the odometry. A thing beside the robot
+"""The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
 moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
 _TURN, _TIME = 0.6, 4.0
 """A window ends after this turn (rad), or after this time (s). In a larger window, a track spans more of the turn, but the
@@ -20,14 +20,14 @@ odometry errs by more than one factor."""
 _LEAST_TURN = 0.15
 """The least turn (rad) of a window. With less, parallax and noise of the rays hide the error of the turn."""
 _MOST, _STEP = 0.3, 0.02
-"""The largest error that is tried, as a share of the turns, and the step between errors. The rays of a window fit a parabola
-around the best of them, so a smaller step is only slower."""
+"""The largest error that is tried, as a share of the turns, and the step between errors. The cost of a window is a parabola
+around the best error, so a smaller step is only slower."""
 _CLIP = 9.0
-"""The largest squared deviation of a ray that counts. A larger one gives a false link of a track more influence."""
+"""A larger squared deviation of a ray counts as this. With a larger value, a false link of a track has more influence."""
 _FEWEST = 3
 """The fewest rays of a track in a window. Two rays nearly always meet."""
 _WINDOWS = 5
-"""The fewest windows that tell an error. Fewer do not show how far they disagree."""
+"""The fewest windows for an estimate of the error. Fewer windows do not show how far they disagree."""
 _FLAT = 1e-4
 """The weight of a point 5 m ahead, in rays. It only makes the point of parallel rays finite."""
 
@@ -35,13 +35,13 @@ _FLAT = 1e-4
 def with_turns_of_tracks(errors: SharedErrors, theta: Floats) -> Floats:
     """Return shared errors (P,), but with the error of the odometry's turns that the tracks of boxes show.
 
-    A track is a chain of boxes of one label, each where the odometry expects the one before. While the robot turns, its
-    rays meet in one point only at poses that turn by the right angles. Each window of the drive tells the factor on its
-    turns. The middle of all windows is joined with the prior by their weights. It has the noise that the settings expect of
-    turns, or more if the windows disagree by more.
+    A track is a chain of boxes of one label. Each box is near the place where the odometry expects the box before it. While
+    the robot turns, the rays of a track meet in one point only at poses that turn by the right angles. Each window of the
+    drive gives an estimate of the error. The weighted median of these estimates is combined with the prior, weighted by
+    their variances. The noise of the median is the noise of turns in the settings, or more if the windows disagree by more.
 
-    An exploration has the turns fixed. With turns that err by 8 %, a half turn at the end of an aisle errs by 14 degrees.
-    Things that are seen again from the next aisle are then taken for their neighbours.
+    The first association of a drive takes this error as given. With turns that err by 8 %, a half turn at the end of an
+    aisle errs by 14 degrees. Things that are seen again from the next aisle are then taken for their neighbours.
 
     Args:
         errors: of the measured keyframes and rays.
@@ -65,7 +65,7 @@ def with_turns_of_tracks(errors: SharedErrors, theta: Floats) -> Floats:
 
 
 def _of_windows(errors: SharedErrors, theta: Floats, number: int) -> tuple[Floats, Floats]:
-    """Return the errors (W,) of the turns of each window that tells one, and their variances (W,)."""
+    """Return the error (W,) of the turns in each window that determines it, and its variance (W,)."""
     keyframes, rays, settings = errors.at(theta, drift=False)
     window, turn = _windows(keyframes)
     _, track, length = np.unique(

@@ -91,7 +91,7 @@ def write_lines(file: Path, lines: Iterable[str]) -> None:
 def copy_files(files: Iterable[Path], folder: Path) -> None:
     """Copy files into a folder, which exists. Each appears whole, and at the end all of them are on the disk.
 
-    So a file that is written later never survives a power cut without them. Raises OutputError for a disk error.
+    So if a file that is written later survives a power cut, they survive too. Raises OutputError for a disk error.
     """
     with disk_errors(folder):
         for file in files:

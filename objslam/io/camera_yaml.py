@@ -53,8 +53,8 @@ def read_camera(
     """Read a camera file. Raises LogError with the line of an invalid value.
 
     name: the camera name. None takes camera_name from the file, or "camera" if the file has no name.
-    place_needed: whether base_T_camera must be in the file. If it need not, a missing base_T_camera is the identity.
-    depth_scale: the units per metre of depth images, used if the file has no depth_scale.
+    place_needed: whether base_T_camera must be in the file. If False, a missing base_T_camera is the identity. depth_scale:
+    the units per metre of depth images, used if the file has no depth_scale.
     """
     return _read(path, _load(path, read_bytes(path), "the file"), ledger, name, place_needed, depth_scale).camera
 

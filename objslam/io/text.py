@@ -18,8 +18,9 @@ from objslam.errors import LogError
 
 _IN_ORDER = 0.5
 """The least share of the rows of a file that are in the order of time. A larger share also rejects files of a robot whose
-clock was set back. A file in another order has far fewer."""
-_PLACES = 3  # The most places (file:line) of dropped rows that the ledger gets for a reason.
+clock was set back. In a file in another order, the share is far smaller."""
+_PLACES = 3
+"""The most places (file:line) of dropped rows that the ledger gets for a reason. A larger number gives more examples."""
 _SHOWN = 80  # The most characters of a line that a message shows. A larger number makes the message longer.
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
@@ -121,7 +122,8 @@ def to_table(
 
 
 def _clean_table(numbered: Sequence[tuple[int, str]], columns: int) -> Table | None:
-    """Return the table if all lines have `columns` numbers, else None. It is three times as fast as line by line."""
+    """Return the table if all lines have `columns` numbers, else None. This is three times as fast as reading line by
+    line."""
     lines = [text for _, text in numbered]
     whole = "".join(lines)
     if not lines or "_" in whole or not whole.isascii():

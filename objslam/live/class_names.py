@@ -14,7 +14,7 @@ UNNAMED = "boxes with a class number that has no name"
 
 
 class NamedSink:
-    """A `Sink` that hands all messages to another one, with names in place of labels that are numbers.
+    """A `Sink` that hands all messages to another sink, with names in place of labels that are numbers.
 
     given: the names, as `load_names` takes them. counters: count boxes whose number has no name, and warn of the first one.
     ConfigError as in `load_names`.

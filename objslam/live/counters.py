@@ -66,7 +66,7 @@ class Counters:
             return dict(self.ledger.dropped)
 
     def update(self) -> tuple[float, float]:
-        """Return the median and the 99th percentile of the newest update times, s. Both are 0 before the first."""
+        """Return the median and the 99th percentile of the newest update times, s. Both are 0 before the first update."""
         with self._lock:
             seconds = np.array(self._seconds)
         return (float(np.median(seconds)), float(np.quantile(seconds, 0.99))) if len(seconds) else (0.0, 0.0)

@@ -10,7 +10,7 @@ from objslam.core.camera import Camera
 class Sink(Protocol):
     """Receives messages from any thread. A push returns at once, with False if the message is dropped and counted.
 
-    A message whose stamp leaps ahead may be dropped and counted later, when the next ones refute its stamp.
+    A message whose stamp leaps ahead may be dropped and counted later, when the next messages refute its stamp.
 
     No message raises an error, even if it is not finite, goes back in time or names an unknown camera.
     The coordinate frames are `map`, `odom`, `base`, and the optical frame of each camera, which has the camera's name.
@@ -42,5 +42,5 @@ class Sink(Protocol):
         """Push all boxes of one image. Push images without boxes too, because they show that an expected object is absent.
 
         stamp: s. boxes: (B, 4) x1, y1, x2, y2, raw px. labels: B names. scores: (B,). depths: (B,) z in m, NaN where
-        unknown. track_ids: B ids, -1 where unknown. whole: True if no box is cut off at the image's edge, as of fiducials.
+        unknown. track_ids: B ids, -1 where unknown. whole: True if no box is cut off at the image's edge, as with fiducials.
         """

@@ -32,7 +32,8 @@ class Request(Protocol[Answer_co]):
 
 
 class Worker(Generic[Answer]):
-    """A process that solves one request after another. It starts with the first one, and once more after a failure."""
+    """A process that solves one request after another. It starts with the first request, and starts again after a
+    failure."""
 
     def __init__(self) -> None:
         self._answer: Answer | None = None
@@ -41,7 +42,7 @@ class Worker(Generic[Answer]):
         self._waiting: list[bytes] = []  # The request until it is sent, because it may be large.
 
     def ask(self, request: Request[Answer]) -> None:
-        """Send a request. The process must not have an earlier one whose `result` was not taken."""
+        """Send a request. The process must not have an earlier request whose `result` was not taken."""
         self._answer = None
         if self._process is None or self._process.poll() is not None:
             self._process = _start()
@@ -56,7 +57,7 @@ class Worker(Generic[Answer]):
 
     @property
     def done(self) -> bool:
-        """Whether there is a request, and `result` returns at once."""
+        """Whether a request has ended, so that `result` returns at once."""
         return self._thread is not None and not self._thread.is_alive()
 
     def result(self) -> Answer | None:

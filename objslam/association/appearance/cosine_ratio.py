@@ -17,11 +17,12 @@ _PRIOR = 20.0
 """The weight of the prior, as a number of pairs. In the prior, boxes of one object are as alike as boxes of two objects, and
 all labels are equal. A larger number needs a longer log to learn from."""
 _LEAST_APART = 0.3
-"""Appearance vectors are used if the two mean cosines are at least this far apart. The unit is the standard deviation of the
-cosine between a box and an object with many boxes. A larger distance leaves more weak vectors unused. Random vectors are 0.1
-apart in a log of a few hundred boxes."""
+"""Appearance vectors are used if the mean cosine within objects is larger than the mean cosine between objects by this. The
+unit is the standard deviation of the cosine between a box and an object with many boxes. A larger value leaves more weak
+vectors unused. With random vectors, the difference is 0.1 in a log of a few hundred boxes."""
 _LEAST_SHARE = 1e-3
-"""The least share of `between` in the variance, and the least variance. It only keeps the ratio finite."""
+"""The least share of `between` in the variance, and the least standard deviation of the cosines. It only keeps the ratio
+finite."""
 MOST_RATIO = 3.0
 """The largest absolute log ratio of a ray and a landmark. A larger value trusts vectors more. An object can look different
 from behind, and some boxes show two objects."""
@@ -85,7 +86,7 @@ class CosineRatio:
         b = d.mean[label]
         a = np.maximum(s.mean[label], b)
         own, their = s.spread(label, one, other), d.spread(label, one, other)
-        # Of two Gaussians, the narrower one ends sooner on both sides. Beyond this turning point the ratio stays constant.
+        # The ratio of two Gaussians has a turning point. Beyond it, the ratio would turn back, so it is held constant.
         apart = np.where(own == their, 1.0, own - their)
         turn = (b * own - a * their) / apart
         x = np.where(own < their, np.minimum(cosine, turn), np.where(own > their, np.maximum(cosine, turn), cosine))
@@ -109,8 +110,10 @@ def _density(pairs: Pairs, prior: tuple[float, float], labels: int) -> Density:
 
 
 def _intraclass_correlation(off: Floats, group: Ints) -> float:
-    """Return the correlation of two deviations (P,) of one group. With few pairs it is near 1. Then many boxes count no more
-    than one."""
+    """Return the correlation between deviations of one group. off, group: (P,) the deviations and their groups.
+
+    With few pairs it is near 1. Then many boxes of an object count as much as one box.
+    """
     _, number = np.unique(group, return_inverse=True)
     size, total, squares = (np.bincount(number, weights) for weights in (None, off, off**2))
     several = size > 1

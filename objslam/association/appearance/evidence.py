@@ -18,8 +18,9 @@ _BESIDE = 8
 """Each box is compared with this number of boxes of its label that follow it in its frame. A larger number gives more pairs
 of different objects where a frame has many boxes, and takes longer."""
 _DUPLICATE = 0.5
-"""The intersection over union above which two boxes of one frame may show one object. A larger value learns from more."""
-_AT_ONCE = 1 << 24  # The most numbers of vectors that are multiplied at once. A larger value needs more memory.
+"""The intersection over union above which two boxes of one frame may show one object. A larger value learns from more
+pairs."""
+_AT_ONCE = 1 << 24  # The most elements of vectors that are multiplied at once. A larger value needs more memory.
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Looks:
         return cls(ratio, np.asarray(which @ vectors), np.bincount(owner[some], minlength=count))
 
     def ray_odds(self, boxes: Boxes, ray: Ints, landmark: Ints, own: Bools) -> Floats:
-        """Return the log odds (E,) that boxes show landmarks, and no other objects of their labels.
+        """Return the log odds (E,) that boxes show landmarks, and not other objects of their labels.
 
         ray: (E,) the index of each box. own: (E,) whether the box belongs to the landmark. Such a box is not compared with
         itself. The odds are 0 if the box, or all other boxes of the landmark, have no vector.
@@ -69,8 +70,8 @@ def learn_ratio(boxes: Boxes, frame: Ints, track: Ints, owner: Ints, labels: int
     """Learn the ratio from boxes and their landmarks (R,), -1 for none. None if the boxes have no vectors that tell objects
     apart.
 
-    One object: boxes of one landmark, or of one track, that follow each other. Two objects: boxes of one label in one frame
-    that hardly overlap. frame, track: (R,) of the boxes, -1 without a track. labels: the number of all labels.
+    Consecutive boxes of one landmark, or of one track, show one object. Boxes of one label in one frame that hardly overlap
+    show two objects. frame, track: (R,) of the boxes, -1 without a track. labels: the number of all labels.
     """
     if boxes.feature is None:
         return None
@@ -100,7 +101,7 @@ def _followers(boxes: Boxes, frame: Ints, group: Ints) -> tuple[Ints, Ints]:
 
 
 def _beside(boxes: Boxes, frame: Ints) -> tuple[Ints, Ints]:
-    """Return the pairs (P,) of boxes with vectors of one label in one frame that hardly overlap."""
+    """Return the pairs (P,) of boxes of one label in one frame that hardly overlap. Only boxes with a vector count."""
     feature, _ = _vectors(boxes)
     some = np.flatnonzero(feature >= 0)
     some = some[np.lexsort((boxes.label[some], frame[some]))]

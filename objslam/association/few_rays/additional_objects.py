@@ -1,6 +1,6 @@
 """Find objects from few rays, among the rays to which the global association gave no object.
 
-The objects of the global association stay as they are. A new object needs no least number of rays: it has to be likelier
+The objects of the global association stay as they are. A new object may have any number of rays, but it has to be likelier
 than stray boxes that meet by chance.
 """
 
@@ -26,12 +26,13 @@ from objslam.core.types import Association, Keyframes, Rays
 _MOVING = 6
 """The number of coordinates of a moving point: those of its position and of its velocity. So it explains any three rays."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
-_TURNS = 8  # The most searches among the unassigned rays. They end once a search finds nothing.
+_TURNS = 8
+"""The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
 _POWER = 0.4
-"""The log odds against strays are multiplied by this factor, and then become a probability. It is below 1, because boxes of
-near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes the
-probabilities about 0.1 too large. A larger factor makes them larger."""
-_SAMPLE = 512  # The most rays of one label in a search, in whole frames. A larger number costs time squared.
+"""The log odds against strays are multiplied by this factor, and then become a probability. The factor is below 1, because
+boxes of near objects mix, so strays are not independent. On 10 simulated streets (`tools/bench_association.py`), 0.4 makes
+the probabilities about 0.1 too large. A larger factor makes the probabilities larger."""
+_SAMPLE = 512  # The most rays of one label in a search. The time grows with the square of this number.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
 
@@ -84,8 +85,8 @@ def add_few_ray_objects(
 
 @dataclass(frozen=True)
 class _Few:
-    """A search for more landmarks beside known ones. free: (F,) the rays that may show others. strays: what is known of
-    stray rays. gate: the largest squared deviation of a match."""
+    """A search for more landmarks beside known ones. free: (F,) the rays that may show such landmarks. strays: the density
+    of stray rays. gate: the largest squared deviation of a match."""
 
     known: State
     free: Ints
@@ -132,7 +133,7 @@ class _Few:
         )
 
     def merged(self, found: State) -> State:
-        """Merge new landmarks that are one object. Drop those that are one object with a known landmark."""
+        """Merge new landmarks that are one object. Drop those whose object has a known landmark."""
         every, known = self.joined(found), self.known.count
         if every.count < 2:
             return found
@@ -146,7 +147,8 @@ class _Few:
     def dropped(self, found: State, least: float) -> State:
         """Drop landmarks until all that are left are likely enough to exist.
 
-        If two neighbours both fail, the one with more rays stays for one more turn. It may get rays of the other one.
+        If two neighbours both fail, the neighbour with more rays stays for one more turn. It may get rays of the other
+        neighbour.
         """
         while (failing := self.existence(found) < least).any():
             number, label = found.ray_count, found.label

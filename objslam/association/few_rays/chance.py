@@ -1,8 +1,9 @@
 """Estimate how unlikely it is that the rays of a landmark meet by chance.
 
-Two explanations of the rays are compared: one object, or as many stray boxes. The strays are as frequent, and lie in the
-images and in range, as the boxes of the label in this log. The odds need no least number of rays. They are the score of a
-track in multiple hypothesis tracking (Blackman, IEEE AES Magazine 19, 2004), with the unknown position integrated out.
+Two explanations of the rays are compared: all rays show one object, or each ray is from a stray box. Stray boxes are assumed
+to be distributed, over the images and over the ranges, like the boxes of their label in this log. The odds have a meaning
+for any number of rays. They are the score of a track in multiple hypothesis tracking (Blackman, IEEE AES Magazine 19, 2004),
+with the unknown position integrated out.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +24,8 @@ MOST_ODDS = 20.0
 _BINS = 256
 """The number of bins of a density along one coordinate. A larger number resolves narrower densities, and is slower."""
 _OUTSIDE = 1e-6
-"""The density of boxes where no box of the log is near. It only keeps logarithms finite."""
+"""The density of boxes, in the units of `_Density`, at places far from all boxes of the log. It only keeps logarithms
+finite."""
 _LOG_RANGE = 4.6
 """The width of the uniform density of ln range if no range is known. It is a factor of 100 in range."""
 _WRONG_RANGE = 0.1
@@ -31,10 +33,12 @@ _WRONG_RANGE = 0.1
 _TRIED = 25
 """The number of tried values, for the share of strays and for the density of objects. A larger number is more exact."""
 _DENSITIES = (1e-4, 10.0)
-"""The limits of the factor on the density of objects that follows from the density of boxes. Objects do not lie everywhere
-where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
+"""The density of objects is first computed from the density of boxes, and then multiplied by a factor between these limits.
+The factor is needed because objects do not lie everywhere where boxes could show them. A larger upper limit keeps more
+landmarks with few rays."""
 _PRIOR_STRAYS = 1.0
-"""The number of strays of each label that are assumed beside those of the log. A larger number keeps fewer landmarks."""
+"""The number of strays of each label that are assumed in addition to those of the log. A larger number keeps fewer
+landmarks."""
 _LOOK = np.radians(2.0)
 """Two rays of a landmark count as independent if the angle (rad) between them is at least this. It is the least parallax of
 a position. A larger angle drops more moving objects, and more objects that were seen from nearly one place."""
@@ -155,8 +159,9 @@ def ray_odds(
 ) -> tuple[Floats, Floats]:
     """Return the log odds (..., R) that each ray shows its point and is no stray, and the density of strays, m^-2.
 
-    number: (..., R) strays of the label in the log. off2, distance: (..., R) m^2, m, of the point from the ray and from the
-    camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs no more.
+    number: (..., R) strays of the label in the log. off2: (..., R) m^2, the squared distance of the point from the ray.
+    distance: (..., R) m, from the camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs as much as
+    one at the gate.
     """
     spread = noise**2 * ((obs.sigma * distance) ** 2 + obs.position_sigma**2)
     density = strays.per_frame(number) * strays.image / distance**2
@@ -173,7 +178,7 @@ def ray_odds(
 
 
 def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> Floats:
-    """Return for each match the cost (E,) of its ray if it had no landmark.
+    """Return for each match the cost (E,) of its ray if the ray had no landmark.
 
     It is -2 ln of the density of strays, relative to the density of the landmark's rays at their peak, and at most `gate`.
     So it matters only where strays are dense compared with the noise of the rays. Boxes within the gate of the landmark do
@@ -190,8 +195,8 @@ def unmatched_costs(state: State, edges: Edges, strays: Strays, gate: float) -> 
 def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
     """Return the log odds (N,) of one object over stray boxes, from the rays of each landmark. Misses do not count.
 
-    One object: its position x is anywhere where boxes of its label are, and p(rays) = int p(x) prod p(ray | x) dx by
-    Laplace's method. Strays: each box has the density of the label's strays.
+    If the rays show one object, its position x is anywhere where boxes of its label are, and p(rays) = int p(x) prod p(ray |
+    x) dx by Laplace's method. If they are strays, each box has the density of the label's strays.
     """
     total, label = _evidence(state, gate, strays, rates), state.label
     share, density = _likeliest(total, _looks(state), label, *_expected(state, rates))
@@ -213,7 +218,8 @@ def _looks(state: State) -> Floats:
     """Return the number (N,) of independent looks at each landmark.
 
     Strays from nearly one place are often one thing: an error that the detector repeats in the next image, or an object
-    that moves slowly. So a ray counts by the angle between it and the ray before it, seen from the landmark, up to 1.
+    that moves slowly. So the weight of a ray is the angle, seen from the landmark, between it and the ray before it, divided
+    by `_LOOK`. The weight is at most 1, and the first ray has the weight 1.
     """
     order = np.lexsort((state.obs.frame[state.assigned], state.owner))
     owner = state.owner[order]
@@ -255,8 +261,8 @@ def _likeliest(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: 
 def log_places(state: State, strays: Strays, rates: Rates) -> Floats:
     """Return ln of the number (N,) of places that each landmark could have been at.
 
-    It is the volume to which the rays confine the position, times the density of objects. This density follows from the
-    boxes at the rays, because each object is detected in a frame with the rate of its class.
+    The number is the volume to which the rays confine the position, times the density of objects. This density follows from
+    the boxes at the rays, because each object is detected in a frame with the rate of its class.
     """
     held, owner, label = state.assigned, state.owner, state.label
     distance = np.maximum(state.distance, 1e-3)

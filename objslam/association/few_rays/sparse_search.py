@@ -1,7 +1,7 @@
 """Search for objects with few rays: points on which free rays of one label agree more closely than by chance.
 
-The search for well seen objects counts the rays at a point. This one adds up their log odds against chance, so two rays, or
-one ray with a range, can be enough where strays are rare.
+The search for well seen objects counts the rays at a point. This search adds up their log odds against chance, so two rays,
+or one ray with a range, can be enough where strays are rare.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,13 @@ _MORE_RAYS = 3.0
 _REFINEMENTS = 2
 """How often each point moves to the best fit of its rays. A larger number costs time."""
 _DAMPING = 1e-6
-"""The share of the information added in all directions. Unobserved directions then stay unchanged."""
+"""The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
+refinement down."""
 
 
 @dataclass(frozen=True)
 class SparseSearch:
-    """The settings of a search. strays: what is known of stray rays. number: how many stray boxes the label has in the log.
+    """The settings of a search. strays: the density of stray rays. number: how many stray boxes the label has in the log.
     gate: largest squared deviation of a pair. parallax: least angle (rad) of a pair. least: the least log odds of a
     point."""
 
@@ -68,7 +69,7 @@ def _propose(obs: Observations, search: SparseSearch) -> Floats:
 
 
 def _meetings(obs: Observations, search: SparseSearch) -> tuple[Ints, Ints, Floats]:
-    """Return the two rays of each pair that meets, and the points (P, 3) m where they do."""
+    """Return the two rays of each pair that meets, and the points (P, 3) m where they meet."""
     first, second = np.triu_indices(len(obs), 1)
     depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
     spread = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2
@@ -83,7 +84,7 @@ def _meetings(obs: Observations, search: SparseSearch) -> tuple[Ints, Ints, Floa
 
 
 def _odds(obs: Observations, search: SparseSearch, points: Floats, rays: Ints) -> Floats:
-    """Return the log odds (H,) of points (H, 3) m from a few rays (S, H) each."""
+    """Return the log odds (H,) of points (H, 3) m. rays: (S, H) the S rays from which each point was made."""
     total, objects, away = np.zeros((3, len(points)))
     information = np.zeros((len(points), 3, 3))
     for ray in rays:

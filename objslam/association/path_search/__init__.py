@@ -1,2 +1,2 @@
-"""Find the most likely path of a robot through a map of landmarks, when each ray may belong to any landmark. The search can
-move a whole visit of the robot from landmarks to their neighbours. Small changes cannot."""
+"""Find the most likely path of a robot through a map of landmarks, when each ray may belong to any landmark. If the path of
+a whole visit lies at wrong landmarks, the search can move it to the landmarks beside them. Small changes cannot."""

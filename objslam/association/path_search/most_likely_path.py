@@ -1,10 +1,10 @@
 """Find the most likely path of a robot through a map of landmarks, when each ray may belong to any landmark.
 
-A path that is bent onto wrong landmarks fits them well, so no small change improves it. This search is global: it moves
-whole visits from landmarks to their neighbours. It is Markov localisation on a grid (Fox, Burgard and Thrun 1999). The
-states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays tell how well a state fits
-the map, and the odometry tells how well the states of two stretches fit together. Dynamic programming finds the most likely
-states of all stretches (Viterbi 1967).
+A path that is bent onto wrong landmarks fits them well, so no small change improves it. This search is global: it tries to
+move each stretch of the path from wrong landmarks to landmarks beside them. It is Markov localisation on a grid (Fox,
+Burgard and Thrun 1999). The states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays
+tell how well a state fits the map, and the odometry tells how well the states of two stretches fit together. Dynamic
+programming finds the most likely states of all stretches (Viterbi 1967).
 """
 
 from dataclasses import dataclass
@@ -29,8 +29,8 @@ reaches farther: the heading of a solved path errs by 14 degrees at most."""
 
 @dataclass(frozen=True)
 class LikelyPath:
-    """The most likely path. map_T_base: (K, 4, 4). turn, shift: rad and m, roughly the standard deviations of its poses that
-    come from the steps of the grid."""
+    """The most likely path. map_T_base: (K, 4, 4). turn, shift: rad and m, rough standard deviations of the errors that the
+    steps of the grid cause in its poses."""
 
     map_T_base: Floats
     turn: float
@@ -47,8 +47,9 @@ def most_likely_path(
 ) -> LikelyPath | None:
     """Return the most likely path through a map, None if no label has two landmarks to confuse.
 
-    Corrections are planar like the drift of wheels. They reach as far as a few neighbouring landmarks. A landmark that is
-    rarely detected costs more, so a second copy of a landmark loses its rays. Frames may give two rays to one landmark.
+    Corrections are planar like the drift of wheels. They reach as far as a few neighbouring landmarks. A match with a
+    landmark that is rarely detected costs more, so a second copy of a landmark loses its rays. A frame may give two rays to
+    one landmark.
 
     keyframes: with odometry. map_T_base: (K, 4, 4) the present path. positions, label: (N, 3) m and (N,) of the landmarks,
     NaN without a position. rate: (N,) the share of the frames in view of each landmark that detect it.
@@ -79,7 +80,7 @@ def most_likely_path(
 
 
 def _spacing(positions: Floats, label: Ints) -> float:
-    """Return the median distance (m) from a landmark to the nearest other one of its label, inf if no label has two
+    """Return the median distance (m) from a landmark to the nearest other landmark of its label, inf if no label has two
     landmarks."""
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,4 @@
-"""The cost of the rays of each stretch of a path in each of its states."""
+"""For each stretch of a path, the cost of its rays in each state."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

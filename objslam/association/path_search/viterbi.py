@@ -54,8 +54,8 @@ class Motions:
 
     def costs(self, k: int, grid: Grid) -> tuple[Cells, Cells, Cells]:
         """Return the costs of motion `k` by x (2 X - 1, Y), by y (2 X - 1, Y) and by yaw (2 Y - 1,). The first axis is the
-        step from the state before to the one after, from the least to the largest. Y is the turn, which is the same before
-        and after the steps in x and y. The drift in x, y and yaw counts as independent."""
+        step from the state before to the state after, in increasing order. Y is the turn, which is the same before and after
+        the steps in x and y. The drift in x, y and yaw counts as independent."""
         shifts, turns = (np.arange(1 - len(axis), len(axis)) for axis in (grid.shifts, grid.turns))
         cos, sin, way = np.cos(grid.turns) - 1, np.sin(grid.turns), self.way[k]
         carried = cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]  # A turn about one pivot shifts the next one.
@@ -100,15 +100,16 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
 
 
 def _steps_to(state: int, count: int) -> slice:
-    """Return where `Motions.costs` has the steps from each of `count` states, in order, to a state."""
+    """Return the indices in `Motions.costs` of the steps from each of `count` states, in order, to one state."""
     return slice(state + count - 1, state - 1 if state else None, -1)
 
 
 def _least(total: Cells, cost: Cells) -> Cells:
-    """Return the least sum (Y, X, n) of a state before and a step along the second axis, to each state.
+    """Return for each state the least sum (Y, X, n) of the costs of a state before and of the step from it along the second
+    axis.
 
-    The sum counts as at most `_SLIP`, so only the steps that cost less are tried. The odometry drifts by few grid steps
-    between two stretches, so they are few. All sums at once take three times as long.
+    The sum counts as at most `_SLIP`, so only the steps that cost less are tried. These are few steps, because the odometry
+    drifts little between two stretches. All sums at once take three times as long.
 
     Args:
         total: (Y, X, n) of the states before.
@@ -123,7 +124,8 @@ def _least(total: Cells, cost: Cells) -> Cells:
 
 
 def _least_turn(total: Cells, cost: Cells) -> Cells:
-    """Return the least sum (Y, X, X) of a state before and a turn, as `_least` does. cost: (2 Y - 1,)."""
+    """Return for each state the least sum (Y, X, X) of the costs of a state before and of the turn from it. cost: (2 Y -
+    1,)."""
     total = np.ascontiguousarray(total)
     least, count = np.full_like(total, _SLIP), len(total)
     for i in np.flatnonzero(cost < _SLIP).tolist():

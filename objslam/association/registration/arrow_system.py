@@ -18,7 +18,8 @@ _RIDGE = 1e-12
 """The share of the trace of the linear system that is added to its diagonal. Unknowns that no measurement determines then
 stay where they are. A larger share slows the solve down."""
 _DETERMINED = 1e14
-"""The largest condition number of a system whose inverse is a covariance. A larger number accepts worse systems."""
+"""The largest condition number of a system whose inverse is a covariance. A larger number accepts systems that are nearer to
+singular."""
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,14 @@ from objslam.core.maps.shared_covariance import jacobian as shared_jacobian
 from objslam.core.statistics import HUBER_K, SAME_POINT
 
 _DETERMINED = 1e12
-"""The largest condition number of the information of a transform that its matches determine. A larger number accepts worse
-ones."""
+"""The largest condition number of the information of a transform that its matches determine. A larger number accepts less
+certain transforms."""
 _DENSITY_NEIGHBOURS = 8
 """The number of nearest objects from which the local density of objects is computed. A larger number smooths it more."""
 _ALIKE_NEIGHBOURS = 4
-"""The same for objects of one label, all of which count. It follows groups of equal objects. A smaller number gives these
-less evidence. With 4, false alarms in simulated places of groups of two, three and five are as rare as the log odds say."""
+"""The number of nearest objects from which the local density of objects of one label is computed. A smaller number finds the
+density of smaller groups of equal objects, so matches in groups give less evidence. With 4, false alarms in simulated places
+of groups of two, three and five are as rare as the log odds say."""
 
 
 class Problem:
@@ -48,9 +49,10 @@ class Problem:
     def chance(self, moved: Floats, index: Ints, covariance: Floats, limits: tuple[float, ...]) -> Floats:
         """Return the probability (L, H, P) that an object of a, moved to (H, P, 3), has a match in b by chance.
 
-        limits: the L largest squared Mahalanobis distances of a match. The local density of objects with the label is the
+        limits: L limits of the squared Mahalanobis distance of a match. The local density of objects with the label is the
         larger one of two: the density of all objects times the share of the label, and the density of this label alone.
-        Equal objects often stand in groups, such as chairs at a table. A chance match of one of them brings others along.
+        Equal objects often stand in groups, such as chairs at a table. If one of them has a match by chance, others of its
+        group have too.
         """
         label = self.a.label[index]
         everything, alike = moved[..., :2], np.concatenate([moved[..., :2], label[..., None] * self.apart], axis=-1)
@@ -58,7 +60,7 @@ class Problem:
         height = np.clip(moved[..., 2], -self.apart, self.apart) + label * 4 * self.apart
         found = []
         nearest, nearest_alike = (min(k, len(self.b.label)) for k in (_DENSITY_NEIGHBOURS, _ALIKE_NEIGHBOURS))
-        others = max(nearest - 2, 1)  # Without the match and the farthest one, scattered objects have the right mean.
+        others = max(nearest - 2, 1)  # Without the match and the farthest object, the mean is right.
         counted = (
             (others / len(self.b.label), _farthest(self._level, everything, nearest)),
             (nearest_alike / self._count[label], _farthest(self._alike, alike, nearest_alike)),
@@ -72,7 +74,7 @@ class Problem:
 
 
 def _farthest(tree: KDTree, points: Floats, number: int) -> Floats:
-    """Return the distance (H, P) from points (H, P, d) to the last one of the `number` objects nearest to each, m."""
+    """Return the distance (H, P), m, from each point (H, P, d) to the `number`-th nearest object."""
     distance = np.asarray(tree.query(points.reshape(-1, points.shape[-1]), k=[number])[0])
     return distance.reshape(points.shape[:-1])
 
@@ -156,9 +158,9 @@ def _weights(miss: Floats, information: Array) -> Floats:
 def transform_covariance(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
     """Return the covariance (4, 4) of a transform x (4,) that was fitted to the pairs of objects a (P,) and b (P,).
 
-    The shared errors of both maps move the fit as `shapes` derives. So the covariance has their shift and yaw, undiminished
-    by the number of pairs, and what their tilt and size do to this fit. NaN if the pairs do not
-    determine the transform.
+    The shared errors of both maps move the fit as `shapes` derives. So the covariance contains the shared shift and yaw in
+    full, however many pairs there are. It also contains the effect of the shared tilt and size on this fit. NaN if the pairs
+    do not determine the transform.
     """
     moved = move(x[None], problem.a.position[a][None])
     offset = covariances(problem, x[None], a[None], b[None])[0]
@@ -180,7 +182,7 @@ def transform_covariance(problem: Problem, x: Floats, a: Ints, b: Ints) -> Float
 
 
 def one_each(partner: Ints, good: Bools) -> Bools:
-    """Return which matches (H, P) remain if an object of b may be matched only once in each row."""
+    """Return which matches (H, P) remain if each transform (row) may match an object of b only once."""
     marked = np.where(good, partner, -1 - np.arange(partner.shape[1]))
     order = np.argsort(marked, axis=1, kind="stable")
     ordered = np.take_along_axis(marked, order, axis=1)

@@ -4,8 +4,8 @@ Each map measures its objects in a frame of its own. A frame has x, y, z and yaw
 frame is the frame of the result. All objects of a map share an error: a shift, a turn and a wrong size
 (`core.maps.shared_covariance`). It is a variable too, with its covariance as the prior. So a map whose size is uncertain
 takes the size of a map whose size is known. The time of a Gauss-Newton step grows with the number of measurements, and with
-the cube of the number of objects or of maps, whichever is smaller (`ArrowSystem`). Cauchy's weights limit what moved objects
-do.
+the cube of the number of objects or of maps, whichever is smaller (`ArrowSystem`). Cauchy's weights limit the effect of
+moved objects.
 
 The errors that are not shared may be larger than the covariances say: objects are nudged, and their boxes differ from day to
 day. The residuals show this. With at least three maps, the variance of each map is estimated against all others (variance
@@ -33,8 +33,8 @@ _FEWEST_MAPS = 3
 """With at least this number of maps, each map has a noise of its own. With fewer, all have one noise, because the residuals
 of two maps do not tell which map is worse. A larger number gives more maps one noise."""
 _POOLED = 10.0
-"""A map's given covariances weigh as much as this number of residuals. A larger number trusts them more. At 10, a map of a
-few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
+"""A map's given covariances weigh as much as this number of residuals. A larger number trusts the covariances more. At 10, a
+map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
 _AGAIN = 0.01
 """The standard deviation (m) that each map adds to the errors that are not shared. A larger value trusts small distances in
 maps less. Without it, one pair of nearly exact objects would fix the shared errors."""
@@ -43,7 +43,7 @@ _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 gives the expectation of a weighted squared residual. More steps give it more exactly."""
 _STILL = 1e-6
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner. With Cauchy's weights, each step is about
-half of the one before. So at the end the positions are wrong by about this much, which is a thousandth of the errors of the
+half of the step before. So at the end the positions are wrong by about this much, which is a thousandth of the errors of the
 best maps."""
 
 
@@ -67,9 +67,9 @@ class JointFrames:
     """S frames and N objects in the frame of the first map.
 
     site_T_map: (S, 4, 4). frame_covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each, 0 for the first. positions:
-    (N, 3) m. covariance: (N, 3, 3) m^2. own: (N, 3, 3) m^2, the part of it that an object has alone. correlated: (N, 3, m)
-    m, the other part, as a factor of the joint covariance. weight: (R,) the weight of each measurement, in [0, 1]. noise:
-    (S,) the factor, at least 1, on the covariances of the errors that are not shared. 1 for one map alone.
+    (N, 3) m. covariance: (N, 3, 3) m^2. own: (N, 3, 3) m^2, the part of the covariance from errors that an object has alone.
+    correlated: (N, 3, m) m, the rest, as a factor of the joint covariance. weight: (R,) the weight of each measurement, in
+    [0, 1]. noise: (S,) the factor, at least 1, on the covariances of the errors that are not shared. 1 for one map alone.
     """
 
     site_T_map: Floats
@@ -96,8 +96,8 @@ class _State:
 
 
 def solve_frames(measured: Measured, site_T_map: Floats, count: int, *, judged: bool = True) -> JointFrames:
-    """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object has a
-    measurement.
+    """Solve S frames, from the start site_T_map (S, 4, 4), and the positions of `count` objects. Each object has at least
+    one measurement.
 
     Each frame must share at least two objects with the first, directly or through other frames. If one does not, the
     covariances of all frames after the first are NaN. judged: whether the noise of the maps is estimated.
@@ -175,15 +175,17 @@ def _solve(measured: Measured, site_T_map: Floats, count: int, noise: Floats, er
     poses[:, 2, 3] = x[:, 2]
     covariance = own + correlated @ np.swapaxes(correlated, 1, 2)
     known = 4 + errors.shape[1] - np.diagonal(spread, axis1=1, axis2=2)[:, 4:].sum(axis=1)
-    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 / len(x)  # One frame is free to choose. No map is special in that.
+    # The frame of the result is a free choice, so its 4 coordinates are not taken from the residuals of any one map.
+    taken = np.maximum(np.nan_to_num(known), 4.0) - 4.0 / len(x)
     found = JointFrames(poses, spread[:, :4, :4], positions, covariance, own, correlated, weight, noise)
     return _State(found, errors, taken)
 
 
 def _mean_weight(information: Floats, total: Floats, object_: Ints) -> Floats:
-    """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3). total: (N, 3, 3), its sums."""
+    """Return the mean weight (R,) that normal residuals would have. information: (R, 3, 3) of the measurements. total:
+    (N, 3, 3), its sum for each object."""
     share = np.trace(information @ np.linalg.inv(total)[object_], axis1=1, axis2=2)
-    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The fit of an object's position takes its share.
+    left = np.clip(1 - share / 3, 0.0, 1.0)[:, None] * _SQUARES  # The fit of the position makes residuals smaller.
     return np.asarray((1 / (1 + left / HALF_RAY)).mean(axis=1))
 
 
@@ -198,7 +200,7 @@ def _moved(measured: Measured, x: Floats, errors: Floats, positions: Floats | No
     rotation = poses[:, :3, :3]
     at = measured.position
     if positions is not None:
-        # At the measured positions, a smaller world would have smaller residuals, and all maps would shrink.
+        # Derivatives at the measured positions would make all maps shrink, because a smaller world has smaller residuals.
         at = (np.swapaxes(rotation, 1, 2) @ (positions[measured.object] - x[measured.map, :3])[..., None])[..., 0]
     shared = jacobian(at) @ measured.roots[measured.map]
     local = measured.position - (shared @ errors[measured.map][..., None])[..., 0]

@@ -36,16 +36,17 @@ MIN_LOG_ODDS = 9.2
 """The least log odds against chance of an accepted registration, and the least lead over another place. A larger value
 refuses more registrations. 9.2 allows one false alarm in 10,000 pairs of maps."""
 _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
-"""The stages of the fit: (number of objects around its pair to which a proposal is fitted, number of best proposals that are
-fitted). Larger numbers find smaller overlaps and take longer."""
+"""The stages of the fit, two numbers each. A proposal is fitted to the first number of objects, those nearest to its pair.
+The second number is how many of the best proposals are fitted. Larger numbers find smaller overlaps and take longer."""
 _LIMITS = (SAME_POINT, SAME_POINT / 2)
 """The largest squared Mahalanobis distances of a match, one for each count of matches. The best count is the evidence. The
-first holds 99 % of true matches, the second 87 %. With tighter ones, simulated groups of three equal objects gave false
+first holds 99 % of true matches, the second 87 %. With tighter limits, simulated groups of three equal objects gave false
 alarms more often than the log odds say."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
-"""Two transforms that differ by less (m at the centre of the map, rad) are one place. Larger values hide repetitions."""
+"""Two transforms are one place if they differ by less than this shift (m, at the centre of the map) and this turn (rad).
+Larger values hide repetitions."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Registration:
 
     @property
     def lead(self) -> float:
-        """The log odds minus the log odds of the second-best place, which count as at least 0."""
+        """The log odds minus the log odds of the second-best place. Those of the second-best place count as at least 0."""
         return self.log_odds - max(self.second_log_odds, 0.0)
 
     @property
@@ -93,9 +94,10 @@ def register_maps(
 
     Both maps have z up. The log odds are -ln(T * P(X >= m - 2)) for T tried proposals and m matched objects. The two objects
     of the proposing pair do not count. X, the number of matches by chance, is Poisson distributed. Its mean is a sum over
-    the objects of a. Each adds the local density of objects in b, times the area of the gate, times the share of the objects
-    of b that have its label and height. True matches are close together, and chance matches are anywhere in the gate. So
-    several gates are tried, the best one counts, and T is the number of proposals times gates (Moisan & Stival 2004).
+    the objects of a. Each object adds the local density of objects in b, times the area of the gate, times the share of the
+    objects of b that have its label and height. True matches are close together, and chance matches are anywhere in the
+    gate. So several gates are tried, the best one counts, and T is the number of proposals times gates (Moisan & Stival
+    2004).
     """
     keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
     if min(len(keep_a), len(keep_b)) < 2:
@@ -140,7 +142,7 @@ def _nothing() -> Registration:
 
 def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
     """Fit the best transforms to the objects around their pair, then to more, then to all (`_STAGES`). Return the remaining
-    ones (H, 4). first: the first object of a in the pair of each transform."""
+    transforms (H, 4). first: the first object of a in the pair of each transform."""
     for size, entering in _STAGES:
         first, x = first[:entering], x[:entering]
         index = around(problem.a, first, size)

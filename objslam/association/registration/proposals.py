@@ -77,10 +77,10 @@ def propose(problem: Problem) -> tuple[Ints, Floats, int]:
 
 
 def _reach(a: Vectors, b: Vectors, size_variance: float) -> Floats:
-    """Return by how much (m) the lengths of similar vectors in map b may differ from those (P,) of vectors in map a.
+    """Return by how much (m) the lengths of similar vectors in map b may differ from the lengths (P,) of vectors in map a.
 
-    It is at least `_GATE` standard deviations. size_variance: of map b. The error of a length in b grows with that length,
-    which is not known yet, but is hardly more than the length in a.
+    It is at least `_GATE` standard deviations. size_variance: the variance of the logarithm of the size of map b. The error
+    of a length in b grows with this length. The length in b is not known yet, but it is hardly more than the length in a.
     """
     other = (b.length_variance - size_variance * b.length**2).max(initial=0.0)
     reach = np.zeros_like(a.length)

@@ -1,8 +1,8 @@
 """The shape of a map: how its objects lie to each other, and which of their errors a transform of the map can absorb.
 
 The error of object i is o_i + L_i e. o_i is its own, and e has the seven numbers that all objects of the map share
-(`core.maps.shared_covariance`): g, a shift and a yaw, and d, a tilt and a size. With J_i and D_i for the columns of L_i that
-belong to g and d, the offset y_i of a matched object from its partner is, to first order,
+(`core.maps.shared_covariance`): g is a shift and a yaw, and d is a tilt and a size. With J_i and D_i for the columns of L_i
+that belong to g and d, the offset y_i of a matched object from its partner is, to first order,
 
     y_i = J_i x + J_i g + D_i d + o_i.
 
@@ -10,10 +10,10 @@ x is the transform between the maps, about which nothing is known before. A chan
 Three things follow.
 
 1. The residuals of a fit of x do not depend on g. So only o_i + D_i d may widen gates, and only their covariance is that of
-   an offset. Anything else would take chance matches for true ones.
+   an offset. Anything else would take chance matches for true matches.
 2. The best estimate of x is the same with and without g in the covariance of the offsets (Rao 1967). For any weights, a fit
-   is x + sum_i K_i (y_i - J_i x), and sum_i K_i J_i = 1. Its error is g + sum_i K_i (D_i d + o_i). So the covariance of x
-   gets that of g back, whole, however many objects match.
+   is x + sum_i K_i (y_i - J_i x), and sum_i K_i J_i = 1. Its error is g + sum_i K_i (D_i d + o_i). So the whole covariance
+   of g is added to the covariance of x, however many objects match.
 3. The vector p_j - p_i between two objects has the error o_j - o_i + turn x (p_j - p_i) + size (p_j - p_i). Its length and
    its rise contain neither the shift nor the yaw.
 """
@@ -29,7 +29,8 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.maps.shared_covariance import NUMBERS, SIZE, jacobian, moved, own_part, root_of
 
 _FLOOR = 0.01
-"""The standard deviation (m) added to each position, so that exact maps can be registered. A larger value matches more."""
+"""The standard deviation (m) added to each position, so that exact maps can be registered. A larger value matches more
+objects."""
 _STRAIN = [3, 4, SIZE]
 """The numbers of a shared error that a shift and a yaw do not absorb: the tilt about x and y, and the size."""
 
@@ -116,7 +117,9 @@ def own_errors(position: Floats, covariance: Floats, shared: Floats) -> Floats:
 
 
 def strain(position: Floats, shared: Floats) -> Floats:
-    """Return the covariances (N, 3, 3), m^2, of what the tilt and the size of a map do to objects at (N, 3) m from its
-    centre."""
+    """Return the covariances (N, 3, 3), m^2, of the errors that the tilt and the size of a map cause at objects.
+
+    position: (N, 3) m, relative to the centre of the map. shared: (7, 7) the covariance of the shared error.
+    """
     lever = jacobian(position)[:, :, _STRAIN]
     return np.asarray(lever @ shared[np.ix_(_STRAIN, _STRAIN)] @ np.swapaxes(lever, 1, 2))

@@ -157,7 +157,7 @@ def _say_what_is_not_used(source: str, options: LiveOptions, speed: float, publi
 
 
 def _is_recorded(source: str, speed: float) -> bool:
-    """Return whether the messages of an adapter are a recording, of which no frame may be dropped for its age."""
+    """Return whether the messages of an adapter are a recording. No frame of a recording may be dropped for its age."""
     recorded = ADAPTERS[source].recorded
     return recorded is not None and (speed == 0 or recorded())
 

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from objslam.live.session.session import Session
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # The signals that end a session with a whole result.
-_POLL = 0.1  # The time in s between two checks for the end of the source, and between two ticks of the feed.
+_POLL = 0.1
+"""The time in s between two checks for the end of the source, and between two ticks of the feed. A larger value reacts
+later."""
 
 
 class LatestObjects:

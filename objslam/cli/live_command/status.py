@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from objslam.core.diagnostics import Ledger
     from objslam.core.snapshot import Snapshot
 
-_LINES = 10.0  # The time in s between two status lines if stderr is not a terminal.
+_LINES = 10.0  # The time in s between two status lines if stderr is not a terminal. A larger value prints fewer lines.
 
 
 @contextmanager

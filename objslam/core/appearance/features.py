@@ -12,10 +12,9 @@ from objslam.core.arrays import Array, Bools, Floats32
 
 MAX_FEATURES = 8192
 """The most numbers in an appearance vector. A larger bound accepts more wrong input, and needs more memory. No common image
-encoder has more than half of it."""
+encoder has more than half of this number."""
 _COMPACT = 64
-"""The number of numbers to which long vectors are shortened in association. A larger number keeps finer differences, and is
-slower."""
+"""The length to which long vectors are shortened in association. A larger number keeps finer differences, and is slower."""
 _SAMPLE = 20_000
 """The most vectors from which the directions of the shortened vectors are found. A larger number takes longer."""
 _ROUNDING = 1e-6
@@ -49,7 +48,7 @@ class FeatureTable:
 def unit_vectors(values: Array) -> tuple[Floats32, Bools]:
     """Return vectors (M, D) scaled to length 1, and which of the vectors (M,) can be scaled.
 
-    A vector that is zero, or has a number that is not finite, cannot. Its row is NaN.
+    A vector that is zero, or has a number that is not finite, cannot be scaled. Its row is NaN.
     """
     given = np.asarray(values, dtype=np.float64)
     with np.errstate(invalid="ignore"):
@@ -75,8 +74,8 @@ def short_numbers(vector: Floats32) -> list[float] | None:
 
 
 def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
-    """Return the unit vector (D,) under the key `features` of a JSON object, None without one. ValueError if it is no such
-    vector."""
+    """Return the unit vector (D,) under the key `features` of a JSON object, None without this key. ValueError if the value
+    is no unit vector."""
     value = entry.get("features")
     if value is None:
         return None
@@ -89,8 +88,8 @@ def vector_of_entry(entry: Mapping[str, Any]) -> Floats32 | None:
 def ranked(vectors: Sequence[Floats32], query: ArrayLike, count: int) -> list[tuple[int, float]]:
     """Return the indices of the vectors (D,) with the largest cosines to a vector, and these cosines, the largest first.
 
-    Vectors of another length than that of the query are left out. count: the most vectors to return. ValueError if the query
-    is no vector, cannot be scaled, or if no vector has its length.
+    Only vectors of the length of the query count. count: the most vectors to return. ValueError if the query is no vector or
+    cannot be scaled, or if no vector has its length.
     """
     given = np.asarray(query, dtype=np.float64)
     if given.ndim != 1 or not len(given):

@@ -13,16 +13,17 @@ Shape = Literal["point", "sphere", "ellipsoid", "cuboid"]
 SHAPES: tuple[Shape, ...] = ("point", "sphere", "ellipsoid", "cuboid")
 """The shapes of objects. A point has no size."""
 UNKNOWN_YAW = float(np.pi / np.sqrt(12))
-"""The standard deviation (rad) of a yaw about which nothing is known: that of an even distribution over half a turn."""
+"""The standard deviation (rad) of a yaw about which nothing is known: the standard deviation of a uniform distribution over
+half a turn."""
 
 
 @dataclass(frozen=True)
 class Body:
     """An upright body around the position of its object.
 
-    shape: `cuboid`, `ellipsoid`, or `sphere` if the boxes fit a sphere as well as an ellipsoid. size: (3,) m, the full
-    length, width and height. The length is the longer horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the
-    length in the plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most `UNKNOWN_YAW`, for an unknown yaw.
+    shape: `cuboid`, `ellipsoid`, or `sphere` if an ellipsoid does not fit the boxes better. size: (3,) m, the full length,
+    width and height. The length is the longer horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the length in the
+    plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most `UNKNOWN_YAW`, for an unknown yaw.
     """
 
     shape: Shape
@@ -40,8 +41,8 @@ def turned(body: Body, rotation: Floats) -> Body:
 
 @dataclass(frozen=True)
 class PlacedBody:
-    """A body in a map. centre: (3,) m, None if the position of the object from its rays is at least as good. covariance:
-    (7, 7) of the centre, the size and the yaw."""
+    """A body in a map. centre: (3,) m, None if the position from the object's rays is as good or better. covariance: (7, 7)
+    of the centre, the size and the yaw."""
 
     body: Body
     centre: Floats | None

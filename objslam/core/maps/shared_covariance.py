@@ -3,7 +3,7 @@
 The path drifts between the start and the objects, and the size of the map may be uncertain. Both move all objects together.
 So the error of an object at p is e_shift + e_turn x p + e_size p, plus an error of its own. The seven numbers of the shared
 error are a shift (m), a rotation vector (rad) and the logarithm of a size, at the origin of the frame. Their covariance is
-one matrix for the whole map. The covariance of each object contains its part.
+one matrix for the whole map. The covariance of each object contains what the shared error adds to it.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ _FEWEST = 3
 """The least number of objects with a shared error. Two objects do not determine a turn about their line."""
 _FLOOR = 1e-3
 """The least standard deviation (m) of an object's own error. A larger value keeps linear systems better conditioned, and
-counts less of the errors of exact maps as shared. This value is far below the errors of real maps."""
+counts a smaller part of the errors of exact maps as shared. This value is far below the errors of real maps."""
 _INDEFINITE = 1e-10
 """The least eigenvalue of the information about the shared error, relative to the largest one, with lengths in units of the
 map's extent. Directions below it have no shared error. A larger value leaves out more directions."""
@@ -38,10 +38,10 @@ def jacobian(points: Floats) -> Floats:
 def shared_covariance(points: Floats, covariance: Floats, factor: Floats) -> Floats | None:
     """Return the covariance (7, 7) of the shared error of objects at points (N, 3), None for fewer than three objects.
 
-    covariance: (N, 3, 3) m^2 of the objects. factor: (N, 3, m) m, the part of their errors that is correlated: the joint
-    covariance is its product with its own transpose, plus a block for each object. The seven numbers are estimated from the
-    objects by the best linear estimate (Gauss and Markov): once with this joint covariance, once with the blocks alone. The
-    result is the covariance of the first estimate minus that of the second. It is exact if all correlated errors are shifts,
+    covariance: (N, 3, 3) m^2 of the objects. factor: (N, 3, m) m, the correlated part of their errors. The joint covariance
+    is the factor times its own transpose, plus a block for each object. The seven numbers are estimated from the objects by
+    the best linear estimate (Gauss and Markov): once with this joint covariance, once with the blocks alone. The result is
+    the covariance of the first estimate minus the covariance of the second. It is exact if all correlated errors are shifts,
     turns and sizes. Other correlated errors, such as bends of the path, then count as errors of the objects. The covariance
     of each object is never below its part of the shared error.
     """
@@ -85,7 +85,8 @@ def root_of(shared: Floats) -> Floats:
 
 
 def own_part(covariance: Floats, factor: Floats) -> Floats:
-    """Return the covariances (N, 3, 3), m^2, without the part of a factor (N, 3, m), m. They are at least `_FLOOR`^2."""
+    """Return the covariances (N, 3, 3), m^2, without the part that a factor (N, 3, m), m, describes. They are at least
+    `_FLOOR`^2."""
     own = covariance - factor @ np.swapaxes(factor, 1, 2)
     size, axes = np.linalg.eigh((own + np.swapaxes(own, 1, 2)) / 2)
     return np.asarray((axes * np.maximum(size, _FLOOR**2)[:, None, :]) @ np.swapaxes(axes, 1, 2))

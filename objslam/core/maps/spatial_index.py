@@ -27,15 +27,15 @@ class SpatialIndex:
         self._trees: dict[int, KDTree] = {}
 
     def _tree(self, coordinates: int) -> KDTree:
-        """Return the tree of the first two or of all three coordinates. It is made at the first question."""
-        from scipy.spatial import KDTree  # Deferred, because a map is often read without any question.
+        """Return the tree of the first two or of all three coordinates. It is made at the first query."""
+        from scipy.spatial import KDTree  # Deferred, because a map is often read without any query.
 
         if coordinates not in self._trees:
             self._trees[coordinates] = KDTree(self.points[self.finite, :coordinates])
         return self._trees[coordinates]
 
     def nearest(self, place: Floats) -> int | None:
-        """Return the index of the point nearest to a place, the first one of several. None without any point."""
+        """Return the index of the point nearest to a place, or of the first such point. None without any point."""
         if not len(self.finite):
             return None
         distance, _ = self._tree(len(place)).query(place)
@@ -60,7 +60,8 @@ class SpatialIndex:
         return np.asarray(near[((some >= low) & (some <= high)).all(axis=1)])
 
     def _near(self, place: Floats, radius: float, norm: float) -> Ints:
-        """Return a few more points than those at most `radius` m from a place, in order. norm: 2 or infinity."""
+        """Return all points at most `radius` m from a place, and a few that are slightly farther, in order. norm: 2 or
+        infinity."""
         found = self._tree(len(place)).query_ball_point(place, _wider(radius), p=norm)
         return self.finite[np.sort(np.asarray(found, dtype=np.int64))]
 

@@ -1,7 +1,7 @@
 """The engines of a fleet: each runs a function on many arguments, and yields each answer as it comes.
 
-An engine is called with the name of a function, "module:function", and its arguments. It never holds more than a bounded
-number of arguments and answers, so that a fleet of any size needs the memory of a small one.
+An engine is called with the name of a function, "module:function", and its arguments. The number of arguments and answers
+that it holds is bounded, so that a fleet of any size needs the memory of a small one.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
 def local_engine(jobs: int, limits: Limits) -> Engine:
     """Return the engine of this machine, with `jobs` processes. Each does one task at a time.
 
-    Each process has a thread that waits for its answers, and computes nothing.
+    For each process, a thread of this program waits for the answers. This thread computes nothing.
     """
 
     def run(work: str, arguments: Iterable[Any]) -> Iterator[Answer]:

@@ -24,8 +24,8 @@ _PATIENT = 10.0
 """How long the address of a cluster may take to accept a connection, s. A larger value waits longer for a wrong address."""
 _GB = 1e9
 _LEASE = "RAY_worker_lease_timeout_milliseconds", "60000"
-"""The environment variable of Ray for how long a driver keeps a process that it uses, and its value, ms. After longer tasks
-the driver gives the process back and asks for another one. This takes 0.1 s a log with the 500 ms of Ray, and 7 ms with this
+"""The environment variable of Ray that says how long a driver keeps a process, and its value, ms. After a longer task, the
+driver gives the process back and asks for another process. This takes 0.1 s a log with the 500 ms of Ray, and 7 ms with this
 value (tasks of 1 s on two nodes). With a larger value, other drivers of a full cluster wait longer."""
 
 _worker = Worker()

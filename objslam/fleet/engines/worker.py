@@ -82,10 +82,10 @@ class Worker:
     def close(self) -> None:
         """End the process, whatever it does, and start no other one. Any thread may call this."""
         self._closed = True
-        process = self._process  # Its own thread may forget it meanwhile.
+        process = self._process  # The thread of its task may set it to None meanwhile.
         if process is not None:
             process.kill()
-            process.wait()  # An idle process has no task whose thread would wait for its end.
+            process.wait()  # If the process is idle, no thread of a task waits for its end.
 
     def _end(self) -> None:
         """End the process. The next task starts another one."""

@@ -71,7 +71,8 @@ class LocalStore:
     def upload(self, folder: Path, name: str) -> list[str]:
         """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order.
 
-        StoreError if the disk refuses. The files are on the disk then, before anything says that they are.
+        StoreError if the disk refuses. When this function returns, the files are on the disk, so a file that is written
+        later may rely on them.
         """
         to = self._folder / name
         self._make(to)

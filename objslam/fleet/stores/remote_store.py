@@ -173,7 +173,7 @@ class RemoteSource:
         return copy
 
     def _is_flat(self) -> bool:
-        """Return whether the file system lists all below a path in few calls, as object stores do.
+        """Return whether the file system lists all files below a path in few calls, as object stores do.
 
         Such a file system has a `find` of its own. The `find` of fsspec goes from folder to folder, and leaves out a folder
         that fails.

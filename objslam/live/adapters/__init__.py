@@ -79,7 +79,7 @@ class Feed:
 
     views: each receives every snapshot. close: called at the end. ticks: called ten times a second. image: returns the image
     of a camera, by its name, at a stamp, s. None if the adapter has no images. odom_frame: returns the name of the
-    odometry's frame, or None if --publish-tf must not publish where this frame is. late: returns what to do if frames
+    odometry's frame, or None if --publish-tf must not publish the pose of this frame. late: returns what to do if frames
     came too late for the map, "" if the source does not know.
     """
 
@@ -97,8 +97,8 @@ class LiveSource:
     """A named source of `objslam live`.
 
     says: its description in `--help`. opens: the function that makes its `Feed`. options: the class of its options, which
-    `LiveOptions` inherits. None if it has no options. recorded: returns whether its messages are a recording now, which may
-    be read as fast as they are mapped (--speed 0). None if they never are.
+    `LiveOptions` inherits. None if it has no options. recorded: returns whether its messages are now those of a recording.
+    Such messages may be read as fast as they are mapped (--speed 0). None if they never are.
     """
 
     says: str

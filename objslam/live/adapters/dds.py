@@ -20,8 +20,8 @@ _TAKE = 50
 delays the other topics more, and each message costs a little less."""
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
 _MAX_PUBLICATIONS = 1000
-"""The most publishers of types that objslam reads. With a larger number, it takes longer to choose topics among made-up
-ones."""
+"""The most publishers of types that objslam reads. With a larger number, many made-up publishers slow down the choice of
+topics more."""
 _MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images cause a warning. A larger value warns more often.
 _Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
 
@@ -210,7 +210,8 @@ class DdsAdapter:
             where = f"{self.network.where}, domain {self.network.domain}{hint}"
             self.ledger.warn(f"no publisher of odometry, tf or detections on {where}")
         for reader in self._readers.values():
-            others = (p for p in self._publications.values() if not p.own)  # A reader is never matched with its own tf.
+            # The session's own tf is no publisher that a reader could be matched with.
+            others = (p for p in self._publications.values() if not p.own)
             present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in others)
             if not reader.warned and present and now - reader.since > _LONELY:
                 reader.warned = True

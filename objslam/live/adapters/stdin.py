@@ -34,8 +34,8 @@ from objslam.live.interface import Sink
 _CAMERA = "camera"
 _LONGEST = 1 << 20  # The longest line, bytes. Longer lines are dropped. A larger number costs memory.
 _CHUNK = 1 << 16  # The most bytes of one read. A larger number makes fewer reads.
-_FASTER = 1.5  # Stamps are of a recording if they run this many times as fast as the clock. A larger number hints less.
-_WAIT = 0.1  # The longest time until a stop is noticed, s.
+_FASTER = 1.5  # Stamps that run faster than the clock by this factor are of a recording. A larger number finds fewer.
+_WAIT = 0.1  # The longest time until a stop is noticed, s. A larger value costs less, and notices it later.
 
 
 @dataclass
@@ -43,7 +43,7 @@ class StdinAdapter:
     """Pushes the messages of a stream. Malformed lines are counted with their line numbers.
 
     wait: the function that is called after each frame of a recorded stream. It returns once the map contains the frame. None
-    if a running robot writes the stream, which never waits for the map. clock: returns the time, s.
+    if a running robot writes the stream, because a robot never waits for the map. clock: returns the time, s.
     """
 
     sink: Sink
@@ -58,7 +58,7 @@ class StdinAdapter:
     def late(self) -> str:
         """Return advice against late frames if the stamps ran faster than the clock, "" otherwise.
 
-        The stamps of a robot run as fast as the clock. Those of a recording may run faster.
+        The stamps of a robot run as fast as the clock. The stamps of a recording may run faster.
         """
         if self.wait is not None or self._faster < _FASTER:
             return ""

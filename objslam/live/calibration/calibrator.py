@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
 
 _GROWTH = 1.5
-"""A calibration begins when the number of keyframes has grown by this factor since the last one began. As the intervals
-grow, the time of all calibrations is proportional to the number of keyframes. A larger factor calibrates more rarely."""
+"""A calibration begins when the number of keyframes has grown by this factor since the last calibration began. As the
+intervals grow, the time of all calibrations is proportional to the number of keyframes. A larger factor calibrates more
+rarely."""
 _DELAY = 0.15
 """The map is corrected when the number of keyframes has grown by this share since the calibration began. If the worker is
 done by then, the map does not depend on the machine's speed. A larger share suits slower machines, but corrects later."""
@@ -38,7 +39,7 @@ def observed(found: Calibration, now: Floats) -> Calibration:
     """Return a calibration in which errors that the session does not observe keep their present values, `now` (P,).
 
     Otherwise, noise would move the map with each calibration. Observed errors get their most probable values, given the
-    kept ones.
+    values that are kept.
     """
     stay = found.sigma > OBSERVABLE * found.prior
     if not stay.any():
@@ -71,15 +72,15 @@ class Calibrator:
         """
         self._counters, self._mapper, self._record, self._name, self._patient = counters, mapper, record, name, patient
         self._next = settings.live.calibrate_from or math.inf
-        # The number of keyframes when a calibration began, and its request. Once the worker has it, it is dropped to save
-        # memory.
+        # The number of keyframes when a calibration began, and its request. Once the worker has the request, it is dropped
+        # to save memory.
         self._asked: tuple[int, CalibrationRequest | None] | None = None
         self._worker: Worker[Calibration | None] = Worker()
         self._known: deque[CalibrationMessage] = deque()
         self._replaying = False
 
     def expect(self, known: Iterable[CalibrationMessage]) -> None:
-        """Apply the calibrations of a journal, each at its keyframe. Start no new ones until `begin`."""
+        """Apply the calibrations of a journal, each at its keyframe. Start no new calibrations until `begin`."""
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:

@@ -154,7 +154,8 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
 def _solve(m: MapState) -> None:
     """Solve the graph with the corrected measurements. If it is large or the solve fails, rebuild it in slices.
 
-    Only the next full solve tests for outliers, because until then the rays of one object may look like those of two.
+    Only the next full solve tests for outliers, because until then the rays of one object may look like the rays of two
+    objects.
     """
     m.schedule.relinearise_soon()
     if len(m.keyframes) <= _AT_ONCE:

@@ -31,7 +31,8 @@ class FrameView:
 
 
 class BearingExtractor:
-    """Numbers cameras and labels in the order of arrival, and converts boxes to bearings, corrected for the shared errors.
+    """Gives numbers to cameras and labels in the order of arrival, and converts boxes to bearings, corrected for the shared
+    errors.
 
     It appends new cameras and labels to the lists of the map.
     """

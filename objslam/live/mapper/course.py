@@ -1,7 +1,7 @@
 """The course of the robot: odometry and localisation joined to one path, in the frame of its first pose (`start`).
 
 Each of the two is a path, and gaps divide a path into stretches. The course is a chain of pieces. A piece is one stretch, or
-a localisation that replaces missing odometry. If possible, localisation also places a piece relative to earlier ones.
+a localisation that replaces missing odometry. If possible, localisation also places a piece relative to earlier pieces.
 """
 
 from collections.abc import Mapping

@@ -20,8 +20,8 @@ _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box t
 _BEYOND = 1.5  # Candidates are within this multiple of the largest observed distance. A larger factor costs time.
 _NEAR = 10.0  # Landmarks in view and nearer than this (m) are always candidates. A larger distance costs time.
 _ROUGH = 3.0
-"""A candidate is rough if its uncertainty fills more than this many times the image area of a ray's noise. With a larger
-value, fewer candidates are rough."""
+"""A candidate is rough if the image area of its uncertainty is more than this many times the image area of a ray's noise.
+With a larger value, fewer candidates are rough."""
 _CLEAR = 6.0  # The least cost difference of the two best candidates, if both are rough. A larger value matches fewer rays.
 _WIDEST = 0.3  # The uncertainty (m) above which a rough candidate is dropped. A larger value matches more boxes.
 _BY_LABEL = 4.0  # The gate is this factor wider if every label is one object. A larger factor keeps more rays after a drift.
@@ -102,7 +102,8 @@ def match_by_label(
 ) -> tuple[Ints, Ints]:
     """Match each ray to the landmark of its label, and return the row (n,) of this landmark in one of two arrays.
 
-    The first array holds it if the ray is inside the gate, the second if it is outside. All other entries are -1.
+    The first array holds the row if the ray is inside the gate, the second array if the ray is outside. All other entries
+    are -1.
     """
     rows = np.flatnonzero(np.isin(landmarks.label, rays.label))
     hit, missed = (np.full(len(rays.label), -1, dtype=np.int64) for _ in range(2))

@@ -13,8 +13,8 @@ _STANDING = 10  # The most keyframes of one stop, without new labels. More of th
 class KeyframeSelector:
     """Selects a keyframe when a camera has moved by a set distance or angle, and a few keyframes while the cameras stand.
 
-    In the methods, camera is the number of the camera, start_T_camera (4, 4) its pose on the course, and shown the numbers
-    of the labels in the frame.
+    The methods share their arguments. camera: the number of the camera. start_T_camera: (4, 4) its pose on the course.
+    shown: the numbers of the labels in the frame.
     """
 
     def __init__(self, settings: Live) -> None:

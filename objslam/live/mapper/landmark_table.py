@@ -16,7 +16,9 @@ from objslam.live.mapper.tracks import Track
 _FLOOR = 0.01  # The standard deviation (m) added to each position. A larger value keeps old landmarks less certain.
 _HELD = 1e-4  # Information (m^-2) that keeps covariances of parallel rays finite. A larger value makes them too small.
 _INNER = 0.05  # The border in which boxes may be cut off, as a share of the image. A larger share expects fewer landmarks.
-_NEAREST = 0.3  # The distance (m) below which an object does not fit into the image and is not expected to be seen.
+_NEAREST = 0.3
+"""The distance (m) below which an object does not fit into the image and is not expected to be seen. A larger distance
+expects fewer landmarks."""
 _FURTHER = 1.1  # A landmark is expected up to this factor times its `far`. A larger factor counts more misses.
 _NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has this id, and -1 means no landmark.
 

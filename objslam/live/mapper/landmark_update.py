@@ -32,7 +32,8 @@ class LandmarkUpdate:
 
 
 def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
-    """Count which landmarks the newest keyframe should show, and which it shows. Update those that it shows by its rays."""
+    """Count which landmarks the newest keyframe should show, and which it shows. Update the landmarks that it shows by its
+    rays."""
     landmarks, keyframes, rays, rows = m.landmarks, m.keyframes, update.rays, update.rows
     pose = m.graph.pose(int(keyframes.id[-1]))
     seen = in_view(landmarks, m.cameras[keyframes.camera[-1]], pose)
@@ -65,7 +66,8 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
 
 
 def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
-    """Move rays and counts from the landmark in row `drop` to the one in row `keep`. The caller must remove `drop` next."""
+    """Move rays and counts from the landmark in row `drop` to the landmark in row `keep`. The caller must remove `drop`
+    next."""
     landmarks, rays = m.landmarks, m.rays
     mine = np.flatnonzero(rays.owner == landmarks.id[drop])
     m.graph.drop_rays(rays.number[mine])

@@ -20,7 +20,9 @@ from objslam.live.mapper.state import MapState
 _ANCHORS = 3  # How many past keyframes are tried as the start of the loop. More keyframes take longer.
 _NEAR = 0.25  # A correction above this (m) bends the path before landmarks merge. A larger value leaves more to iSAM2.
 _TURNED = 0.05  # A heading correction above this (rad) bends the path before landmarks merge, as a shift above _NEAR does.
-_AROUND = 6.0  # Other landmarks within this radius (m) of recognised ones match again. Cameras see about as far in a hall.
+_AROUND = 6.0
+"""Other landmarks within this radius (m) of recognised landmarks match again. Cameras see about as far in a hall. In a
+larger radius, more landmarks match again."""
 _ERA = 15.0  # Landmarks _AROUND match again if seen within this time (s) of the recognised ones. A longer time matches more.
 _ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
 _TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.

@@ -36,8 +36,8 @@ _VISITS = 6
 """The least number of changes between inliers and outliers, in time order, that shows two objects of a label. Drift makes
 one run of outliers, which has two changes. A larger number needs more visits to both objects."""
 _DRIFT = 5.0
-"""The largest drift of a path, as a multiple of that in the settings, that may move an object. Real robots need up to 3.3. A
-larger value needs objects that are farther apart, or more visits to both."""
+"""The largest assumed drift of a path, as a multiple of the drift in the settings. Real robots drift by up to 3.3 times.
+With a larger value, two objects of a label are recognised as two only if they are farther apart, or visited more often."""
 _DISTANT = 60.0  # The time (s) after which an unseen track with enough rays is dropped. A larger time keeps more tracks.
 _AROUND = 0.15  # The camera may soon see this share of the image beyond its edge. A larger share prepares more landmarks.
 _USUAL = 0.75  # Every landmark may be seen up to this quantile of all `far`. A larger value prepares more landmarks.
@@ -47,8 +47,8 @@ _USUAL = 0.75  # Every landmark may be seen up to this quantile of all `far`. A 
 class _SecondObject:
     """Another object of the label of a landmark.
 
-    row: of the landmark. rays: (n,) the rows of the rays that show it. fit: its position. obs: these rays in map. far: if
-    no drift of the path explains its distance.
+    row: of the landmark. rays: (n,) the rows of the rays that show it. fit: its position. obs: these rays in map. far:
+    whether no drift of the path explains its distance from the landmark.
     """
 
     row: int
@@ -158,9 +158,9 @@ def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
 def _second_objects(m: MapState, obs: Observations, held: Ints, row: Ints, support: Bools) -> list[_SecondObject]:
     """Return the landmarks whose rays show two objects, each with its outliers (rows of `m.rays`) and their point.
 
-    The outliers of two objects fit one point. Then inliers and outliers alternate (_VISITS), or the point is farther away
-    than the path drifts. obs: the rays, in time order. held: (R,) their rows in `m.rays`. row: (R,) the row of each ray's
-    landmark. support: (R,) which rays are inliers.
+    If there are two objects, the outliers fit one point. In addition, inliers and outliers alternate (_VISITS), or the point
+    is farther away than the path drifts. obs: the rays, in time order. held: (R,) their rows in `m.rays`. row: (R,) the row
+    of each ray's landmark. support: (R,) which rays are inliers.
     """
     found: list[_SecondObject] = []
     against = np.bincount(row[~support], minlength=len(m.landmarks))
@@ -181,7 +181,7 @@ def _second_objects(m: MapState, obs: Observations, held: Ints, row: Ints, suppo
 def _farther_than_drift(m: MapState, j: int, fit: PointFit, inliers: Ints, outliers: Ints) -> bool:
     """Return whether a point is so far from landmark j (row) that it is no duplicate, and no drift of the path explains it.
 
-    The drift counts between the inlier and the outlier, by rows of `m.rays`, that are nearest in time.
+    inliers, outliers: rows of `m.rays`. The drift counts from the inlier to the outlier that is nearest in time.
     """
     k = m.keyframes
     way = fit.position - m.landmarks.position[j]
@@ -200,7 +200,7 @@ def _farther_than_drift(m: MapState, j: int, fit: PointFit, inliers: Ints, outli
 
 
 def _separate(m: MapState, second: _SecondObject) -> None:
-    """Make a landmark of the outliers of a landmark that show another object."""
+    """Make a new landmark from those outliers of a landmark that show another object."""
     k = m.keyframes
     rows = np.searchsorted(k.id, m.rays.keyframe[second.rays])
     last = rows[k.stamp[rows].argmax()]

@@ -9,7 +9,8 @@ from objslam.core.rotation import skew
 
 HORIZON = 0.06
 """A landmark is long unseen if the heading has drifted by more than this (rad, one sigma) since the last sight. This drift
-moves a landmark at 5 m by 0.3 m, perhaps onto a neighbour. With a larger value, single boxes match for longer."""
+moves a landmark at 5 m by 0.3 m, perhaps onto a neighbour. With a larger value, single boxes match landmarks after a longer
+absence."""
 _PLACED = 0.1  # The sigma (m) of the camera position below which long unseen tracks match. A larger value matches more.
 
 
@@ -50,8 +51,8 @@ class PoseUncertainty:
     def against(self, to: Floats, then: Floats) -> Floats:
         """Return the covariance (6, 6) of the camera pose relative to several landmarks together, in the camera frame.
 
-        It is the smaller of two: the drift since the longest unseen landmark was seen, and that of the pose in the map. to:
-        (n, 3) m from the camera to each landmark. then: (n, 6, 6) drift when each landmark was last seen.
+        It is the smaller of two covariances: from the drift since the longest unseen landmark was seen, and from the pose in
+        the map. to: (n, 3) m from the camera to each landmark. then: (n, 6, 6) drift when each landmark was last seen.
         """
         oldest = then[np.trace(then, axis1=1, axis2=2).argmin()]
         since = self.camera_from_drift @ gathered(self.drift, oldest[None])[0] @ self.camera_from_drift.T

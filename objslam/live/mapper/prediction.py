@@ -12,8 +12,8 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 
 _ASK = 10
-"""Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is added
-to it, which overestimates it. A larger number overestimates it more."""
+"""Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is
+added, so the covariance is too large. With a larger number, it is larger still."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,8 @@ class PosePrediction:
     """The predicted camera pose (4, 4) of a frame in map, and its uncertainty.
 
     camera_T_start: (4, 4) start of the course in the camera frame. motion: the id of the previous keyframe, the motion
-    (4, 4) from its camera to the new one, and the covariance (6, 6) of this motion in the new camera frame. None without a
-    previous keyframe, or if the pose is from localisation.
+    (4, 4) from its camera to the new camera, and the covariance (6, 6) of this motion in the new camera frame. None without
+    a previous keyframe, or if the pose is from localisation.
     """
 
     map_T_camera: Floats

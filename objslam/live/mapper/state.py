@@ -163,7 +163,8 @@ class MapState:
     def bearings(self, at: Ints) -> Bearings:
         """Return the rays in rows (n,) for the graph.
 
-        The ranges of a landmark share a bias, which does not average out. So the noise of each grows with their number.
+        The ranges of a landmark share a bias, which does not average out. So the noise of each range grows with the number
+        of ranges.
         """
         rays = self.rays
         sigma = rays.range_sigma[at]

@@ -137,7 +137,7 @@ class PathTable(GrowingTable):
         return self._one_per(self._spacing) | (near & self._one_per(min(self._spacing, self._widest)))
 
     def _one_per(self, period: float) -> Bools:
-        """Return a mask of the first pose in each period, s, and of the poses before longer steps."""
+        """Return a mask of the first pose in each period, s, and of each pose before a step that is longer than a period."""
         number = np.floor((self.stamp - self.stamp[0]) / period)
         return np.append(True, np.diff(number) > 0) | np.append(np.diff(self.stamp) > period, True)
 

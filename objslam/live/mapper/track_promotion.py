@@ -18,7 +18,7 @@ from objslam.live.mapper.tracks import Track
 
 AGREE = 0.7  # The share of a track's rays that must be inliers. A larger share makes landmarks later, and fewer false ones.
 SLACK = 0.02  # The assumed error (m) between camera poses of one track. With a larger one, more rays are inliers.
-_AGREE_BY_LABEL = 0.5  # AGREE for tracks that were grouped by label alone. A larger share makes landmarks later.
+_AGREE_BY_LABEL = 0.5  # `AGREE`, but for tracks that were grouped by label alone. A larger share makes landmarks later.
 _AGAIN = 1.2  # A track is tried again when its rays or its spread have grown by this factor. A smaller factor costs time.
 _EARLY = 0.4  # This share of joint.min_parallax_deg suffices if the position is certain. A larger share delays landmarks.
 _SURE = 0.05  # A position with a sigma below this share of its distance is certain. A larger share accepts more false ones.
@@ -109,7 +109,7 @@ def prune_tracks(m: MapState) -> None:
     """Remove and count the tracks above the limit.
 
     The labels with the most tracks lose tracks first. Of one label, tracks with fewer than live.min_rays rays go first, then
-    the longest unseen ones.
+    the tracks that were unseen for longest.
     """
     if len(m.tracks) <= _MOST_TRACKS:
         return

@@ -146,7 +146,7 @@ class Cameras:
         return ""
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return the image of a camera, by its name, at a stamp, s. None if it is not among the newest."""
+        """Return the image of a camera, by its name, at a stamp, s. None if it is not among the newest images."""
         return next((image for at, image in self._images.get(camera, ()) if abs(at - stamp) <= _SAME), None)
 
     def _make(self, boxes: Boxes, waited: float) -> _Known | str:
@@ -185,8 +185,8 @@ class Cameras:
     def _source(self, boxes: Boxes, waited: float) -> str | None:
         """Return the frame of the CameraInfo for boxes, None if there is none yet. waited: s.
 
-        It is the frame of the boxes. After half of `PATIENCE` without a CameraInfo of this frame, the CameraInfo of the
-        closest topic is used.
+        Usually this is the frame of the boxes. After half of `PATIENCE` without a CameraInfo of that frame, the CameraInfo
+        of the closest topic is used.
         """
         if boxes.frame in self._infos:
             return boxes.frame

@@ -106,7 +106,8 @@ class RosMessages:
             self._cameras.add(boxes)
 
     def image(self, camera: str, stamp: float) -> NDArray[np.uint8] | None:
-        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s. None if it is not among the detector's newest."""
+        """Return a camera's image (H, W, 3), uint8 BGR, at a stamp, s. None if it is not among the detector's newest
+        images."""
         with self._lock:
             return self._cameras.image(camera, stamp)
 
@@ -122,7 +123,8 @@ class RosMessages:
             self.ledger.warn(message)
 
     def _takes(self, role: str, source: str) -> bool:
-        """Return whether a source is used as odometry or localization: the one that the user chose, else the first one."""
+        """Return whether a source is used as odometry or localization. The source that the user chose is used, else the
+        first source."""
         if self.sources.setdefault(role, source) == source:
             return True
         if source != TF:

@@ -109,7 +109,8 @@ class BodyEstimator:
             self._fitted[j] = replace(fitted, body=body)
 
     def _due(self, m: MapState, covariances: dict[int, Floats]) -> Ints:
-        """Return the rows of the landmarks to fit, in the order of their ids. Those that have grown most come first."""
+        """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, those that have grown
+        most are fitted."""
         landmarks = m.landmarks
         self._fitted = {j: self._fitted[j] for j in landmarks.id.tolist() if j in self._fitted}
         before = np.array([self._fitted[j].rays if j in self._fitted else 0 for j in landmarks.id.tolist()])

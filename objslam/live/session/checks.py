@@ -154,7 +154,7 @@ def sound_frame(
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:
-    """Copy values into an array. None if they are too many or form no array of numbers. Truth values are no numbers here."""
+    """Copy values into an array. None if they are too many or form no array of numbers. Booleans are no numbers here."""
     if not _is_short(values, scalar=True):
         return None
     try:

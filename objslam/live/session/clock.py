@@ -50,7 +50,8 @@ class Clock:
     def place(self, stamp: float, oldest: float, latest: float) -> float:
         """Return a stamp in session time, and leave the clock as it is. oldest, latest: session time, s.
 
-        The newest shift that puts the stamp between `oldest` and `latest` is used. If none does, the present one is used.
+        The newest shift that puts the stamp between `oldest` and `latest` is used. If no shift does, the present shift is
+        used.
         """
         for shift in (self.shift, *reversed(self._shifts)):
             if oldest <= stamp + shift <= latest:

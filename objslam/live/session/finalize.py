@@ -35,7 +35,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     """Return the result of a session. Association and solve alternate as in the joint mode, from the session's estimate.
 
     If every label is one object so far, that association is solved. If many of its rays do not fit, the drive is associated
-    anew as in an offline run. If there are more rays than live.reassociate, the session's association is kept.
+    again, as in an offline run. If there are more rays than live.reassociate, the session's association is kept.
 
     name: of the log. journal: its file, None without one. known: a prior map. If the whole drive is found in it, the
     result is in the frame of that map, as in an offline run. SolveError when no box could be mapped.
@@ -112,8 +112,8 @@ def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], setti
 
 
 def _may_have_several(solution: Solution, settings: Settings) -> bool:
-    """Return whether a label may have several objects, which no frame showed together. solution: with one object for each
-    label."""
+    """Return whether a label may have several objects, which no frame showed together. solution: the solution with one
+    object for each label."""
     if settings.association.method == "by_label":
         return False
     if not labels_tell(solution.association, solution.estimate):

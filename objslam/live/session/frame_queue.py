@@ -38,7 +38,7 @@ class FrameQueue:
         # Of each frame: the corrected stamp, s, its number in the order of arrival, the message, the time of arrival, s.
         self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
-        self._newest = -np.inf  # When the newest message arrived, s. A frame may come behind a pose that arrived later.
+        self._newest = -np.inf  # When the newest message arrived, s. It need not be the message taken last.
         self.lag = 0.0
         self.worked = -np.inf
 

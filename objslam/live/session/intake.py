@@ -55,14 +55,14 @@ class _Checked(NamedTuple):
 class Intake:
     """A `Sink` that checks messages and delivers the valid ones.
 
-    A message whose stamp leaps ahead waits until the next ones of its publisher confirm the leap (`stamp_leaps`). Its push
-    returns True. If the next ones refute it, it is dropped and counted.
+    A message whose stamp leaps ahead waits until the next messages of its publisher confirm the leap (`stamp_leaps`). Its
+    push returns True. If the next messages refute the leap, the message is dropped and counted.
 
     It converts stamps to session time, in which the stamps of the path always increase. After a restart of the robot's
     odometry, it converts the new poses, so that they continue the old path.
 
-    deliver(message, arrival): takes one message at a time, in the thread that pushes. arrival: s, by `time.perf_counter`. It
-    returns whether it accepts the message, and counts the refused ones.
+    deliver(message, arrival): takes one message at a time, in the thread that pushes, and returns whether it accepts the
+    message. It counts the messages that it refuses. arrival: s, by `time.perf_counter`.
     """
 
     def __init__(self, settings: Settings, counters: Counters, deliver: Callable[[Message, float], bool]) -> None:
@@ -139,7 +139,7 @@ class Intake:
             return self._take(f"frames of {camera}", frame.stamp, checked)
 
     def end(self) -> None:
-        """Drop and count the messages that still wait for the next ones to confirm their stamps."""
+        """Drop and count the messages that still wait for a confirmation of their stamps."""
         with self._lock:
             self._refute(self._leaps.clear())
 
@@ -185,8 +185,8 @@ class Intake:
     def _take(self, stream: str, stamp: float, message: _Checked, alone: bool = False) -> bool:
         """Deliver a message of a stream, and those that it confirms, and return whether it is accepted. stamp: s.
 
-        The path that sets the clock confirms the stamps of all other streams, and only its own next poses confirm its own.
-        alone: as in `StampLeaps.take`.
+        The path that sets the clock confirms the stamps of all other streams. The stamps of this path are confirmed only by
+        its own next poses. alone: as in `StampLeaps.take`.
         """
         clock = -math.inf if stream == self._lead.path else self._clock.newest - self._clock.shift
         passing, refuted = self._leaps.take(stream, stamp, clock, message, alone)
@@ -266,7 +266,8 @@ class Intake:
         return self._hand_on(MountMessage(self._place(stamp), camera, pose))
 
     def _is_known(self, path: PathKind, at: float, pose: Floats) -> bool:
-        """Return whether this pose was accepted before at this stamp, in session time, s, and newer ones after it."""
+        """Return whether this pose was accepted before at this stamp, in session time, s, and newer poses were accepted
+        after it."""
         known = self._heard[path].get(at) if path in self._heard else None
         if known is None or at >= self._last[path].stamp:
             return False

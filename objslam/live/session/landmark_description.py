@@ -22,9 +22,9 @@ _FEW = 60  # The most rays that give the parallax of an object, as the widest an
 def describe_landmark(m: MapState, row: int, position: Floats, covariance: Floats, *, from_graph: bool = False) -> MapObject:
     """Describe the landmark in a row of `m.landmarks`, at a position (3,) m with a covariance (3, 3) m^2.
 
-    If the mean square of its normalised residuals is above 1, it multiplies the covariance. Box offsets are added.
-    from_graph: whether the covariance includes the drift of the map. If it is then too large, the landmark is still resolved
-    if its covariance relative to the last keyframe that saw it is small.
+    If the mean square of the landmark's normalised residuals is above 1, the covariance is multiplied by it. Box offsets are
+    added. from_graph: whether the covariance includes the drift of the map. Such a covariance may be too large. Then the
+    landmark is still resolved if its covariance relative to the last keyframe that saw it is small.
     """
     landmarks, rays, j = m.landmarks, m.rays, int(m.landmarks.id[row])
     mine = np.flatnonzero((rays.owner == j) & rays.used)

@@ -18,7 +18,7 @@ _TURNS_PER_M = 4.0  # The allowed turn rate, rad/s, per m/s of live.max_speed. A
 class OdometryRestarts:
     """Finds restarts of the robot's odometry, and moves the poses after them so that they continue the old path.
 
-    start_T_odom: (4, 4), moves poses from the odometry's present frame into its first one.
+    start_T_odom: (4, 4) moves poses from the odometry's present frame into its first one.
     """
 
     def __init__(self, settings: Settings, counters: Counters) -> None:
@@ -42,7 +42,7 @@ class OdometryRestarts:
         return np.asarray(self.start_T_odom @ odom_T_base), True
 
     def _jumped(self, odom_T_base: Floats, pose: Floats, last: Floats, gap: float) -> bool:
-        """Return whether no robot can move so, or the odometry counts from 0 again after a gap."""
+        """Return whether the motion is too large for any robot, or the odometry counts from 0 again after a gap."""
         moved = motion_between(last, pose)
         way, turn = math.hypot(*moved.way), moved.angle
         if way > self._fast * gap + _JUMP or turn > _TURNS_PER_M * self._fast * gap + _TURN:

@@ -269,7 +269,8 @@ class Session(Intake):
         return _IDLE if self._wanted == self._given else max(0.0, self._frames_waiting.worked + _IDLE - time.perf_counter())
 
     def _has_time(self, worked: bool, begin: float) -> bool:
-        """Return whether to make a snapshot now: no frame came for a while, the last ones were quick, or the wait is long.
+        """Return whether to make a snapshot now: no frame came for a while, the last messages were quick, or the wait is
+        long.
 
         worked: whether a frame was just processed. begin: when the last messages were taken, s (`time.perf_counter`).
         """

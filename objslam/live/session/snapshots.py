@@ -28,7 +28,7 @@ class Describer:
         self._bodies = bodies
         # By landmark id: the number of its rays and its last stamp, s, when it was described, and the description.
         self._described: dict[int, tuple[tuple[int, float], MapObject]] = {}
-        self._covariances: dict[int, Floats] = {}  # Of the described landmarks in the graph, (3, 3) m^2, by their ids.
+        self._covariances: dict[int, Floats] = {}  # (3, 3) m^2, in the graph, of the described landmarks, by id.
         # By track id: the number of its rays when it was described, and the description.
         self._waiting: dict[int, tuple[int, MapObject]] = {}
         self._tied = False  # Whether the covariances of the descriptions are relative to a prior map.

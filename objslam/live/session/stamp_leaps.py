@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 _SURE = 3
-"""A leap is real if this many messages in a row make it. A larger number is surer, and the first messages after a gap wait
-longer."""
+"""A leap is real if this many messages in a row confirm it. A larger number is surer, and the first messages after a gap
+wait longer."""
 _LAG = 0.3
 """A stamp is no leap if it is ahead by less, s. This covers the usual lags between topics. With a larger value, a wrong
 stamp can move the clock further, and fewer messages wait after short pauses."""
@@ -108,7 +108,7 @@ class StampLeaps(Generic[T]):
         return [*earlier, message, *s.near(s.reach(stamp))], s.empty()
 
     def confirmed(self, clock: float) -> list[T]:
-        """Return the waiting messages of all streams that another stream, whose newest stamp is `clock`, s, has reached."""
+        """Return, from all streams, the waiting messages that another stream has reached. clock: its newest stamp, s."""
         return [message for s in self._streams.values() if s.waiting for message in s.near(clock + _LAG)]
 
     def recall(self, stream: str, stamp: float) -> None:
