@@ -26,7 +26,8 @@ step is twice as long. Above `_FAILS`, a shorter step is tried. Larger limits ta
 pairs of limits from (1, 3) to (5, 15) degrees lead to the same map."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
 """During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
-median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both."""
+median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both
+limits."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With a larger number, landmarks are
 added later. With a smaller one, false boxes agree by chance too often."""

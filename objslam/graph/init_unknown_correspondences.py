@@ -182,8 +182,8 @@ def _recognise(
     end: int,
     looks: Looks | None,
 ) -> tuple[Ints, Floats]:
-    """Return the active landmark of each new ray (n,), or -1, and the poses (K, 4, 4), in which those from `begin` to `end`
-    - 1 are aligned."""
+    """Return the active landmark of each new ray (n,), or -1, and all poses (K, 4, 4). The poses from `begin` to `end` - 1
+    are now aligned with the landmarks."""
     if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)

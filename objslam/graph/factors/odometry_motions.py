@@ -2,9 +2,10 @@
 
 Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent, because the odometry
 knows the whole step: a robot that turned late in one motion turned more in the next. So the motions inside a step get the
-loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact: let motions
-with the shares d of a step have the noise D d of the odometry and the bridge W (diag(d) - d d'). Then their information is
-the sum of two: that of independent motions with the noise (D + W) d, and that of a tie, 1 / D - 1 / (D + W).
+loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact. Let the
+motions take the shares d of a step. Their noise is D diag(d) from the odometry, plus the bridge W (diag(d) - d d'). Then
+their information is a sum: the information of independent motions with the noise (D + W) d, plus the information 1 / D - 1 /
+(D + W) of a tie.
 """
 
 from dataclasses import dataclass, replace
@@ -112,8 +113,8 @@ def below_ties(ties: Ints, count: int) -> Bools:
 def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
     """Return the pairs (T, 2) of keyframes that need a tie, one after the other along the path.
 
-    A tie connects the keyframes that are nearest to two poses of the odometry, if there are others between them. If the
-    interpolation errs by less than the odometry, the tie is left out.
+    A tie connects the keyframes that are nearest to two poses of the odometry, if other keyframes lie between the two. If
+    the interpolation errs by less than the odometry, the tie is left out.
     """
     nothing = np.zeros((0, 2), dtype=np.int64)
     if keyframes.step is None or keyframes.wander is None or len(keyframes) < 3:

@@ -41,7 +41,8 @@ class NormalEquations:
         return found
 
     def late(self, columns: Ints, most: int) -> Ints:
-        """Return those of some columns (n,) that are eliminated among the `most` last ones, for `last_block`."""
+        """Return the columns among `columns` (n,) that belong to the last `most` eliminated columns. They are for
+        `last_block`."""
         straight = np.arange(len(self.order))
         if not all(np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)):
             return columns[:0]
@@ -51,8 +52,8 @@ class NormalEquations:
         """Return the block (n, n) of the inverse at some columns (n,), which are `late`.
 
         With J^T J = L U, the last block of the inverse is the inverse of the last block of L times the last block of U.
-        Landmarks are eliminated late, because many poses see them. So their covariances come from a small dense matrix,
-        where `solve` would go through all poses for each column.
+        Landmarks are eliminated late, because many poses see them. So their covariances come from a small dense matrix.
+        `solve` would go through all poses for each column.
         """
         if not len(columns):
             return np.zeros((0, 0))

@@ -2,8 +2,8 @@
 
 The graph of the drive stays in its own frame. The pose of this frame in the map is one more variable, F. Each object has two
 points. The rays of the drive point to L(j), in the frame of the drive. P(j) = F * L(j) + e(j) is in the map. The error e(j)
-has the errors that the graph of the drive does not contain, such as the offsets of boxes. If the map has the object, its
-estimate is the prior of P(j).
+is the sum of the errors that the graph of the drive does not contain, such as the offsets of boxes. If the map has the
+object, its estimate is the prior of P(j).
 
 The registration gives only the start and the matches, so that the map counts once. The objects of a drifted map share
 errors, but the map does not tell which. The priors count as independent. So the largest error that all objects can share is

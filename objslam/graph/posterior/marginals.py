@@ -24,8 +24,9 @@ deviation of a landmark is still above half of this value, no measurement determ
 the landmarks less. With too large a value, the system stays indeterminate."""
 
 _LEAST_PIVOT = 1e-11
-"""The least pivot of the information matrix, scaled to 1 on its diagonal, of a system with one solution. Rounding leaves
-about 1e-15 if a system has none. A larger value refuses more systems that have a solution, but are badly conditioned."""
+"""A system has a single solution if every pivot of its information matrix, scaled to 1 on the diagonal, is at least this.
+Rounding leaves a pivot of about 1e-15 if a system has no single solution. A larger value refuses more systems that have a
+solution, but are badly conditioned."""
 
 _DIRECTIONS = 20
 """The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven.

@@ -110,7 +110,7 @@ class TagCorners:
         return np.isin(np.arange(count - 1), again)
 
     def tied(self, landmarks: Ints) -> Ints:
-        """Return the fiducials (t,) all of whose corners are among the landmarks (m,)."""
+        """Return the fiducials (t,) whose four corners are all among the landmarks (m,)."""
         return np.flatnonzero(np.isin(self.landmarks, landmarks).all(axis=1))
 
     def of_objects(self, values: Floats) -> Floats:

@@ -153,7 +153,8 @@ def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Float
 
 
 def _scaled(squares: Squares, side: Floats, origins: Floats) -> Squares:
-    """Return squares of side 1 after a scaling to sides (H,) m. The points `origins` (H, 3) m are the fixed points."""
+    """Return squares of side 1 after a scaling to sides (H,) m. The scaling leaves the points `origins` (H, 3) m where they
+    are."""
     pose = squares.pose.copy()
     pose[:, :3, 3] = origins + side[:, None] * (pose[:, :3, 3] - origins)
     return Squares(squares.shape, pose, side)

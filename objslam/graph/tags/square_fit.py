@@ -21,8 +21,8 @@ _DAMPING = 1e-3
 """The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
 
 _MOST_LEVERAGE = 0.9
-"""The part of a view's influence on its own residuals that is corrected. It is below 1, because the residuals of a view that
-decides alone are 0. A larger part widens the covariances of squares that few views show."""
+"""The share of a view's influence on its own residuals that is corrected. It is below 1, because the residuals of a view
+that decides alone are 0. A larger share widens the covariances of squares that few views show."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class Corners:
     """The corners that V views of squares show. Each view belongs to one square.
 
     square: (V,) index of the square. origin: (V, 3) m in map, where the rays begin. direction: (V, 4, 3) unit, in map.
-    sigma: (V,) rad, the noise of one corner. whitening: (V, 8, 8) what the eight residuals of a view are multiplied with,
-    after a division by sigma: the identity if the corners err independently (see `with_pose_noise`).
+    sigma: (V,) rad, the noise of one corner. whitening: (V, 8, 8) the matrix that multiplies the eight residuals of a view
+    after their division by sigma. It is the identity if the corners err independently (see `with_pose_noise`).
     """
 
     square: Ints

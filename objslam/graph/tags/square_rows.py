@@ -30,7 +30,7 @@ class SquareRows:
 
     @classmethod
     def of(cls, tags: TagCorners | None, landmarks: Ints) -> Self:
-        """Return the squares all of whose corners are among the landmarks (m,), which are in increasing order."""
+        """Return the squares whose four corners are all among the landmarks (m,). The landmarks are in increasing order."""
         if tags is None:
             return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4, 3)), np.zeros(0))
         tied = tags.tied(landmarks)
