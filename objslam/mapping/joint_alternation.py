@@ -125,8 +125,8 @@ class JointState:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
         If an earlier association returns, a few rays could change for ever. Then the best `explained` state since then is
-        returned. A few changed rays hardly change the shared errors, which take most of the time of a solve. So these stay
-        as the first round found them until the rounds end, and are then estimated again.
+        returned. A few changed rays hardly change the shared errors, but their estimation takes most of the time of a solve.
+        So the shared errors stay as the first round found them. After the last round, they are estimated again.
         """
         state, earlier, held = self, dict[bytes, Self](), False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
@@ -211,9 +211,9 @@ class JointState:
     def split(self) -> Self:
         """Return the state after objects that may be two were split, if its rays are better `explained`.
 
-        Rounds in turns keep two things that one object holds, because the path is bent until all rays agree. So do they keep
-        a phantom where the rays of two things cross. Here all objects whose rays come in two bundles are split at once. The
-        solve takes the bend out of the path, and bundles of one thing are merged again.
+        Rounds in turns do not separate two things that share one object, because the path is bent until all rays agree. They
+        also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles are split at
+        once. The solve takes the bend out of the path, and bundles of one thing are merged again.
         """
         assert self.association is not None
         _, direction = self.rays.in_map(self.solved_poses)
@@ -296,6 +296,6 @@ class JointState:
             position_sigma=place,
             seed=self.settings.seed,
             guess=guess,
-            # Landmarks of a solve hold the path together. Before it, the odometry alone says how two sights of one lie.
+            # The landmarks of a solve hold the path together. Before the first solve, only the odometry does.
             drifts=rough and frames.odom_T_base is not None and not frames.localized_every,
         )

@@ -16,7 +16,7 @@ from objslam.frontend.shared_errors import SharedErrors
 
 MANY, SECOND = 5, 0.25
 """A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
-find fewer."""
+find fewer second objects."""
 _DOUBLE = 0.1
 """One object for each label is tried if at most this share of labels has several boxes in a keyframe, over all keyframes. A
 detector draws some boxes twice, and some false ones. With a larger share, more logs are tried without success. Each try
@@ -80,7 +80,7 @@ def shows_second_object(
 
 def _drawn_twice(rays: Rays, association: Association) -> Bools:
     """Return which rays (R,) have the centre of their box inside the box of their label's object in the same keyframe, or
-    the centre of that box inside their own."""
+    the centre of that box inside their own box."""
     held = np.flatnonzero(association.object >= 0)
     key = rays.keyframe * len(rays.label_names) + rays.label
     order = held[np.argsort(key[held], kind="stable")]

@@ -34,7 +34,7 @@ _NOISE = 2.0
 noise, wrong boxes fit too. Larger values refute more findings. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
 """A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
-more."""
+more findings."""
 _QUIETER = 0.5
 """If a solve explains the boxes only with noise, a finding stands if its corrected log needs at most this share of the
 noise. A larger share refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with mirrored images,
@@ -53,7 +53,7 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
     of a finding. "boxes": the finding is wrong if the solution explains the boxes, or if a solution of the log without the
     fault explains them no better. If the solution needs noisy odometry, the log without the fault must need it too. If the
     log without the fault needs noisy odometry, the finding is right only if the solution needs far more noise, of any kind.
-    If neither of the two explains the boxes, the solves show nothing, and a finding stands if the quick look is clear.
+    If neither of the two explains the boxes, the solves show nothing, and a finding stands if the quick check is clear.
     "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree on the objects.
     "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
     """

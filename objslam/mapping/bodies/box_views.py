@@ -68,7 +68,8 @@ class BoxViews:
         return found
 
     def edges(self, touched: Floats | None = None) -> BoxEdges:
-        """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch them, if known."""
+        """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch these planes, if
+        known."""
         rays, settings, poses, camera = self.rays, self.settings, self.poses, self.camera
         count = len(self.body)
         normal, turn, bound = np.zeros((count, 4, 3)), np.ones((count, 4)), self.bound.copy()

@@ -27,8 +27,8 @@ _KEPT = 0.5
 bearings of a lost object stay as they were."""
 _WORTH = 0.1
 """The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
-shift repeats in all bearings of the object, so 0.1 is as much as the noise of 100 of them. A larger value solves fewer logs
-again."""
+shift repeats in all bearings of the object. So a shift of 0.1 equals the noise of the mean of 100 bearings. A larger value
+solves fewer logs again."""
 
 
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
@@ -63,8 +63,8 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
         return estimate, None
     if state.trace is not None:
         state.trace.end_round("bodies", association, solved)
-    # A rejected ray shows something else than its object, so it has no centre of this body. Turned, such rays of a second
-    # thing would no longer meet in its place.
+    # A rejected ray may show a second thing, so it keeps its direction. Rays that were turned to the centre of this body
+    # would no longer meet at the second thing.
     return solved, np.where((solved.weight > 0)[:, None], shift, 0.0)
 
 

@@ -32,8 +32,9 @@ _FEWEST = 2
 """A box is used if at least this number of its edges are no bounds. With a larger number, fewer boxes are used. One edge
 alone agrees with too many bodies. In simulated drives, boxes with fewer such edges made centres a little worse."""
 _WITHIN = 0.1
-"""An edge is a bound if the body touches it outside the image, or inside it, but at most this share of the box away from the
-cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simulated drives."""
+"""An edge is a bound if the body touches it outside the image. It is also a bound if the body touches it inside the image,
+but at most this share of the box away from the cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly
+differ in simulated drives."""
 
 
 def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution) -> BoxEdges | None:

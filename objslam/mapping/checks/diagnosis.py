@@ -29,9 +29,9 @@ from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
 """A run tries hypotheses if the score (`Agreement.score`) at poses of a localisation is below this. With wrong input, most
-boxes may still fit, but only with several points for each thing, and each point costs a part of the score. Poses by odometry
-need a point for each thing in each window, so their share of fitting boxes is compared instead. With a larger value, more
-runs take a few seconds longer."""
+boxes may still fit, but only with several points for each thing, and each point costs a part of the score. At poses by
+odometry, each window needs its own point for each thing. So the share of fitting boxes is compared there, not the score.
+With a larger value, more runs take a few seconds longer."""
 _FITTING = 0.82
 """If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9.
 With a larger value, more runs take a few seconds longer."""
@@ -126,7 +126,8 @@ def diagnose(
     if found is not None and part.boxes >= _FEWEST:
         doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
         none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part)
-        # Where boxes agree only by chance, they say nothing of single frames, of halves, and of how a camera is turned.
+        # Where boxes agree only by chance, they say nothing about single frames, about halves, or about how a camera is
+        # turned.
         findings += [none_fits] if none_fits else _parts_differ(part, found, settings)
         if not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
@@ -206,7 +207,7 @@ def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Find
 
     one = differ(found)
     if one is not None and not part.drifts:
-        # The robot does not turn equally fast in all frames. So a clock, too, lets the boxes of some frames fit badly.
+        # The robot does not turn equally fast in all frames. So a wrong clock, too, lets the boxes of some frames fit badly.
         one = differ(without_usual_errors(part, found, settings)[0])
     if one is not None:
         return [one]

@@ -22,8 +22,8 @@ _FEWEST = 4
 _LEAST_ANGLE = np.radians(4.0)
 """The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
 _NARROW = 0.9
-"""The rays of a label that are left show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction.
-With a smaller share, false rays are excused too."""
+"""The remaining rays of a label show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction. With
+a smaller share, false rays are excused too."""
 _NEAREST = 0.25
 """The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself."""
 _MOST_POINTS = 40
@@ -37,7 +37,7 @@ cache."""
 
 @dataclass(frozen=True)
 class Meeting:
-    """The points that R rays meet in. point: (R,) the index into points of each ray, -1 for none. points: (N, 3) m.
+    """The points in which R rays meet. point: (R,) the index into points of each ray, -1 for none. points: (N, 3) m.
 
     fit: (R,) how well each ray fits, from 1 on its point to 0 from its tolerance on, and without a point. narrow: (R,)
     whether a ray has no point because the rays of its label are nearly parallel, so that they neither meet nor miss.

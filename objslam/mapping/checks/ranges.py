@@ -33,7 +33,8 @@ _CLOSE = 0.25
 """A factor is a unit of `_UNITS` if the logarithm of the ratio between the two is below this. A larger value names more
 units."""
 _UNIT = 0.7
-"""The logarithm of a factor above which no calibration error explains the factor."""
+"""The logarithm of a factor above which no calibration error explains the factor. A larger value asks fewer factors for a
+unit."""
 _GROUP = 8
 """The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
 _ALONE = 1.1

@@ -54,8 +54,8 @@ def check_pose_noise(
 ) -> Finding | None:
     """Return a finding if the noise of the poses that the log shows makes most rays far noisier than the settings say.
 
-    The covariances of the map contain this noise, so they are honest. With better poses it would be more exact. calibrated:
-    whether the cameras were calibrated against the poses.
+    The covariances of the map contain this noise, so they are honest. With better poses, the map would be more exact.
+    calibrated: whether the cameras were calibrated against the poses.
     """
     if keyframes.pose_noise == (1.0, 1.0) or not _held(objects, association).any():
         return None

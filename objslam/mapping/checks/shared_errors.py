@@ -63,7 +63,7 @@ def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
 
 
 def at_bounds(estimate: Estimate, bounds: Floats) -> list[Finding]:
-    """Return a finding for each shared error that ended at its bound (P,), and for each noise that did."""
+    """Return a finding for each shared error that ended at its bound (P,), and for each noise that ended at its bound."""
     errors = [] if estimate.calibration is None else _uncorrected(estimate.calibration, bounds)
     return errors + ([] if estimate.noise is None else _with_most_noise(estimate.noise))
 

@@ -14,8 +14,8 @@ _UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
 _DATES = (1e8, 1e10)
 """Stamps of dates between 1973 and 2286, s. A wider range leaves the unit of fewer stamps open."""
 _RARE = 10.0
-"""Poses and frames that come less often than this, s, in the median, are probably not in s. At 10 s, a robot hardly
-measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
+"""If the median time between two poses or frames is above this, s, their stamps are probably not in s. At 10 s, a robot
+hardly measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
 _CRAWL = 0.01
 """A robot that is slower than this, m/s, all along its path probably has stamps that are not in s. Even a lawn mower is 30
 times as fast. A larger value accuses more robots that hardly drive."""

@@ -1,4 +1,4 @@
-"""Whether rays or boxes lie closer together than by chance, judged by how many lie around them."""
+"""Judge whether rays or boxes lie closer together than by chance, from the number of rays or boxes around them."""
 
 import numpy as np
 

@@ -18,8 +18,8 @@ _LEAST_SHARE = 0.1
 fewer objects that are two."""
 _APART = (3.8, 85.0)
 """The least distance between the groups, in standard deviations within them: the first number, plus the second divided by
-the number of rays. Of objects whose rays scatter evenly, 1 in 10,000 has two-means as far apart (simulated for 15 to 300
-rays); with Gaussian scatter fewer. Larger numbers find fewer objects that are two."""
+the number of rays. Of objects whose rays scatter evenly, 1 in 10,000 has groups at this distance (simulated for 15 to 300
+rays). With Gaussian scatter, fewer objects have. Larger numbers find fewer objects that are two."""
 _ABOVE_NOISE = 3.0
 """The least distance between the groups, in standard deviations of a ray by the noise that the label's rays show in this
 log. A larger number finds fewer objects that are two."""
@@ -27,7 +27,7 @@ _WITHIN_SIZE = 0.35
 """The least distance between the groups, as a share of the object's size. Box centres wander within their object. A larger
 share finds fewer objects that are two."""
 _ROUNDS = 8
-"""The rounds of two-means. They converge in fewer."""
+"""The rounds of two-means. They converge in fewer rounds. A larger number is slower."""
 
 
 @dataclass(frozen=True)

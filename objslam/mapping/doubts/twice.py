@@ -77,5 +77,6 @@ def _cut(first: Floats, last: Floats) -> float | None:
     good = np.flatnonzero((smaller >= _FEWEST) & (spanning <= _SPANNING * len(first)))
     if not len(good):
         return None
-    # An object that both parts show is evidence against the cut, as much as one more of the smaller part is for it.
+    # An object that both parts show is evidence against the cut. An object of the smaller part is evidence for the cut, of
+    # the same weight.
     return float(times[good[np.argmax((smaller - spanning)[good])]])

@@ -71,14 +71,16 @@ class FixedPoses:
 
     @property
     def noise_unknown(self) -> bool:
-        """Whether the noise of the poses is estimated: if the poses are localised, and as `noise.localization` says."""
+        """Whether the noise of the poses is estimated. The poses must be localised, and `noise.localization` must ask for
+        it."""
         use, usual = self.settings.noise.localization, self.settings.localization == Settings().localization
         return bool(self.frames.localized_every and (usual if use == "auto" else use))
 
     def noise_of_poses(self, association: Association, positions: Floats, weight: Floats) -> tuple[float, float]:
         """Return the factors on `localization.yaw` and `localization.xy` that the rays show, 1 if they are not estimated.
 
-        positions: (N, 3) m, NaN for an object without a position. weight: (R,) 0 for a rejected ray. It does not count."""
+        positions: (N, 3) m, NaN for an object without a position. weight: (R,) 0 for a rejected ray. A rejected ray does not
+        count."""
         if not self.noise_unknown:
             return 1.0, 1.0
         agreeing = replace(association, object=np.where(weight > 0, association.object, -1))

@@ -26,7 +26,7 @@ from objslam.mapping.sites.session import Session
 
 _YOUNG = 2
 """An object that at most this number of sessions saw may have moved to its place. A larger number finds more moves, and
-takes more added objects for moved ones."""
+takes more added objects for moved objects."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Island:
 def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
     """Join each group of sessions that share objects to one island. The largest island comes first.
 
-    sessions: in the order of time. The first session of an island gives its frame. A session that fits no other one is an
-    island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions (`visits`) are
+    sessions: in the order of time. The first session of an island gives its frame. A session that fits no other session is
+    an island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions (`visits`) are
     read only for the objects that it lacks.
     """
     islands = [_island(sessions, part) for part in place_sessions(sessions)]

@@ -1,8 +1,9 @@
 """Place the frames of many sessions: which sessions share objects, how they lie to each other, and which objects are one.
 
-A session is registered to the map of all sessions that are placed so far, not to each of them. So a session costs one
-registration, however many there are. The map has more objects than any of its sessions, and its labels are the majority's.
-So it also gives more evidence. What this module finds is a start: one joint solve of all sessions follows.
+A session is registered to the map of all sessions that are placed so far, not to each of these sessions. So a session costs
+one registration, however many sessions there are. The map also gives more evidence: it has more objects than any single
+session, and the label that most sessions gave to an object. What this module finds is a start: one joint solve of all
+sessions follows.
 """
 
 from __future__ import annotations

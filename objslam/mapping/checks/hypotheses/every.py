@@ -18,7 +18,7 @@ _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
 _SQUARES = (320, 416, 512, 640)
 """The sides (px) of square images that detectors often use."""
 _CLIPPED, _AT_EDGE = 0.05, 1.0
-"""Boxes are px of the calibration's images if at least this share of them ends within this distance (px) of the right or
+"""Boxes are in px of the calibration's images if at least this share of them ends within this distance (px) of the right or
 the lower edge, and hardly any beyond. A detector clips boxes there. In another unit, boxes end there by chance only. With a
 larger share, more wrong sizes are tried. With a larger distance, fewer are tried."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
@@ -62,7 +62,7 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
 def _clipped_edges(log: Log) -> set[int]:
     """Return the widths and heights (px) of the cameras' images at whose right or lower edges boxes end.
 
-    Only boxes in px of these images end there, or of others that are as wide or as high.
+    Boxes end there only if they are in px of these images, or of images with the same width or height.
     """
     found: set[int] = set()
     for one in log.cameras:

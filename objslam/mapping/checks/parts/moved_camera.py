@@ -1,8 +1,8 @@
 """Detect that somebody turned a camera on the robot in the middle of a log.
 
 All other errors of a camera are the same in both halves: its clock, its place, its lens, and the rotation that it had at
-first. They are estimated together with the turn. Otherwise they look like one: a late clock moves all rays to one side while
-the robot turns left, and to the other side while it turns right.
+first. They are estimated together with the turn. Otherwise they look like a turn: a late clock moves all rays to one side
+while the robot turns left, and to the other side while it turns right.
 """
 
 from dataclasses import replace
@@ -33,8 +33,9 @@ _SIGMAS = 5.0
 """The least difference of a camera's rotation between the halves, in standard deviations. A larger number warns less
 often."""
 _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
-"""The least difference, as a multiple of `_MOVED` and in standard deviations, for another round. At first, only the
-rays fit that show a small difference. Larger values take less time, and find fewer turns."""
+"""The least difference for which another round of the estimation follows: as a multiple of `_MOVED`, and in standard
+deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer
+turns."""
 _MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
 """`_MOVED` for poses by odometry, and the least growth of the score (`Agreement.score`) by a turn. Drift looks like a
 rotation, and is not in the standard deviations. Larger values warn less often."""
