@@ -56,7 +56,7 @@ def place_sessions(sessions: Sequence[Session]) -> list[Part]:
         while k < len(parts):
             found = register(new.objects, parts[k].objects)
             if found.accepted:
-                new, k = _joined(parts.pop(k), new, found.b_T_a, found.log_odds), 0  # It grew, so others may accept it now.
+                new, k = _joined(parts.pop(k), new, found.b_T_a, found.log_odds), 0  # It grew, so others may match now.
             else:
                 k += 1
         parts = sorted([*parts, new], key=lambda one: -len(one.site_T_session))

@@ -23,9 +23,9 @@ _LUMINANCES = (0.09, 0.17)
 """Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
 either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _CORE, _AROUND = 0.1, 1.5
-"""The shown area without a path. The box of the objects leaves out the first share of them on each side. A picture shows
-objects up to the second number times the box's diagonal from it. A larger share hides more far objects, and a larger
-multiple fewer."""
+"""They limit the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects on
+each side. A picture shows objects up to `_AROUND` times the box's diagonal away from the box. A larger share hides more far
+objects. A larger multiple hides fewer."""
 _OUTLINE_POINTS = 96  # A round body is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _FENCE = (3.0, 0.5, 1.0)
 """A picture shows an object if its distance from the path is at most the largest of three distances: this multiple of the
