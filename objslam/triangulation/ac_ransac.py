@@ -24,7 +24,7 @@ from objslam.triangulation.point_to_lines import PointSolution, minimise_distanc
 _VIEW_CAP = 1 - math.cos(math.radians(45))
 """The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle."""
 _NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score the same.
-_MOST_NOISE = 0.25  # Noise takes at most this share of the view. With a larger share, very noisy rays agree with any point.
+_MOST_NOISE = 0.25  # Noise covers at most this share of the view. With a larger share, noisy rays agree with any point.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
 _MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end earlier if the agreement stops growing.
 
@@ -37,8 +37,9 @@ def fit_consensus(
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
     far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
     within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
-    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. So does a `judged` (N,)
-    object, whose rays do not meet by chance, if all agree within noise. hypotheses, jitter: for `best_pair`.
+    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. A `judged` (N,) object also
+    keeps all its rays if they agree within noise, because its rays do not meet by chance. hypotheses, jitter: for
+    `best_pair`.
     """
     xp = module_of(bundle.origin)
     used = xp.ones_like(bundle.index, dtype=xp.bool)

@@ -87,7 +87,7 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
 
 
 def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return what `newton` does.
+    """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return the same as `newton`.
 
     First, the point on this line with the least sum of distances from the other lines is found. Across the line, this sum
     has a gradient at the point. If the gradient is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming 4,

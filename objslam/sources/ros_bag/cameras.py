@@ -42,11 +42,12 @@ def find_cameras(
 
     With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the camera's
     name as a part. A single calibration without such topics takes all topics. One of several calibrations without such
-    topics is left out with a warning. Without calibrations, each frame_id of detections is a camera. Without detections too,
-    each frame_id that colour images share with a CameraInfo is a camera, and so is a single topic of colour images. The
-    other topics of a camera have its frame_id. In a recording without detections and images, each frame_id of a CameraInfo
-    is a camera, and so is each calibration. If several topics fit a role, the one with the most similar name is taken
-    with a warning. rectified: whether boxes and images are rectified. None lets the topic names decide.
+    topics is left out with a warning. Without calibrations, each frame_id of detections is a camera. If there are no
+    detections either, each frame_id that colour images share with a CameraInfo is a camera, and so is a single topic of
+    colour images. The other topics of a camera have its frame_id. In a recording without detections and images, each
+    frame_id of a CameraInfo is a camera, and so is each calibration. If several topics fit a role, the one with the most
+    similar name is taken with a warning. rectified: whether boxes and images are rectified. None lets the topic names
+    decide.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
     seeds = detections or images or pool.fitting("camera_info")

@@ -25,7 +25,8 @@ _DAMPING = (1e-3, 1e-9, 1e6)
 _LONGEST = 0.7
 """The longest step of a logarithm or an angle (rad). A longer step may leave the region in which the linear model holds."""
 _REMAIN = 0.7
-"""If a smaller share of the bodies than this is unfinished, only they get more steps. A larger share copies more often."""
+"""If less than this share of the bodies is unfinished, only these bodies get more steps. A larger share copies their data
+more often."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Errors that the boxes of a body share. A side is a direction from which an object is seen. All boxes from one side err
-alike, because the outline is no ellipse and detectors err systematically. Averaging does not help, so they count as few
-(Kish 1965).
+alike, because the outline is no ellipse and detectors err systematically. Averaging does not help, so these boxes count as
+few (Kish 1965).
 """
 
 from __future__ import annotations
