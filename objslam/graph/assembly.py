@@ -205,7 +205,7 @@ def fixed_pose_factors(
     noise: tuple[Floats, float],
     loss: Loss,
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of rays at fixed poses: first that of each ray and its landmark, then the measured ranges.
+    """Return the factors of rays at fixed poses: first one for each ray and its landmark, then one for each measured range.
 
     With the loss `l1`, this is Eq. 1 of Staszak & Belter: the distance of each ray from its landmark, without noise and
     without ranges. Noise of the directions then draws a landmark towards the cameras, because the distance to a noisy ray is

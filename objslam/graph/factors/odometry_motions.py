@@ -22,8 +22,8 @@ from objslam.graph.factors.odometry import motions, wander
 
 _LEAST_TOLD = 0.1
 """A tie is used if it gives at least this share of the information about a motion in some direction. With a larger share,
-fewer ties are used, and the motions below them count as independent. With a smaller one, faster odometry has ties too, which
-hardly change the solution but take time."""
+fewer ties are used, and the motions below them count as independent. With a smaller share, faster odometry has ties too.
+They hardly change the solution, but take time."""
 _NOTHING = 1e-6
 """A tie gives at least this share of the information about a motion in each direction, so that its information matrix has an
 inverse. A tie has no information in directions in which the motions inside a step are not loose. A larger share adds more
@@ -32,8 +32,8 @@ false information there."""
 
 @dataclass(frozen=True)
 class OdometryMotions:
-    """M camera motions: first those between consecutive keyframes, then the ties. The motions below a tie are those between
-    its two keyframes.
+    """M camera motions: first the motions between consecutive keyframes, then the ties. The motions below a tie are the
+    motions between its two keyframes.
 
     before, after: (M,) the keyframes. motion: (M, 4, 4). noise: (M, 6, 6) of the odometry. wander: (M, 6, 6) of the
     interpolated path, which adds to the noise. loose: (T, 6, 6) for each of the T ties, the noise and wander of the
@@ -83,7 +83,7 @@ class OdometryMotions:
 
     @cached_property
     def covariance(self) -> Floats:
-        """(M, 6, 6). The covariance of a tie is that of the information it adds to the motions below it."""
+        """(M, 6, 6). For a tie, the inverse of the information that the tie adds to the motions below it."""
         covariance = self.noise + self.wander
         ties = slice(len(self) - len(self.loose), len(self))
         if len(self.loose):

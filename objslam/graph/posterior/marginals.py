@@ -102,7 +102,8 @@ def seen_covariances(solved: SolvedGraph, landmarks: Ints, witnesses: Ints, ledg
 
 
 def in_camera(joint: Floats, map_T_camera: Floats, point: Floats) -> Floats:
-    """Return the covariance (3, 3), m^2, of a landmark in the frame of a camera, from the covariance (9, 9) of both.
+    """Return the covariance (3, 3), m^2, of a landmark in the frame of a camera, from the joint covariance (9, 9) of camera
+    and landmark.
 
     The camera comes first in `joint`. map_T_camera: (4, 4) its pose. point: (3,) the position of the landmark in map.
     """

@@ -64,7 +64,8 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
 
 
 def _excess(covariance: Floats, nominal: Floats) -> Floats:
-    """Return by how much covariances (n, d, d) exceed the nominal ones, in the directions in which they do."""
+    """Return by how much covariances (n, d, d) exceed the nominal covariances, in the directions in which they are
+    larger."""
     root = np.linalg.cholesky(nominal)
     inverse = np.linalg.inv(root)
     ratio, axes = np.linalg.eigh(inverse @ covariance @ np.swapaxes(inverse, 1, 2))

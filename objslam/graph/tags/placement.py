@@ -29,7 +29,7 @@ A decrease by 1 means odds of e^(1/2). A larger value leaves more fiducials wher
 
 @dataclass(frozen=True)
 class Placement:
-    """The best pose of each of T fiducials for given camera poses, and a second one.
+    """The best pose of each of T fiducials for given camera poses, and a second pose.
 
     best, other: the squares at these poses. cost, other_cost: (T,), Cauchy's loss, infinite for a fiducial without that
     pose. information: (T, 7, 7) of the best, as in `square_fit.fit`.
@@ -43,11 +43,11 @@ class Placement:
 
 
 def place(seen: Corners, shapes: Floats, sides: Floats) -> Placement:
-    """Return the best pose of each of T fiducials, and its second one.
+    """Return the best pose of each of T fiducials, and its second pose.
 
     A single view gives two poses. The two poses of each of `_CANDIDATES` views are tried in `_VIEWS` views. The best pose is
-    fitted to the `_VIEWS` views. The mirror image of the best is fitted too, because both fit if the views have little
-    parallax. An unknown side comes from the parallax of the views.
+    fitted to the `_VIEWS` views. The mirror image of the best pose is fitted too, because both poses fit if the views have
+    little parallax. An unknown side comes from the parallax of the views.
 
     seen: views of the fiducials. shapes: (T, 4, 3). sides: (T,) m, NaN if unknown.
     """
