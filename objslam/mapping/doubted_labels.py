@@ -2,7 +2,7 @@
 
 A map with one object for two things bends the path, so that both things lie in one place. A solve that estimates the noise
 explains the bend by noise of the odometry, and then all rays agree. So the rays do not tell that the label has two objects.
-Only the evidence for both maps does, at the same noise.
+Only a comparison of the evidence for both maps, at the same noise, tells it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NOISY_BOXES = 2.0
 """The factor on the noise of boxes, found by a solve with noisy odometry, above which all labels are doubted. If several
 labels have two objects each, they cannot check one another, but their boxes miss. The recorded wheel robots have 0.5 to 1.2
 with one thing for each label, and a simulated drive with two labels of two things had 4.4. A larger factor doubts fewer
-labels, and a smaller one explores more logs in vain."""
+labels, and a smaller factor explores more logs without need."""
 _REJECTED = 0.1
 """A label is doubted if at least `MANY` of its rays, and at least this share, are rejected. A larger share doubts fewer
 labels. In a smaller share, a second object cannot be told from wrong names and false boxes."""

@@ -233,10 +233,11 @@ class JointState:
         return replace(self, ledger=Ledger(), trace=None if self.trace is None else self.trace.aside())
 
     def better(self, attempt: Self) -> Self:
-        """Return the result of an attempt if its association explains more than that of this state, else this state.
+        """Return the result of an attempt if its association explains more than the association of this state. Otherwise
+        return this state.
 
-        The two are compared at the shared errors and the noise of each. An estimate of the noise that is off by chance would
-        otherwise decide.
+        The two associations are compared twice: at the shared errors and the noise of each state. The two gains are added.
+        Otherwise an estimate of the noise that is wrong by chance could decide.
         """
         gain = attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
         return self.replaced(attempt) if gain > 0 else self
@@ -277,7 +278,8 @@ class JointState:
         frames, rays = self.frames, self.all_rays
         if self.errors is not None and self.theta is not None:
             frames, rays, _ = self.errors.take(frames, rays).at(self.theta, drift=False)
-            # If the estimated noise is below the nominal noise, it describes inliers only. The gate needs the larger one.
+            # If the estimated noise is below the nominal noise, it describes inliers only. The gate needs the nominal noise
+            # then.
             rays = replace(rays, sigma=np.maximum(rays.sigma, self.all_rays.sigma))
         mine = self.keyframes
         at = correct_poses(frames.stamps, frames.map_T_base, mine.stamps, mine.map_T_base, map_T_base)

@@ -26,7 +26,7 @@ _AGREES = 3.0
 fewer boxes can show a second object."""
 _JUDGEMENTS = 2
 """How often `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays finds too
-little noise, so a second one finds more. A larger number is slower."""
+little noise, so a second solve finds more. A larger number is slower."""
 _SAME_NOISE = 0.1
 """The relative change of the noise below which `noise_explains` does not solve again. A larger value ends sooner."""
 

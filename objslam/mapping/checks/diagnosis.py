@@ -43,7 +43,7 @@ With a larger value, more logs are compared, which takes longer."""
 _FEWEST = 60
 """The fewest boxes of a log that are judged by their agreement. Fewer boxes agree by chance."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
-"""The clock offsets (s) that are tried besides 0. The search for small errors starts from the one that fits best. More
+"""The clock offsets (s) that are tried besides 0. The search for small errors starts from the offset that fits best. More
 offsets take longer."""
 _GAIN = 0.02
 """The least growth of the score by a clock offset of `_CLOCKS`, and by the removal of the errors that the run does not
@@ -152,7 +152,7 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 
 def _corrected(part: Part, found: Agreement | None, settings: Settings) -> tuple[float, str]:
     """Return the score of a log without the small errors that a run in this mode estimates from given poses, 0 if there are
-    none. Also return those of the errors, in words, that are too large for a usual camera."""
+    none. Also return, in words, the errors that are too large for a usual camera."""
     estimated = _estimated(part, settings)
     if found is None or part.drifts or settings.mode == "joint" or not estimated:
         return 0.0, ""

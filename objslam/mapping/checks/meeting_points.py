@@ -131,8 +131,8 @@ def fit_points(origins: Floats, directions: Floats, tolerance: Floats, place: fl
 def nearest_point(origins: Floats, directions: Floats, start: Floats, used: Bools | None = None) -> Floats:
     """Return the points (..., 3) that are nearest to rays (..., N, 3) in least squares of angles.
 
-    start: (..., 3) points near them, whose distances turn offsets into angles. used: (..., N) which rays count, by default
-    all.
+    start: (..., 3) points near the returned points. Their distances turn offsets into angles. used: (..., N) which rays
+    count, by default all.
     """
     to = start[..., None, :] - origins
     weight = 1 / np.maximum(np.einsum("...ni,...ni->...n", to, to), _NEAREST**2)
@@ -193,7 +193,7 @@ def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
 
 
 def _nearly_parallel(rows: _Rows) -> Bools:
-    """Return the labels (L,) whose rays are so close to parallel that no point of theirs can be told."""
+    """Return the labels (L,) whose rays are so close to parallel that they tell no point."""
     mean = (rows.directions * rows.real[:, :, None]).sum(axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     near = (np.einsum("lni,li->ln", rows.directions, mean) >= np.cos(_LEAST_ANGLE)) & rows.real

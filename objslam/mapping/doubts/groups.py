@@ -38,8 +38,8 @@ Reason = Literal[
 REASONS: tuple[Reason, ...] = get_args(Reason)
 """Why boxes are no object. In this order: they stay at one place of the image, they lie on an object, they follow one
 another and no place explains them, too few rays, no parallax, the rays do not meet, the ranges disagree, too few frames show
-the thing, its size is wrong, it moves a little, as many strays meet by chance, no reason alone. The first three belong to no
-place."""
+the thing, its size is wrong, it moves a little, as many strays meet by chance, none of these reasons alone. The first three
+belong to no place."""
 _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
 """The median deviation of the ranges from the place, in standard deviations, above which the ranges disagree. With a larger

@@ -17,8 +17,8 @@ _FEWEST = 4
 """The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number does
 less work."""
 _SPANNING = 0.5
-"""The largest share of objects that both parts of the drive show. After a loss, these are objects whose place another one
-has by chance. A larger share searches more maps."""
+"""The largest share of objects that both parts of the drive show. After a loss, an object is in both parts only if another
+object is at its place by chance. A larger share searches more maps."""
 _FEWEST_MATCHES = 0.5
 """The least share of the objects of the smaller part that the other part has too. Rooms of a building have some furniture in
 common. A larger share finds fewer losses."""

@@ -38,9 +38,9 @@ _FIRST = 0.05
 poses. The priors of the shared errors of a camera allow about as much. With a larger value, near objects become one, and
 then their rays show nothing of the poses."""
 _EXPLAINED = 0.5
-"""If an association with wide gates explains at most this share of the rays, one with narrow gates is tried as well. The
-narrow one is taken if the wide one explains less than this share of the rays that the narrow one explains. With a larger
-share, the narrow one is tried and taken more often."""
+"""If an association with wide gates explains at most this share of the rays, a second association with narrow gates is
+tried. The second is taken if the first explains less than this share of the rays that the second explains. With a larger
+share, the second is tried and taken more often."""
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,12 @@ _MOST_POSES = 500
 """The most poses that count, spread evenly. They determine a factor to 3 %. More poses are more exact and slower."""
 _BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])
 """The logarithms of the least and largest factors on the noise of rays, headings and places. The noise of poses never falls
-below the settings: a few frames with small errors do not promise the same of the others."""
+below the settings: a few frames with small errors do not promise small errors of the other frames."""
 _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
 """The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
 _CHANCE = 1e-3
-"""The chance of a false alarm: that poses which are as good as the settings say are found noisier. With a larger value,
-shorter logs can show noisy poses, and more good logs seem to have such poses."""
+"""The chance of a false alarm: poses that have the noise of the settings are found noisier. With a larger value, shorter
+logs can show noisy poses, and more good logs seem to have such poses."""
 _SIGNIFICANT = -2 * np.log(_CHANCE)
 """The poses count as noisier if this lowers -2 ln of the posterior density by at least this value. It is the quantile of
 chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are the noises of headings and of
@@ -129,14 +129,14 @@ def _summed(miss: Floats, by_pose: Floats, pose: Ints, noise: tuple[float, float
 def _most_likely(sums: _Sums) -> Floats:
     """Return the factors (3,) on the noise of rays, headings and places with the least cost.
 
-    The last two are 1 unless larger ones cost significantly less."""
+    The factors on headings and places are 1 unless larger factors cost significantly less."""
     usual, cost_usual = _searched(sums, np.array([True, False, False]), np.zeros(3))
     found, cost = _searched(sums, np.ones(3, dtype=bool), usual)
     return np.exp(found if cost < cost_usual - _SIGNIFICANT else usual)
 
 
 def _searched(sums: _Sums, free: Bools, start: Floats) -> tuple[Floats, float]:
-    """Return the logarithms (3,) of factors with the least cost, and this cost: steps along the axes, then smaller ones.
+    """Return the logarithms (3,) of factors with the least cost, and this cost, by steps along the axes that become smaller.
 
     free: (3,) which factors change. start: (3,) logarithms."""
     best, cost = start, sums.cost(start)

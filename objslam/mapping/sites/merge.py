@@ -126,8 +126,7 @@ def _live(
 
 
 def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject]) -> None:
-    """Join the lives of the objects that both the tracks in `begun` and a site have. here: the objects of the site, by
-    track."""
+    """Join the lives of the objects that are in `begun` and in a site. here: the objects of the site, by track."""
     for at in begun:
         old, new = tracks[at].life, here[at].life if at in here else None
         if old is not None and new is not None:
@@ -160,7 +159,8 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
-    """Find objects that moved: one track is gone, a similar one is new elsewhere. Return the tracks except these gone ones.
+    """Find objects that moved: one track is gone, a similar one is new elsewhere. Return all tracks except the gone tracks
+    that were found to have moved.
 
     The new track takes the number of the gone one. begun: the tracks so far. came: the tracks that a later site brought.
     They count as new, however many sessions of that site saw them.

@@ -31,9 +31,9 @@ class Part:
     """Sessions that share objects, as one map.
 
     objects: the map, in the frame of one of the sessions. Its objects are those of `tracks`, in the same order: first all
-    that are present in a session, then those that are gone. tracks: each object as its sessions have it. site_T_session: how
-    each session lies in this frame. log_odds: of the registration that tied each session to the others, NaN for the one that
-    gives the frame.
+    objects that are present in a session, then the gone objects. tracks: each object as its sessions have it.
+    site_T_session: how each session lies in this frame. log_odds: of the registration that tied each session to the others,
+    NaN for the session that gives the frame.
     """
 
     objects: ObjectMap
@@ -124,7 +124,7 @@ def _with_labels_of(ours: MapObject, theirs: MapObject, often: Sequence[int]) ->
 
 
 def sessions_behind(item: MapObject) -> int:
-    """Return how many sessions an object stands for: those that saw it if it is of a site, else one."""
+    """Return how many sessions an object stands for: 1, or for an object of a site the number of sessions that saw it."""
     return 1 if item.life is None else item.life.sessions_seen
 
 

@@ -24,9 +24,9 @@ _CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
 _MORE_BOXES = 25
 """The least number of additional boxes that must fit. A larger number needs longer logs."""
 _CROOKED, _STRAIGHT = 0.62, 0.85
-"""Below the first straightness, the axes of a path may be wrong. Corrected axes must reach the second one. In real logs,
-hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59. A larger first value suspects more paths. A
-larger second value accepts fewer corrections."""
+"""Below the first straightness, the axes of a path may be wrong. Corrected axes must reach the second straightness. In real
+logs, hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59. A larger first value suspects more
+paths. A larger second value accepts fewer corrections."""
 _NOT_WORSE = 0.8
 """A hypothesis about the axes of a path must keep this share of the score. Boxes of sparse logs show little about axes. A
 larger share accepts fewer corrections."""
@@ -99,10 +99,10 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log.
 
     corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
-    better than this: a mount with another order of its quaternion may look like one that is tilted a little. unusual: those
-    of the errors, in words, that are too large for a usual mount, "" if there are none. If there are such errors, a wrong
-    mount that explains the boxes equally well is the more probable cause. The finding names this mount. It does not spoil
-    the map, because the run corrects the error.
+    better than this: a mount with another order of its quaternion may look like a mount that is tilted a little. unusual:
+    the errors, in words, that are too large for a usual mount, "" if there are none. If there are such errors, a wrong mount
+    that explains the boxes equally well is the more probable cause. The finding names this mount. It does not spoil the map,
+    because the run corrects the error.
     """
     first, rest = trials[0], trials[1:]
 
@@ -168,8 +168,8 @@ def _of_another_drive(first: Trial, best: Trial) -> Finding:
 
 
 def chance(trials: Sequence[Trial]) -> float | None:
-    """Return the score that boxes reach by chance in this log: that of the best tenth of all turned mounts, of which at most
-    one is right. None if no mounts were tried."""
+    """Return the score that boxes reach by chance in this log: the score of the best tenth of all turned mounts. At most one
+    of these mounts is right. None if no mounts were tried."""
     turned = [trial.score for trial in trials if trial.hypothesis is not None and trial.hypothesis.of_mount]
     return float(np.percentile(turned, _CHANCE)) if turned else None
 
