@@ -43,7 +43,8 @@ def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:
 def ray_ends(result: RunResult) -> Floats:
     """Return the point (R, 3), m in map, at which the drawing of each ray ends.
 
-    A ray is as long as the distance to its object. A ray without an object gets the median length of the rays with one.
+    A ray is as long as the distance to its object. A ray without an object gets the median length of the rays with an
+    object.
     """
     index = result.association.object
     reach = np.full(len(index), np.nan)

@@ -41,9 +41,7 @@ from objslam.results.read import (
 
 _BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
 _LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
-_KNOWN_YAW = (
-    0.999 * UNKNOWN_YAW
-)  # A yaw is shown if its standard deviation (rad) is below this. A less certain yaw counts as unknown.
+_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # A yaw is unknown if its standard deviation (rad) is at least this.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",

@@ -38,7 +38,7 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     Args:
         path: (K, 3) points, m in map, that labels should not cover.
         static: whether the objects are static. If not, they are logged at the current time of the recording, and an entity
-            without objects is logged to clear the earlier ones.
+            without objects is logged to clear the earlier objects.
     """
     every, texts, colour = objects.objects, captions(objects), colours(objects)
 
