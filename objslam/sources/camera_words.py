@@ -7,9 +7,7 @@ from objslam.core.camera import Camera, spoken_name, undistort
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
 _STEEP = 60.0  # From this elevation, degrees, a camera "looks up" or "looks down". With a larger value, fewer do.
 _LEVEL = 5.0  # The text omits an elevation or a tilt of at most this, degrees. A larger value omits more of them.
-_ASPECT = (
-    1.2  # A camera is reported if fx / fy or fy / fx exceeds this. Real lenses are below 1.1. A larger value reports fewer.
-)
+_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx exceeds this. Real lenses are below 1.1. More reports fewer.
 
 
 def view_of(camera: Camera) -> str:
