@@ -187,8 +187,8 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
 
 
 def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the lowest log NFA (B, H) over all k, and the k-th lowest chance for this k. The k rays with the lowest chances
-    are the ones that agree. chance: (B, H, n) of each ray.
+    """Return the lowest log NFA (B, H) over all k, and the k-th lowest chance for this k. The rays that agree are the k rays
+    with the lowest chances. chance: (B, H, n) of each ray.
 
     NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
     and 3 of them determine the point. Each p counts for 2 coordinates.

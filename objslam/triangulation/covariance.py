@@ -122,7 +122,7 @@ def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
-    Of more than `_EVERY_PAIR` rays, only the ones nearest to 64 evenly spread axes are compared. The angle is then exact to
+    Of more than `_EVERY_PAIR` rays, only the rays nearest to 64 evenly spread axes are compared. The angle is then exact to
     1 %."""
     xp = module_of(bundle.direction)
     rays = bundle.select(use)

@@ -234,8 +234,8 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray. ValueError if one is not finite and above 0. Where `needed` (R,) is not finite, no value is
-    needed: a wrong value becomes 1."""
+    """Return one value per ray. ValueError if a value is not finite and above 0. Where `needed` (R,) is not finite, no value
+    is needed: a wrong value becomes 1."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():

@@ -184,7 +184,8 @@ def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Fl
 
 
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
-    """Return half the weighted sum of squares (N,) of each body, with its prior. The weights are fixed, also robust ones.
+    """Return half the weighted sum of squares (N,) of each body, with its prior. All weights are fixed, the robust weights
+    too.
 
     A bound that a step crosses counts at once, so that no step jumps back and forth across it.
     """

@@ -83,7 +83,7 @@ def nominal_noise(edges: BoxEdges) -> Floats:
 
 
 def at_edges(edges: BoxEdges, noise: Floats) -> Floats:
-    """Return the noise (B, 5) of the residuals, given that of shift, size and range (B, 5).
+    """Return the noise (B, 5) of the residuals, given the noise (B, 5) of shift, size and range.
 
     If an edge of an axis is a bound, the residuals of this axis are its two edges. An edge has the noise of shift and size
     together.
