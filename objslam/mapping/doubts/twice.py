@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from objslam.association.registration.map_registration import Registration
 
 _FEWEST = 4
-"""The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number does
-less work."""
+"""The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number saves
+time, and misses losses among few objects."""
 _SPANNING = 0.5
 """The largest share of objects that both parts of the drive show. After a loss, an object is in both parts only if another
 object is at its place by chance. A larger share searches more maps."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _ROUNDS = 12
 """The most rounds of association and calibration. Two or three are usual. A clock that is off by a second moves by 0.03 s in
-a round, so it needs ten to reach its bound. More rounds are slower if they do not settle."""
+a round, so it reaches its bound after ten rounds. A larger number is slower for logs that do not settle."""
 _SAME = 0.05
 """An association is repeated only if ray directions, or their noise, differ from those of each earlier round by more than
 this share of the noise. A smaller change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A larger
@@ -245,7 +245,7 @@ def _placed(estimate: Estimate) -> Floats:
 
 
 def _own(at: FixedPoses) -> Floats:
-    """Return the standard deviations (R,), rad, of ray directions by their own noise and that of the headings."""
+    """Return the standard deviations (R,), rad, of ray directions, from the noise of rays and of headings."""
     from objslam.graph.fixed_pose_triangulation import pose_noise
 
     return pose_noise(at.rays_seen, at.seen, at.settings)[0]
