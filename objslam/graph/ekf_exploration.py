@@ -26,15 +26,15 @@ from objslam.graph.multiframes import Multiframes
 from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 
 _STRETCH = 150
-"""A landmark with too few rays is dropped after this number of frames without a ray, or sooner if the heading drifted by
-`HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A larger number keeps
-false landmarks longer."""
+"""A landmark with too few rays is dropped after this number of frames without a ray. It is dropped sooner if the heading
+drifted by `HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A larger number
+keeps false landmarks longer."""
 _RECENT = 300
 """The number of frames after its first ray during which a landmark can be tied to an older one. A larger number is
 slower."""
 _SURE = 4.0
-"""A match is sure if the best assignment with it is more likely than the best one without it by at least this value (log
-odds). A larger value matches fewer rays."""
+"""The best assignment with a match is compared with the best assignment without it. The match is sure if the log odds are at
+least this. A larger value matches fewer rays."""
 _NEW = 0.2
 """The prior probability that a ray belongs to no known landmark. A larger value accepts fewer matches."""
 _PAIRS = 40

@@ -21,9 +21,9 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""A rejected ray gets a second chance if at least the share `_MOST` of the rays from `_BESIDE` before it to `_BESIDE` after
-it are rejected. Perhaps the poses are wrong there. A few false boxes in a row get no second chance. Larger values restore
-fewer rays."""
+"""The stretch of a ray goes from `_BESIDE` rays before it to `_BESIDE` rays after it. A rejected ray gets a second chance if
+at least the share `_MOST` of its stretch is rejected. Perhaps the poses are wrong there. A few false boxes in a row get no
+second chance. Larger values restore fewer rays."""
 ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and late rounds change few rays."""
 _COARSE = 1e-4
@@ -230,8 +230,8 @@ def supported(rays: Rays, association: Association, map_T_camera: Floats, positi
 
 
 def widening(residual: Floats, landmark: Ints, count: int) -> Floats:
-    """Return the factor (N,) >= 1 by which the covariance of each landmark grows if its rays miss it by more than their
-    noise.
+    """Return the factor (N,) >= 1 on the covariance of each landmark. It is above 1 if rays miss the landmark by more than
+    their noise.
 
     The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) in units of the noise
     of the settings.

@@ -158,8 +158,9 @@ def correlated_factor(solved: SolvedGraph, landmarks: Ints, covariance: Floats) 
     """Return the correlated errors of landmarks (n,), as a factor (n, 3, m), m, of their joint covariance.
 
     covariance: (n, 3, 3) m^2 of the landmarks. A few products with the joint covariance find its strongest directions
-    (subspace iteration), so the time grows with the number of landmarks, not with its square. The factor comes from the
-    Nystroem approximation, which is nowhere above the joint covariance. m is 0 if the linear system is indeterminate.
+    (subspace iteration). So the time grows with the number of landmarks, not with the square of this number. The factor
+    comes from the Nystroem approximation, which is nowhere above the joint covariance. m is 0 if the linear system is
+    indeterminate.
     """
     none = np.zeros((len(landmarks), 3, 0))
     inverse = solved.inverse

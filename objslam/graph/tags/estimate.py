@@ -97,8 +97,8 @@ def with_objects(
 def _marginals(
     values: gtsam.Values, covariances: Covariances, tags: TagCorners, which: Ints, ledger: Ledger
 ) -> Floats | None:
-    """Return the covariances (t, 7, 7) of the rotation (rad) and position (m) of fiducials in their own frames, and of the
-    logarithm of their side. If the linear system is indeterminate, return None, and warn in the ledger."""
+    """Return the covariances (t, 7, 7) of fiducials: rotation (rad) and position (m) in their own frames, then the logarithm
+    of their side. If the linear system is indeterminate, return None, and warn in the ledger."""
     covariance = np.zeros((len(which), 7, 7))
     free = np.flatnonzero(~np.isfinite(tags.side[which]))
     keys = [(TAG0 + t,) for t in which.tolist()] + [(TAG_SIZE0 + t,) for t in which[free].tolist()]

@@ -12,9 +12,8 @@ from objslam.core.statistics import CAUCHY_K
 from objslam.graph.factors.bearing import tangent_basis
 
 _BEHIND = 1e-3
-"""The least part of the way from the camera to a corner that must be along the corner's ray, as a share of the distance. A
-corner with a smaller share counts as behind the camera: it costs `_BEHIND_COST` and has no gradient. A larger share counts
-more corners as behind."""
+"""The least depth of a corner along its ray, as a share of its distance from the camera. A corner with a smaller share
+counts as behind the camera: it costs `_BEHIND_COST` and has no gradient. A larger share counts more corners as behind."""
 _BEHIND_COST = 1e6
 """The squared deviation of a corner behind its camera. A larger value excludes such poses more surely."""
 _DAMPING = 1e-3
@@ -187,8 +186,8 @@ def _linearised(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, F
 
 
 def _jacobians(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Floats, Floats, Bools]:
-    """Return the derivatives (V, 8, 7) of the residuals of views by their squares, the same times the weights of Cauchy's
-    loss, the residuals (V, 4, 2), and which corners (V, 4) are ahead."""
+    """Return four arrays: the derivatives (V, 8, 7) of the residuals of views by their squares, these derivatives times the
+    weights of Cauchy's loss, the residuals (V, 4, 2), and which corners (V, 4) are ahead of the camera."""
     count, rotation = len(squares.side), squares.pose[:, :3, :3]
     residual, by_point, ahead = _residuals(seen, squares.corners)
     local = squares.shape * squares.side[:, None, None]
