@@ -38,8 +38,8 @@ class Sides:
     alike: (C, C) the correlation between the errors of two sides. mean: (C, A) rad, the mean angle by which the rays of a
     side miss the object, along A axes (azimuth and elevation). white: (C,) rad, the standard deviation of this mean if the
     rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset: (C, A,
-    3) rad, the derivative of the mean by an offset that all boxes of the side have, as a share of the object's size. pull:
-    (C, 3, 3) m, the derivative of the object's position by this offset.
+    3) rad, the derivative of the mean by an offset of all boxes of the side. The offset is a share of the object's size.
+    pull: (C, 3, 3) m, the derivative of the object's position by this offset.
     """
 
     alike: Floats

@@ -79,8 +79,8 @@ def shows_second_object(
 
 
 def _drawn_twice(rays: Rays, association: Association) -> Bools:
-    """Return which rays (R,) have the centre of their box inside the box of their label's object in the same keyframe, or
-    the centre of that box inside their own box."""
+    """Return which rays (R,) have a box that is drawn around the object of their label. In the same keyframe, the object has
+    a box of its own, and the centre of one of the two boxes is inside the other box."""
     held = np.flatnonzero(association.object >= 0)
     key = rays.keyframe * len(rays.label_names) + rays.label
     order = held[np.argsort(key[held], kind="stable")]

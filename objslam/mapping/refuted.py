@@ -36,10 +36,10 @@ _MORE = 0.05
 """A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
 more findings."""
 _QUIETER = 0.5
-"""If a solve explains the boxes only with noise, a finding stands if its corrected log needs at most this share of the
-noise. A larger share refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with mirrored images,
-because with these the path must turn the other way. It has 0.15 of the noise that it has with the identity for
-base_T_camera, but 2.9 times the noise in the settings."""
+"""A solve may explain the boxes only with noise. Then a finding stands if its corrected log needs at most this share of the
+noise. A larger share refutes fewer findings. Examples from a clean MRCLAM robot: it needs 0.17 of the noise that its log
+with mirrored images needs, because there the path must turn the other way. It needs 0.15 of the noise that its log with the
+identity for base_T_camera needs, but 2.9 times the noise in the settings."""
 _IN_BOTH = 0.4
 """The least share of rays of common objects at which the halves of a log agree. Common objects are seen in both halves. The
 share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs
@@ -50,12 +50,12 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
     """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
 
     solution: of the unchanged log. It explains boxes only if its noise is near the settings. The test depends on the basis
-    of a finding. "boxes": the finding is wrong if the solution explains the boxes, or if a solution of the log without the
-    fault explains them no better. If the solution needs noisy odometry, the log without the fault must need it too. If the
-    log without the fault needs noisy odometry, the finding is right only if the solution needs far more noise, of any kind.
-    If neither of the two explains the boxes, the solves show nothing, and a finding stands if the quick check is clear.
-    "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree on the objects.
-    "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
+    of a finding. "boxes": the finding is wrong if the solution explains the boxes. It is also wrong if a solution of the log
+    without the fault explains the boxes no better. If the solution needs noisy odometry, the log without the fault must need
+    it too. If the log without the fault needs noisy odometry, the finding is right only if the solution needs far more
+    noise, of any kind. If neither of the two explains the boxes, the solves show nothing, and a finding stands if the quick
+    check is clear. "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree
+    on the objects. "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
     """
     kept = tuple(
         one

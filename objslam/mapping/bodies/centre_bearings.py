@@ -35,10 +35,10 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
 
     Nothing is added to a ray that the solve rejects.
-    The bearings of an object that would be lost stay at the centres of its boxes. If no body shifts its bearings enough
-    (`_WORTH`), or if an object would still be lost, the estimate is as before, and the second value is None. A second
-    round, from the bodies at the new poses, would change the path by 1 mm and the objects by less than their noise (24
-    simulated drives between large objects).
+    The bearings of an object that would be lost stay at the centres of its boxes. The estimate stays as before, and the
+    second value is None, in two cases: no body shifts its bearings enough (`_WORTH`), or an object would still be lost.
+    There is no second round, from the bodies at the new poses. In 24 simulated drives between large objects, it would change
+    the path by 1 mm, and the objects by less than their noise.
     """
     if not state.settings.bodies.use:
         return estimate, None

@@ -32,7 +32,7 @@ fewer logs."""
 def refuse_shares(log: Log) -> None:
     """Raise a LogError if all boxes of a camera lie between 0 and 1: they are shares of the image.
 
-    No detector finds boxes of less than a pixel in one corner of the image, so the fault is certain, and no box is of use.
+    No detector finds boxes of less than a pixel in one corner of the image. So the fault is certain, and no box is of use.
     """
     for one in log.cameras:
         found, size = one.detections, one.camera.size.astype(int).tolist()

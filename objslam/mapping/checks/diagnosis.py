@@ -29,9 +29,9 @@ from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
 """A run tries hypotheses if the score (`Agreement.score`) at poses of a localisation is below this. With wrong input, most
-boxes may still fit, but only with several points for each thing, and each point costs a part of the score. At poses by
-odometry, each window needs its own point for each thing. So the share of fitting boxes is compared there, not the score.
-With a larger value, more runs take a few seconds longer."""
+boxes may still fit, but only with several points for each thing. Each point costs a part of the score. At poses by odometry,
+each window needs its own point for each thing. So the share of fitting boxes is compared there, not the score. With a larger
+value, more runs take a few seconds longer."""
 _FITTING = 0.82
 """If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9.
 With a larger value, more runs take a few seconds longer."""
@@ -151,8 +151,10 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 
 
 def _corrected(part: Part, found: Agreement | None, settings: Settings) -> tuple[float, str]:
-    """Return the score of a log without the small errors that a run in this mode estimates from given poses, 0 if there are
-    none. Also return, in words, the errors that are too large for a usual camera."""
+    """Return the score of a log without small errors, and the errors, in words, that are too large for a usual camera.
+
+    The small errors are those that a run in this mode estimates from given poses. If there are none, the score is 0.
+    """
     estimated = _estimated(part, settings)
     if found is None or part.drifts or settings.mode == "joint" or not estimated:
         return 0.0, ""
@@ -197,7 +199,8 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
 
 
 def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
-    """Return findings if the boxes of some frames, or of one half, fit worse than the others, or if a camera was turned."""
+    """Return findings about parts that differ: some frames fit worse than others, one half fits worse than the other, or
+    somebody turned a camera."""
     middle = float(np.median(found.keyframes.stamps))
     late = found.keyframes.stamps[found.rays.keyframe] > middle
     long = bool(min(late.sum(), (~late).sum()) >= _FEWEST)

@@ -17,8 +17,8 @@ _RARE = 10.0
 """If the median time between two poses or frames is above this, s, their stamps are probably not in s. At 10 s, a robot
 hardly measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
 _CRAWL = 0.01
-"""A robot that is slower than this, m/s, all along its path probably has stamps that are not in s. Even a lawn mower is 30
-times as fast. A larger value accuses more robots that hardly drive."""
+"""If a robot is slower than this, m/s, all along its path, its stamps are probably not in s. Even a lawn mower is 30 times
+as fast. A larger value accuses more robots that hardly drive."""
 
 
 def check_stamps(log: Log) -> Finding | None:

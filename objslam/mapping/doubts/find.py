@@ -50,9 +50,9 @@ def find_doubts(result: RunResult) -> Doubts:
 def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
-    A map with objects that are more likely doubles than not is not called good. The same holds for a map that holds a place
-    twice, for a map with an object of many sizes, and for a map without an object where many boxes of a label meet. A label
-    without an object is named, but its boxes may be false, so the level stays.
+    A map is not called good in four cases: some objects are more likely doubles than not, a place is in the map twice, an
+    object has many sizes, or many boxes of a label meet where the map has no object. A label without an object is named, but
+    its boxes may be false, so the level stays.
     """
     found = find_doubts(result)
     doubts = tuple(in_words(result, found.pairs, found.splits, found.groups))
@@ -96,7 +96,8 @@ def _of_doubles(doubles: int) -> list[str]:
 
 
 def _of_lost_things(groups: BoxGroups, result: RunResult) -> list[str]:
-    """Return a reason for each label with a thing that is not in the map, though many of its boxes meet in one place."""
+    """Return a reason for each label with a lost thing: many boxes of the label meet in one place, but the map has no object
+    there."""
     if not len(groups):
         return []
     labels = result.rays.label_names

@@ -65,8 +65,8 @@ def find_pairs(evidence: Evidence) -> Pairs:
     """Return the pairs of objects that may be one.
 
     Two explanations are compared. If they are one object, the covariance of their offset is the sum of their covariances,
-    and hardly any frame shows both (`TOGETHER`). If they are two, the second lies anywhere among the objects of its label,
-    and the frames that have both in view show both. Objects that fill one space are candidates too, because two things
+    and hardly any frame shows both (`TOGETHER`). If they are two objects, the second lies anywhere among the objects of its
+    label, and each frame with both in view shows both. Objects that fill one space are candidates too, because two things
     cannot do so.
     """
     state, covariance = evidence.state, evidence.covariance

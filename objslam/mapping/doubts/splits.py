@@ -54,8 +54,8 @@ def find_splits(evidence: Evidence) -> Splits:
     """Return the objects that may be two.
 
     The offsets between an object and its rays have a direction along which they scatter most. Two-means along it gives two
-    groups. They are two things if they lie far apart compared with their own scatter, with the noise of the rays of this
-    label in this log, and with the size of the object.
+    groups. The groups are two things if the distance between them is large compared with three lengths: their own scatter,
+    the noise of the rays of this label in this log, and the size of the object.
     """
     state, count = evidence.state, evidence.state.count
     obs, owner, ray = state.obs, state.owner, state.assigned

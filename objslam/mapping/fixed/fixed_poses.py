@@ -29,7 +29,7 @@ _ROUNDS = 12
 """The most rounds of association and calibration. Two or three are usual. A clock that is off by a second moves by 0.03 s in
 a round, so it reaches its bound after ten rounds. A larger number is slower for logs that do not settle."""
 _SAME = 0.05
-"""An association is repeated only if ray directions, or their noise, differ from those of each earlier round by more than
+"""An association is repeated only if ray directions or their noise are new: they differ from each earlier round by more than
 this share of the noise. A smaller change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A larger
 share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the association
 can swing between two states for ever."""

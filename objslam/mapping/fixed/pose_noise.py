@@ -72,10 +72,11 @@ def noise_in_frames(
 ) -> tuple[float, float]:
     """Return the factors (at least 1) on `localization.yaw` and `localization.xy` that agree best with the rays.
 
-    A variance component model (Searle, Casella and McCulloch 1992): the miss of a ray, seen from above, is the sum of its
-    own noise, of the error of its pose's heading, and of the error of the pose's place as seen from the object. The three
-    sizes are those of the largest posterior density. Both factors are 1 unless the rays refute the settings. Only poses with
-    rays to two objects and more count, because a single ray does not tell which of the three errors it has.
+    A variance component model (Searle, Casella and McCulloch 1992): seen from above, the miss of a ray is a sum of three
+    errors: the noise of the ray, the error of the heading of its pose, and the error of the place of its pose, as seen from
+    the object. The sizes of the three errors are those of the largest posterior density. Both factors are 1 unless the rays
+    refute the settings. Only poses with rays to two objects and more count, because a single ray does not tell which of the
+    three errors it has.
 
     positions: (N, 3) m, NaN for an object without a position.
     """

@@ -18,9 +18,10 @@ _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
 _SQUARES = (320, 416, 512, 640)
 """The sides (px) of square images that detectors often use."""
 _CLIPPED, _AT_EDGE = 0.05, 1.0
-"""Boxes are in px of the calibration's images if at least this share of them ends within this distance (px) of the right or
-the lower edge, and hardly any beyond. A detector clips boxes there. In another unit, boxes end there by chance only. With a
-larger share, more wrong sizes are tried. With a larger distance, fewer are tried."""
+"""A detector clips boxes at the right and the lower edge of the image. So boxes are in px of the calibration's images if at
+least the share `_CLIPPED` of them ends within `_AT_EDGE` (px) of an edge, and hardly any box ends beyond it. In another
+unit, boxes end there by chance only. With a larger share, more wrong sizes are tried. With a larger distance, fewer are
+tried."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 """The tried clock offsets (s). `small_errors` finds smaller offsets."""
 

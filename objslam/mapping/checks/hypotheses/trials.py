@@ -41,17 +41,17 @@ _RIVAL = 0.02
 different random pairs differ by as much. A larger value names more mounts."""
 
 _BOTH_WAYS = 0.8
-"""Two shifts of a clock contradict each other if one is earlier, one is later, and the worse has at least this share of the
-score of the better. A clock has one error. In simulated logs with a wrong clock, no shift the other way has more than 0.61
-of the best score. A smaller share names fewer clocks."""
+"""An earlier and a later clock contradict each other if the worse of the two has at least this share of the score of the
+better. A clock has one error. In simulated logs with a wrong clock, no shift the other way has more than 0.61 of the best
+score. A smaller share names fewer clocks."""
 _CHANCE = 90.0
 """The percentage of all turned mounts that have at most the score of chance. With a larger percentage, more agreement counts
 as chance."""
 _BEYOND, _FAR_BETTER = 1.3, 1.5
 """A mount is clear if its score is at least `_BEYOND` times the score by chance, and at least `_FAR_BETTER` times the score
-of the unchanged log. In logs of five kinds of simulated robots and three real ones, with odometry alone and a turned camera,
-the right turn has 1.2 to 3.7 times the score of chance, mostly more than 1.4. No mount has more than 1.34 times the score of
-a clean log. Larger multiples keep fewer findings that no solve supports."""
+of the unchanged log. Logs of five kinds of simulated robots and of three real robots were tried, with odometry alone and a
+turned camera. The right turn has 1.2 to 3.7 times the score of chance, mostly more than 1.4. No mount has more than 1.34
+times the score of a clean log. Larger multiples keep fewer findings that no solve supports."""
 
 
 @dataclass(frozen=True)
