@@ -177,8 +177,8 @@ def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
-    between both, all in m."""
+    """For each far point (F, 2), return the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
+    between the two. All are in m."""
     centre, half = (low + high) / 2, (high - low) / 2
     at = centre + (points - centre) * (_EDGE / (np.abs(points - centre) / half).max(axis=1, initial=1e-9))[:, None]
     return at, np.linalg.norm(points - at, axis=1)
