@@ -136,7 +136,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the indices (B, H) `first` < `second` of the two rays of each pair among the rays of an object, and whether the
+    """Return the two rays of each pair, as indices (B, H) `first` < `second` among the rays of an object, and whether the
     pair exists. number: (B,) rays of each object. which, jitter: (H,) the indices and the jitter of the hypotheses."""
     xp = module_of(number)
     n = as_type(number[:, None], jitter)

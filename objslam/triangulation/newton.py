@@ -1,7 +1,7 @@
 """Newton's method for Eq. 1, for all objects of a block at once.
 
-The distance d from a line along n has the gradient u = q / d and the Hessian t t^T / d, where q is the offset of the point
-from the line and t = n x u. The unit of length is about the mean distance of an object from its lines.
+Let q be the offset of the point from a line along n, and d its length, the distance. The distance has the gradient u = q / d
+and the Hessian t t^T / d, where t = n x u. The unit of length is about the mean distance of an object from its lines.
 """
 
 from __future__ import annotations

@@ -72,8 +72,7 @@ def known_sizes(
 ) -> Prior:
     """Return the prior with known sizes (length, width, height), m, of labels. names: the label of each body.
 
-    The yaw of a body stays free, because only its aspect is drawn towards the known aspect, at the yaw that the fit has
-    found.
+    The yaw of a body stays free. Only its aspect is drawn towards the known aspect, at the yaw that the fit has found.
     """
     mean, information = prior.mean.copy(), prior.information.copy()
     for body, name in enumerate(names):

@@ -1,9 +1,9 @@
 """The residuals of boxes against bodies, and their derivatives.
 
-A plane with the outward unit normal n through the camera m touches the body with the centre c and the support h(n) if
-n . (c - m) + h(n) = 0. An ellipsoid with the matrix M has h = sqrt(n^T M n), so this is the equation of its dual quadric
-(Hartley and Zisserman 2004, section 8.3). If the left side is not 0, it is the length, m, by which the body reaches beyond
-the plane. Divided by the distance of the touched point, it is an angle.
+Let a plane go through the camera m, with the outward unit normal n. Let a body have the centre c and the support h(n). The
+plane touches the body if n . (c - m) + h(n) = 0. For an ellipsoid with the matrix M, h = sqrt(n^T M n), and this is the
+equation of its dual quadric (Hartley and Zisserman 2004, section 8.3). If the left side is not 0, it is the length, m, by
+which the body reaches beyond the plane. Divided by the distance of the touched point, it is an angle.
 """
 
 from __future__ import annotations
