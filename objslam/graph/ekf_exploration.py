@@ -30,7 +30,7 @@ _STRETCH = 150
 drifted by `HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A larger number
 keeps false landmarks longer."""
 _RECENT = 300
-"""The number of frames after its first ray during which a landmark can be tied to an older one. A larger number is
+"""During this number of frames after its first ray, a landmark can be tied to an older landmark. A larger number is
 slower."""
 _SURE = 4.0
 """The best assignment with a match is compared with the best assignment without it. The match is sure if the log odds are at

@@ -102,8 +102,7 @@ def _in_camera(keyframes: Keyframes, last: Ints, covariance: Floats) -> Floats:
 
 
 def below_ties(ties: Ints, count: int) -> Bools:
-    """Return which motions (count - 1,) between consecutive keyframes lie between the two keyframes of one of the ties (T,
-    2)."""
+    """Return which motions (count - 1,) between consecutive keyframes are below one of the ties (T, 2)."""
     ends = np.zeros(count, dtype=np.int64)
     np.add.at(ends, ties[:, 0], 1)
     np.add.at(ends, ties[:, 1], -1)

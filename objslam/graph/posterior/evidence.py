@@ -26,12 +26,12 @@ def log_evidence(
     """Return the log evidence for an association, up to a constant that all associations of the same rays share.
 
     Args:
-        measured: with the noise at which the graph was solved.
-        association: of the rays.
+        measured: the measurements, with the noise at which the graph was solved.
+        association: the landmark of each ray.
         used: (R,) the rays in the graph. All others are strays.
         distance: (n,) m, from the origin of each used ray to its landmark.
         solved: the graph at its solution, with its Gaussian noise.
-        cost: of the solution, half the sum of the squared residuals, with the robust losses.
+        cost: the cost of the solution, which is half the sum of the squared residuals, with the robust losses.
 
     Returns:
         The log evidence, -inf if the linear system is indeterminate.

@@ -45,7 +45,7 @@ def with_objects(
         values: the solved values of the graph. covariances: those of its variables.
         wider: (M,) the factor on the covariance of each landmark.
         sensitivity: (M, 3, P) of the landmarks by the shared errors of `estimate.calibration`, None without such errors.
-        ledger: for a warning if the graph has no covariances.
+        ledger: gets a warning if the graph has no covariances.
     """
     which = tags.tied(np.flatnonzero(estimate.solved))
     corners = estimate.positions[tags.landmarks]

@@ -132,7 +132,7 @@ def _middle(seen: Corners) -> Floats:
 
 
 def with_pose_noise(seen: Corners, squares: Squares, angle: Floats, place: Floats) -> Corners:
-    """Return views whose cameras have noise in their rotation, angle (V,) rad, and position, place (V,) m, per axis.
+    """Return views whose cameras have noise. angle: (V,) rad, of the rotation, place: (V,) m, of the position, per axis.
 
     The noise of a camera moves the four corners of its view together: the residuals have the covariance sigma^2 I + J S J^T.
     J is taken at the given squares (H), so it is the same for each pose that is then compared.
