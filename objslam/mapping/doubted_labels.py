@@ -89,9 +89,9 @@ def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, e
     of its rays.
 
     Args:
-        rays: with their labels.
-        association: of the rays. A second box of a label in one frame may have no object.
-        keyframes: of the rays.
+        rays: the rays, with their labels.
+        association: the object of each ray. A second box of a label in one frame may have no object.
+        keyframes: the keyframes of the rays.
         estimate: the solved map of one object for each label.
     """
     noise = estimate.noise
@@ -114,8 +114,8 @@ def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
     witnesses.
 
     Args:
-        rays: with their labels.
-        keyframes: of the rays.
+        rays: the rays, with their labels.
+        keyframes: the keyframes of the rays.
     """
     stamps = keyframes.stamps[rays.keyframe]
     order = np.lexsort((stamps, rays.label))

@@ -55,7 +55,7 @@ def may_be_by_label(settings: Settings, rays: Rays) -> bool:
 def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> Floats:
     """Return the angle (R,), rad, between each ray and the object of its label, NaN if the object has no position.
 
-    estimate: of one object for each label. map_T_camera: (K, 4, 4) the solved poses.
+    estimate: with one object for each label. map_T_camera: (K, 4, 4) the solved poses.
     """
     origins, directions = rays.in_map(map_T_camera)
     return angles_off(origins, directions, estimate.positions[np.searchsorted(np.unique(rays.label), rays.label)])
@@ -67,7 +67,8 @@ def shows_second_object(
     """Return whether the other boxes of a label meet in a point of their own, more closely than by chance.
 
     These are the boxes without an object. A box that agrees with the object of its label, or that is drawn around the same
-    thing in the same keyframe, shows no second object. keyframes: of the rays. map_T_camera: (K, 4, 4) the solved poses.
+    thing in the same keyframe, shows no second object. keyframes: the keyframes of the rays. map_T_camera: (K, 4, 4) the
+    solved poses.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
@@ -133,7 +134,8 @@ def noise_explains(
     With too little noise in the settings, poses cannot move far enough. Then the rays of one object look like rays of
     several. So the noise is estimated, even if the settings fix it, and the labels are judged again.
 
-    estimate: in which some label has many rejected rays. errors: the shared errors of the log. solve: solves once.
+    estimate: a solution in which some label has many rejected rays. errors: the shared errors of the log. solve: solves
+    once.
     """
     errors = errors.with_unknown_noise()
     before = NOMINAL if estimate.noise is None else estimate.noise

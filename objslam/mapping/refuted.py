@@ -49,13 +49,14 @@ have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
     """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
 
-    solution: of the unchanged log. It explains boxes only if its noise is near the settings. The test depends on the basis
-    of a finding. "boxes": the finding is wrong if the solution explains the boxes. It is also wrong if a solution of the log
-    without the fault explains the boxes no better. If the solution needs noisy odometry, the log without the fault must need
-    it too. If the log without the fault needs noisy odometry, the finding is right only if the solution needs far more
-    noise, of any kind. If neither of the two explains the boxes, the solves show nothing, and a finding stands if the quick
-    check is clear. "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree
-    on the objects. "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
+    solution: the solution of the unchanged log. It explains boxes only if its noise is near the settings. The test depends
+    on the basis of a finding. "boxes": the finding is wrong if the solution explains the boxes. It is also wrong if a
+    solution of the log without the fault explains the boxes no better. If the solution needs noisy odometry, the log without
+    the fault must need it too. If the log without the fault needs noisy odometry, the finding is right only if the solution
+    needs far more noise, of any kind. If neither of the two explains the boxes, the solves show nothing, and a finding
+    stands if the quick check is clear. "halves": the finding is wrong if the solution explains the boxes of both halves, or
+    if both halves agree on the objects. "frames": the finding is wrong if the solution explains similar shares of the rays
+    in all frames.
     """
     kept = tuple(
         one

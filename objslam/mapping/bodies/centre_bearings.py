@@ -73,7 +73,7 @@ def _solve(
 ) -> Estimate:
     """Solve poses and objects once more, from the estimate, with `shift` (R, 3) added to the measured directions.
 
-    keyframes, rays: those of the state without the shared errors of the estimate.
+    keyframes, rays: those of the state, with the shared errors of the estimate removed.
     """
     from objslam.graph import batch_solver
 

@@ -47,7 +47,7 @@ def refuse_shares(log: Log) -> None:
 def check_boxes(log: Log, ledger: Ledger) -> list[Finding]:
     """Return the findings about the boxes of a log, from their corners alone.
 
-    ledger: of the reading of the log, because most readers drop the boxes that have no area.
+    ledger: from the reading of the log. It counts the boxes without area, because most readers drop these boxes.
     """
     found: list[Finding] = []
     read = [c.detections.boxes for c in log.cameras if c.detections is not None]

@@ -95,7 +95,7 @@ def diagnose(
 ) -> Diagnosis:
     """Return the diagnosis of a log. thorough: whether to try hypotheses even if all looks right.
 
-    ledger: of the reading of the log. LogError if stamps are not in s, or boxes not in px.
+    ledger: from the reading of the log. LogError if stamps are not in s, or boxes not in px.
     """
     if log.localization is None and log.odometry is None:
         return Diagnosis()

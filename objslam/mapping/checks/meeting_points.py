@@ -25,7 +25,8 @@ _NARROW = 0.9
 """The remaining rays of a label show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction. With
 a smaller share, false rays are excused too."""
 _NEAREST = 0.25
-"""The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself."""
+"""The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself. A larger distance
+loses points near a camera."""
 _MOST_POINTS = 40
 """The most points of one label. More points explain more boxes by chance."""
 _REFITS = 2

@@ -26,7 +26,7 @@ _JUMP = 5.0
 less often."""
 _JUMP_TURN = 20.0
 """The turn rate (rad/s) above which a step of an otherwise slow path may be a jump. As in a live session, it is 4 rad/s for
-each m/s of live.max_speed."""
+each m/s of live.max_speed. A larger rate warns less often."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
 _ACCELERATION = 5.0

@@ -8,16 +8,17 @@ from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 
 _FEWEST = 40
-"""The fewest ranges that are judged. A few ranges show a scale error poorly."""
+"""The fewest ranges that are judged. A few ranges show a scale error poorly. A larger number judges fewer logs."""
 _POINTS = 4
-"""The fewest points whose ranges are judged. A few points may be at wrong positions by chance."""
+"""The fewest points whose ranges are judged. A few points may be at wrong positions by chance. A larger number judges fewer
+logs."""
 _PARALLAX = np.radians(20.0)
 """The least angle (rad) between the rays of a point for a reliable distance. A larger angle leaves fewer points."""
 _SPREAD = 0.1
 """The largest median deviation of the points' ratios from their median, as a share. A wrong unit or scale is equal for all
-points. The ratios of points at wrong positions differ."""
+points. The ratios of points at wrong positions differ. A larger value also judges such points."""
 _SPREAD_OF_UNITS = 0.3
-"""`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`)."""
+"""`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`). A larger value also judges points at wrong positions."""
 _LEAST = 0.04
 """The least error of the ranges that is reported, as a share. Smaller errors also come from the depth of things and from
 cameras that are turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger
@@ -41,7 +42,8 @@ _ALONE = 1.1
 """The crowd (`Part.crowd`) up to which all boxes of a label in a window count as boxes of one thing. A larger value tests
 the ranges of more labels by whether they end at one point."""
 _LEAST_BY_ODOMETRY = 0.18
-"""The least error of the ranges for poses by odometry. The joint mode itself corrects several percent."""
+"""The least error of the ranges for poses by odometry. The joint mode itself corrects several percent. A larger error warns
+less often."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
 """The tried factors on ranges. More factors find the best one more exactly."""
 _TELLS = 0.5

@@ -103,7 +103,8 @@ class SmallErrors:
         return ", ".join(parts)
 
     def remedy(self, settings: Settings) -> str:
-        """Return the options with which a run estimates the harmful errors. settings: of a run without these options."""
+        """Return the options with which a run estimates the harmful errors. settings: the settings of a run without these
+        options."""
         held = [kind(name) for name in self.harmful if prior_sigma(name, settings) == 0]
         given = dict.fromkeys("translation" if what in ("x", "y") else what for what in held)
         options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
@@ -169,8 +170,8 @@ def find_small_errors(
 def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agreement, settings: Settings) -> SmallErrors:
     """Return the errors of a log. They are `errors`, with an offset (s) added to each clock.
 
-    errors: of the same log with the stamps of its frames later by the offset. None if the search found none. Then the clocks
-    of the cameras are the only errors.
+    errors: the errors of the same log with the stamps of its frames later by the offset. None if the search found none. Then
+    the clocks of the cameras are the only errors.
     """
     own = shared(log, found.keyframes, found.rays, settings)
     values = dict.fromkeys((name for name in own.names if kind(name) == "clock"), offset)

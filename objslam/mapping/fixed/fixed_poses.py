@@ -109,7 +109,7 @@ class FixedPoses:
     def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
         """Add the objects that can be found from few rays, if the poses are localised and the settings allow it.
 
-        estimate: of the objects, None if there are none. more: as in `associate`."""
+        estimate: the estimate of the objects, None if there are none. more: as in `associate`."""
         from objslam.association.few_rays.additional_objects import add_few_ray_objects
         from objslam.graph.fixed_pose_triangulation import pose_noise
 

@@ -22,7 +22,8 @@ _MOST_POSES = 500
 """The most poses that count, spread evenly. They determine a factor to 3 %. More poses are more exact and slower."""
 _BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])
 """The logarithms of the least and largest factors on the noise of rays, headings and places. The noise of poses never falls
-below the settings: a few frames with small errors do not promise small errors of the other frames."""
+below the settings: a few frames with small errors do not promise small errors of the other frames. Wider bounds allow
+noisier poses."""
 _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
 """The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
 _CHANCE = 1e-3
@@ -44,8 +45,8 @@ class _Sums:
     """Sums over the rays of each of K poses, in units of the nominal noise of rays.
 
     shared: (K, 3, 3) the information about an error of the pose: heading (rad), x and y (m). pulled: (K, 3) this information
-    times the error that fits best. squares: of all rays, their sum. rays: their number. noise: (3,) the nominal standard
-    deviations of the error. prior: the weight of the nominal noise, as a number of residuals.
+    times the error that fits best. squares: the sum of the squared misses of all rays. rays: the number of rays. noise: (3,)
+    the nominal standard deviations of the error. prior: the weight of the nominal noise, as a number of residuals.
     """
 
     shared: Floats
@@ -118,7 +119,7 @@ def noise_in_frames(
 
 def _summed(miss: Floats, by_pose: Floats, pose: Ints, noise: tuple[float, float], settings: Settings) -> _Sums:
     """Return the sums over the rays of each pose. miss: (R,), by_pose: (R, 3) its derivative by the error of the pose, both
-    in standard deviations of the rays. noise: of headings, rad, and of places, m."""
+    in standard deviations of the rays. noise: the noise of headings, rad, and of places, m."""
     count, pose = len(np.unique(pose)), np.unique(pose, return_inverse=True)[1]
     shared, pulled = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(shared, pose, by_pose[:, :, None] * by_pose[:, None, :])

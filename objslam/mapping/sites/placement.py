@@ -32,8 +32,8 @@ class Part:
 
     objects: the map, in the frame of one of the sessions. Its objects are those of `tracks`, in the same order: first all
     objects that are present in a session, then the gone objects. tracks: each object as its sessions have it.
-    site_T_session: how each session lies in this frame. log_odds: of the registration that tied each session to the others,
-    NaN for the session that gives the frame.
+    site_T_session: how each session lies in this frame. log_odds: the log odds of the registration that tied each session to
+    the others, NaN for the session that gives the frame.
     """
 
     objects: ObjectMap

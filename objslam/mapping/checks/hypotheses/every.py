@@ -14,9 +14,10 @@ from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_camera
 from objslam.mapping.checks.hypotheses.mounts import mounts, w_last
 
 _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
-"""The tried sizes of the images in which the boxes were found, as multiples of the image size in the calibration."""
+"""The tried sizes of the images in which the boxes were found, as multiples of the image size in the calibration. More sizes
+take longer."""
 _SQUARES = (320, 416, 512, 640)
-"""The sides (px) of square images that detectors often use."""
+"""The sides (px) of square images that detectors often use. More sides take longer."""
 _CLIPPED, _AT_EDGE = 0.05, 1.0
 """A detector clips boxes at the right and the lower edge of the image. So boxes are in px of the calibration's images if at
 least the share `_CLIPPED` of them ends within `_AT_EDGE` (px) of an edge, and hardly any box ends beyond it. In another

@@ -130,10 +130,9 @@ def _turned_in_base(pose: Floats, turn: Floats) -> Floats:
 
 
 def _mirrored(pose: Floats, axis: int) -> Floats:
-    """Return a mount that looks where its mirror image looks. axis: of base, across which it is mirrored, 1 for y, 2 for z.
+    """Return a mount that looks where its mirror image looks. axis: the axis of base that is reversed, 1 for y, 2 for z.
 
-    A mirrored frame would be left-handed. So one axis of the mirrored camera is reversed: x for a mirror across y, y for a
-    mirror across z.
+    A mirrored frame would be left-handed. So one axis of the camera is reversed too: x with y of base, y with z of base.
     """
     base, camera = np.eye(3), np.eye(3)
     base[axis, axis] = camera[axis - 1, axis - 1] = -1.0
