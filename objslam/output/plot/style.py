@@ -16,7 +16,7 @@ from objslam.errors import printable
 RayKind = Literal["used", "rejected", "unexplained"]
 """The kind of a ray: used for its object, rejected as an outlier of its object, or unexplained by any object."""
 
-REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value.
+REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value. A larger value rejects more.
 _USUAL_REACH = 2.0  # Rays are drawn with this length, m, if no ray has an object.
 _SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
 _LUMINANCES = (0.09, 0.17)

@@ -85,9 +85,9 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
 def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
     """Return the indices of the rays for the pictures of an object, each with its kind.
 
-    best: up to `count` rays of `best_rays`. worst: of the other used rays, those with the largest residuals, in sigmas.
-    rejected: evenly chosen. There are up to half of `count` worst rays, rounded up, and the same number of rejected rays.
-    mine: (M,) the indices of the object's rays, in the order of time.
+    best: up to `count` rays of `best_rays`. worst: the other used rays with the largest residuals, in sigmas. rejected:
+    evenly chosen. There are up to half of `count` worst rays, rounded up, and the same number of rejected rays. mine: (M,)
+    the indices of the object's rays, in the order of time.
     """
     found: dict[int, Kind] = dict.fromkeys(best_rays(rays, mine, count).tolist(), "best")
     few = (count + 1) // 2 if count else 0

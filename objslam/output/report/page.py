@@ -156,7 +156,7 @@ def _unexplained(rays: RaysTable, crops: int) -> dict[str, dict[int, Kind]]:
 def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None) -> dict[str, Images]:
     """Return the images of each camera with corrected stamps: the clock offset that the run estimated is added.
 
-    images: by camera name. calibration: the entry of summary.json, None if the run estimated no shared errors.
+    images: the images by camera name. calibration: the entry of summary.json, None if the run estimated no shared errors.
     """
     found = calibration["parameters"] if calibration else {}
     clock = {name: found.get(f"{name}.clock", {"value": 0.0})["value"] for name in images}
