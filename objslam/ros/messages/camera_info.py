@@ -28,8 +28,9 @@ def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera
 
     If `rectified`, there is no distortion. The camera matrix is the left 3x3 part of P, or K if both P and D are zero. If
     not, K and D apply. R is then the rotation of frame_T_camera, because the header frame belongs to the rectified camera
-    (as in image_geometry). The camera is for the image after binning and region of interest. name: of the camera. topic: of
-    the message, for errors. Raises LogError if the camera is not calibrated or its distortion is invalid.
+    (as in image_geometry). The camera is for the image after binning and region of interest. name: the name of the camera.
+    topic: the topic of the message, for errors. Raises LogError if the camera is not calibrated or its distortion is
+    invalid.
     """
     values = _values(info, "P")[[0, 1, 2, 4, 5, 6, 8, 9, 10]] if rectified else _values(info, "K")
     if rectified and not values.any() and not _values(info, "D").any():  # P is unset. Without distortion, K is right.
