@@ -63,7 +63,8 @@ def is_journal(path: Path) -> bool:
 
 
 def holds_messages(file: Path, header: Header | None) -> bool:
-    """Return whether a journal has messages. header: of its last segment, which is `file`, None if it is damaged."""
+    """Return whether a journal has messages. header: the header of its last segment, which is `file`, None if the header is
+    damaged."""
     return header is not None and (header.number > 1 or file.stat().st_size > header.size)
 
 
