@@ -22,11 +22,12 @@ from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.point_to_lines import PointSolution, minimise_distances
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
-"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle."""
+"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle. With a
+larger angle, agreement counts as chance more rarely."""
 _NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score the same.
 _MOST_NOISE = 0.25  # Noise covers at most this share of the view. With a larger share, noisy rays agree with any point.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
-_MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end earlier if the agreement stops growing.
+_MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end if the agreement stops growing. More are slower.
 
 
 def fit_consensus(
@@ -38,7 +39,7 @@ def fit_consensus(
     far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
     within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
     the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. A `judged` (N,) object also
-    keeps all its rays if they agree within noise, because its rays do not meet by chance. hypotheses, jitter: for
+    keeps all its rays if they agree within noise, because its rays do not meet by chance. hypotheses, jitter: as in
     `best_pair`.
     """
     xp = module_of(bundle.origin)
@@ -187,8 +188,8 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
 
 
 def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the lowest log NFA (B, H) over all k, and the k-th lowest chance for this k. The rays that agree are the k rays
-    with the lowest chances. chance: (B, H, n) of each ray.
+    """Return the lowest log NFA (B, H) over all numbers k of agreeing rays, and the k-th lowest chance for this k. The
+    agreeing rays are those with the lowest chances. chance: (B, H, n) of each ray.
 
     NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
     and 3 of them determine the point. Each p counts for 2 coordinates.

@@ -20,9 +20,9 @@ improve a single-precision point."""
 _STEPS = 6
 """The most Newton steps in double precision. An object that needs more has a line through or near its solution."""
 _LINE_STEPS = 6
-"""The number of Newton steps along the nearest line."""
+"""The number of Newton steps along the nearest line. More steps are more exact and slower."""
 _SHORTER = 0.3
-"""The factor for a step that did not lower the cost enough."""
+"""The factor for a step that did not lower the cost enough. A larger factor shortens the step less."""
 _SINGLE, _DOUBLE = 2.0**-23, 2.0**-52
 """The relative distance between neighbouring numbers near 1, in single and in double precision."""
 _TINY = 1e-30

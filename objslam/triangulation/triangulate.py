@@ -78,7 +78,7 @@ def triangulate(
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.
         object_index: (R,) the object of each ray, -1 for none, of `count` objects.
         sigma: (R,) or one number, rad, the noise of a ray's angle along each perpendicular axis.
-        seed: of the random pairs of rays that are tried.
+        seed: the seed for the random choice of pairs of rays.
         ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
         range_bias: (R,) or one number, m, the standard deviation of the error that all ranges of an object share.
         position_sigma: m, the noise of the origins along each axis.
