@@ -70,10 +70,9 @@ def has_labels_of(one: JointState, other: JointState) -> bool:
 
 
 def needs_noisy_boxes(named: JointState, other: JointState) -> bool:
-    """Return whether a map with one object for each label needs far noisier boxes than another map of the same log.
+    """Return whether the map `named`, with one object for each label, needs far noisier boxes than another map of the log.
 
-    Then the map is not trusted, even if the other map has less evidence. The exploration of the other map may only have
-    missed a thing.
+    Then `named` is not trusted, even if `other` has less evidence. The exploration of `other` may only have missed a thing.
     """
     assert named.errors is not None
     assert other.errors is not None

@@ -46,9 +46,9 @@ class JointState:
 
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
-    (P,) their last values, None before the first solve. hold: whether they are known well enough to stay fixed until the
-    last solve. settled: whether no ray changed its object in the last round. doubted: the labels of which it is not clear
-    whether they name one object or several.
+    (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
+    until the last solve. settled: whether no ray changed its object in the last round. doubted: the labels of which it is
+    not clear whether they name one object or several.
     """
 
     frames: Keyframes
@@ -168,11 +168,12 @@ class JointState:
         return replace(chosen, rounds=self.rounds, settled=True)
 
     def relocalized(self) -> Self:
-        """Return the state after rounds along the most likely path through its map, if its rays are better `explained`.
+        """Return the state after rounds along the most likely path through its map, if they make the rays better
+        `explained`.
 
-        Rounds in turns keep a path that is bent onto wrong landmarks, because all its rays agree. So each round here begins
-        with the path that is most likely if any ray may belong to any landmark. Every second round holds the shared errors
-        and the noise, as they change little in one round.
+        The rounds of `alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each round
+        here begins with the path that is most likely if any ray may belong to any landmark. Every second round holds the
+        shared errors and the noise, as they change little in one round.
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return self
@@ -209,11 +210,11 @@ class JointState:
         return self.better(turns)
 
     def split(self) -> Self:
-        """Return the state after objects that may be two were split, if its rays are better `explained`.
+        """Return the state after a split of objects that may be two, if the split makes the rays better `explained`.
 
-        Rounds in turns do not separate two things that share one object, because the path is bent until all rays agree. They
-        also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles are split at
-        once. The solve takes the bend out of the path, and bundles of one thing are merged again.
+        The rounds of `alternated` do not separate two things that share one object, because the path is bent until all rays
+        agree. They also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles
+        are split at once. The solve takes the bend out of the path, and bundles of one thing are merged again.
         """
         assert self.association is not None
         _, direction = self.rays.in_map(self.solved_poses)

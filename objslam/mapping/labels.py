@@ -25,8 +25,8 @@ _AGREES = 3.0
 """A ray agrees with the object of its label if it is off by at most this many standard deviations. With a larger value,
 fewer boxes can show a second object."""
 _JUDGEMENTS = 2
-"""How often `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays finds too
-little noise, so a second solve finds more. A larger number is slower."""
+"""How many times `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays
+finds too little noise, so a second solve finds more. A larger number is slower."""
 _SAME_NOISE = 0.1
 """The relative change of the noise below which `noise_explains` does not solve again. A larger value ends sooner."""
 
@@ -64,11 +64,10 @@ def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> F
 def shows_second_object(
     rays: Rays, association: Association, estimate: Estimate, keyframes: Keyframes, map_T_camera: Floats, settings: Settings
 ) -> bool:
-    """Return whether the other boxes of a label meet in a point of their own, more closely than by chance.
+    """Return whether boxes of a label that have no object meet in a point of their own, more closely than by chance.
 
-    These are the boxes without an object. A box that agrees with the object of its label, or that is drawn around the same
-    thing in the same keyframe, shows no second object. keyframes: the keyframes of the rays. map_T_camera: (K, 4, 4) the
-    solved poses.
+    A box that agrees with the object of its label, or that is drawn around the same thing in the same keyframe, shows no
+    second object. keyframes: the keyframes of the rays. map_T_camera: (K, 4, 4) the solved poses.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 

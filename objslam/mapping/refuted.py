@@ -88,7 +88,7 @@ def _refuted(
     except ObjslamError:
         return unclear
     fits = _least_explained(other) >= _EXPLAINED and _noise(other, rays_only=True) <= _NOISE
-    if not fits:  # A solve may miss right boxes too, as when it takes two things for one. It is no evidence then.
+    if not fits:  # A solve may miss right boxes too, as when it takes two things for one. Such a solve is no evidence.
         return unclear
     quieter = _noise(other) <= _QUIETER * _noise(solution)
     if explained:  # A path that is free to bend explains boxes of a mirrored image too.

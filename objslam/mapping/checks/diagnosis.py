@@ -46,8 +46,8 @@ _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
 """The clock offsets (s) that are tried besides 0. The search for small errors starts from the offset that fits best. More
 offsets take longer."""
 _GAIN = 0.02
-"""The least growth of the score by a clock offset of `_CLOCKS`, and by the removal of the errors that the run does not
-estimate. A larger value reports fewer errors."""
+"""The least growth of the score that shows an error: by a clock offset of `_CLOCKS`, or by the removal of the errors that
+the run does not estimate. A larger value reports fewer errors."""
 
 
 @dataclass(frozen=True)

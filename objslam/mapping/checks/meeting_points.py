@@ -40,8 +40,8 @@ cache."""
 class Meeting:
     """The points in which R rays meet. point: (R,) the index into points of each ray, -1 for none. points: (N, 3) m.
 
-    fit: (R,) how well each ray fits, from 1 on its point to 0 from its tolerance on, and without a point. narrow: (R,)
-    whether a ray has no point because the rays of its label are nearly parallel, so that they neither meet nor miss.
+    fit: (R,) how well each ray fits: 1 on its point, 0 beyond its tolerance, 0 without a point. narrow: (R,) whether a ray
+    has no point because the rays of its label are nearly parallel, so that they neither meet nor miss.
     """
 
     point: Ints
@@ -204,7 +204,7 @@ def _nearly_parallel(rows: _Rows) -> Bools:
 def _tried_points(rows: _Rows, size: Ints, dice: Floats) -> tuple[Floats, Bools]:
     """Return the points (L, P, 3) where pairs of rays come closest, and which of them (L, P) are ahead of both cameras.
 
-    All pairs of a label are tried if there are few enough, else random ones.
+    All pairs of a label are tried if there are few enough, else random pairs.
     """
     tried = int(_tried(size).max())
     order = np.arange(tried)

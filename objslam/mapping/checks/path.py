@@ -51,12 +51,13 @@ _MOVING_PX = 12.0
 """The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves. A larger spread
 finds fewer frozen paths."""
 _LEAST_STEP = 0.01
-"""The noise (m) of a position. The direction of a motion is judged if the motion is more than three times as long. A larger
-value suits noisy poses."""
+"""The noise (m) of a position. The direction of a motion is judged if the motion is longer than three times this noise. A
+larger value suits noisy poses."""
 _PIECE = 1.0
 """The time (s) over which distances are compared. A longer time suits noisy poses."""
 _LEAST_PIECE = 0.3
-"""The least distance in a time of `_PIECE` that is compared, as a share of the longest one. Shorter distances are noise."""
+"""The least distance in a time of `_PIECE` that is compared, as a share of the longest distance. Shorter distances are
+noise."""
 _OTHER_SCALE = 0.1
 """The logarithm of the ratio between the distances by localisation and odometry, above which a run warns. Real odometry errs
 by up to 8 %. A larger value warns less often."""

@@ -19,7 +19,7 @@ _SCALES = (1.0, 3.0)
 pass nearby. Larger numbers find looser groups, and join different groups more often."""
 _LOOSE = 2.0
 """The second scale finds more rays than the first. If it finds more than this multiple, the rays only pass nearby, and do
-not meet. With a larger number, more loose groups count as narrow ones."""
+not meet. With a larger number, more loose groups count as groups that meet."""
 _AROUND = 4.0
 """The surroundings of a place end at this multiple of the distance up to which a ray passes it. A larger multiple gives a
 surer estimate of how many rays pass by chance, from a larger area."""
@@ -78,7 +78,7 @@ def _of_label(evidence: Evidence, mine: Ints, reach: float) -> Iterator[Ints]:
         scale = int(standing_out[0])
         place = int(odds[scale].argmax())
         open_[scale, place] = False
-        loose = np.flatnonzero(number[:, place] > _LOOSE * number[scale, place])  # They include the narrow crowd.
+        loose = np.flatnonzero(number[:, place] > _LOOSE * number[scale, place])  # A loose crowd includes the narrow one.
         scale = max([scale, *loose.tolist()])
         group = _gathered(obs, mine, free, places[place], inside[scale, place], _SCALES[scale] * radius)
         if group.sum() >= _FEWEST:

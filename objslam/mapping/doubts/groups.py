@@ -58,8 +58,8 @@ class BoxGroups:
     objects of its label, 0 if unknown. way: (G,) m, how far a moving point that explains the rays best moves. range,
     distance: (G,) m, the median measured range, NaN without one, and the median distance to the place. odds: (G,) the log
     odds that association gives to an object there. object: (G,) the index of the nearest object in the map, -1 for none.
-    away: (G,) m, the distance of this object from the place. double: (G,) the number of these boxes in frames in which this
-    object has a box of its own.
+    away: (G,) m, the distance of this object from the place. double: (G,) the number of the group's boxes in frames in which
+    this object has a box of its own.
     """
 
     ray: Ints

@@ -71,7 +71,7 @@ def find_splits(evidence: Evidence) -> Splits:
     scatter = grouped_sums((scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 9), owner, count).reshape(-1, 3, 3)
     worst = np.linalg.eigh(scatter)[1][:, :, -1][owner]
     across = worst - np.einsum("pi,pi->p", worst, obs.direction[ray])[:, None] * obs.direction[ray]
-    seen = np.einsum("pi,pi->p", across, across)  # A ray along the worst direction tells nothing of it.
+    seen = np.einsum("pi,pi->p", across, across)  # A ray along the worst direction tells nothing about it.
     along = np.einsum("pi,pi->p", offset, across) / np.maximum(seen, 0.05)
     weight = np.where(depth > 0, seen / sigma**2, 0.0)
     upper, low, high = _two_means(along, weight, owner, count)

@@ -34,9 +34,9 @@ this share of the noise. A smaller change moves hardly any ray across a gate, an
 share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the association
 can swing between two states for ever."""
 _FIRST = 0.05
-"""The noise (rad) of ray directions, in addition to that of the settings, in an association that shows the noise of the
-poses. The priors of the shared errors of a camera allow about as much. With a larger value, near objects become one, and
-then their rays show nothing of the poses."""
+"""The noise (rad) of ray directions that is added to the noise in the settings, for the association from which the noise of
+the poses is taken. The priors of the shared errors of a camera allow errors of about this size. With a larger value, near
+objects become one, and then their rays show nothing of the poses."""
 _EXPLAINED = 0.5
 """If an association with wide gates explains at most this share of the rays, a second association with narrow gates is
 tried. The second is taken if the first explains less than this share of the rays that the second explains. With a larger
@@ -154,8 +154,8 @@ def associate_fixed(
     """Find the objects, and the noise of the poses if the settings allow it.
 
     With too narrow gates, one object becomes several, and their rays show hardly any noise. So the noise is first taken from
-    an association with wide gates. Then both alternate until the noise stays. Returns the input with this noise, the
-    association, the estimate, and the number of objects in each round if there were several.
+    an association with wide gates. Then the association and the noise are found in turns until the noise stays. Returns the
+    input with this noise, the association, the estimate, and the number of objects in each round if there were several.
     """
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[float, float]] = []

@@ -15,7 +15,8 @@ from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
 
 _CELL = 1.0
-"""The shortest time (s) whose rays count as one. A longer time is faster, and sees shorter errors as noise."""
+"""The length (s) of the shortest cell. The rays of an object in one cell count as one ray. A longer time is faster, and sees
+shorter errors as noise."""
 _MOST_CELLS = 48
 """The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
 slower."""
@@ -79,7 +80,8 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
 
 
 def lasting_variances(seen: list[Cells]) -> Floats:
-    """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum is the factor of all errors.
+    """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum over these times is the
+    squared factor of all errors.
 
     seen: the cells of each object.
     """

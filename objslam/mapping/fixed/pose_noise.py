@@ -30,12 +30,12 @@ _CHANCE = 1e-3
 """The chance of a false alarm: poses that have the noise of the settings are found noisier. With a larger value, shorter
 logs can show noisy poses, and more good logs seem to have such poses."""
 _SIGNIFICANT = -2 * np.log(_CHANCE)
-"""The poses count as noisier if this lowers -2 ln of the posterior density by at least this value. It is the quantile of
-chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are the noises of headings and of
+"""The poses count as noisier if more noise lowers -2 ln of the posterior density by at least this value. It is the quantile
+of chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are the noises of headings and of
 places."""
 _STRAY = 3.0
 """The deviation of a stray ray, in standard deviations of all noise together. A larger number lets false boxes raise the
-noise, a smaller one lowers the noise of true boxes: by 1.3 % at 3."""
+noise. A smaller number lowers the noise of true boxes: the number 3 lowers it by 1.3 %."""
 _ROUNDS = 4
 """The most rounds in which stray rays are told from noisy poses. More rounds hardly change a factor."""
 

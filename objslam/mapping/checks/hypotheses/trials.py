@@ -88,7 +88,7 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
 
 def _unchanged(before: Agreement | None, log: Log) -> Trial:
     """Return the trial of the unchanged log. Boxes that are seen from one direction count as fitting: a hypothesis that
-    makes their rays cross explains no more of them."""
+    makes their rays cross does not explain more boxes."""
     if before is None:
         return Trial(None, 0.0, 0.0, _straight(log))
     narrow = float(before.narrow.sum() / before.boxes)

@@ -24,8 +24,8 @@ _LATER = ", second half"  # What the name of a camera of the second half ends wi
 _TURN = 0.2
 """The prior standard deviation (rad) of a turn. With a larger value, larger turns are found."""
 _SAME = 1e-3
-"""The prior standard deviation of the change of all other errors, as a share of their own. The graph divides by
-it, so it is not 0. A larger value lets the other errors change too."""
+"""The prior standard deviation of the change of all other errors, as a share of the prior standard deviation of the errors.
+The graph divides by it, so it is not 0. A larger value lets the other errors change too."""
 _MOVED = 0.05
 """If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
 less often."""
@@ -112,7 +112,8 @@ def _pairs(names: tuple[str, ...]) -> list[tuple[int, int]]:
 
 
 def _turns(found: Calibration, least: float, sigmas: float) -> dict[str, float]:
-    """Return the turns (rad) between the halves that are larger than `least` and than a number of standard deviations."""
+    """Return the turns (rad) between the halves that are larger than `least`, and larger than a number of standard
+    deviations."""
     turns = {}
     for i, j in _pairs(found.names):
         change, of = float(found.values[j] - found.values[i]), found.covariance
