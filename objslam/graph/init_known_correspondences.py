@@ -18,8 +18,8 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
-"""The most iterations of each solve during growth. Few are enough, because each solve starts near its optimum and the next
-one goes on from there. A larger number is slower."""
+"""The most iterations of each solve during growth. Few are enough, because each solve starts near its optimum, and the next
+solve goes on from there. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses of a step. Below `_HOLDS`, the next
 step is twice as long. Above `_FAILS`, a shorter step is tried. Larger limits take longer steps. On the MRCLAM logs, all

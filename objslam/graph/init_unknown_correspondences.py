@@ -56,7 +56,7 @@ _PAIRS = 150
 """The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
 next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.
 A larger number finds loops sooner in logs with many landmarks of one label, and takes longer. The unnamed posts of MRCLAM
-need 45, and up to 330 with mirrored images."""
+need 45 pairs, and up to 330 pairs with mirrored images."""
 
 
 @dataclass(frozen=True)

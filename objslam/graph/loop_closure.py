@@ -20,8 +20,8 @@ _SLIPS = (1.0, 3.0, 10.0)
 """The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
 more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
-"""The number of keyframes in a row that are an epoch. The drift since an epoch is computed from only one of its keyframes,
-so a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
+"""An epoch is this number of consecutive keyframes. The drift since an epoch is computed from only one of its keyframes, so
+a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
 
 
 @dataclass

@@ -96,7 +96,7 @@ def reject_outliers(
 class _Solver:
     """Solves the graph of the same measurements for different inliers.
 
-    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves. graph: the last one of GTSAM.
+    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves. graph: the last graph of GTSAM.
     """
 
     measured: Measurements

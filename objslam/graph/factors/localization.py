@@ -2,8 +2,9 @@
 
 The error of a pose may be new in each pose, or last for seconds, or both. A lasting error is a first-order Gauss-Markov
 process (Jazwinski 1970, 4.5): between two poses it keeps the share r = exp(-t / T), and r^2 of its variance. The information
-of such a chain is a sum of terms on single errors and on differences of consecutive errors. So poses whose errors last are
-weak absolute poses, and precise motions from pose to pose: priors and between-factors, without further variables.
+of such a chain is a sum of terms on single errors and on differences of consecutive errors. So a localisation whose errors
+last gives weak absolute poses, and precise motions from pose to pose. They become priors and between-factors, without
+further variables.
 """
 
 from dataclasses import dataclass

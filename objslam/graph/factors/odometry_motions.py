@@ -133,8 +133,8 @@ def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
 
 
 def _told(whole: Floats, loose: Floats) -> tuple[Floats, Floats]:
-    """Return the shares (T, 6) of the information 1 / `whole` that is not in 1 / `loose`, and the axes (T, 6, 6) of these
-    shares."""
+    """Return which share (T, 6) of the information of `whole` is not in the information of `loose`, along each of six axes,
+    and these axes (T, 6, 6)."""
     root = np.linalg.cholesky(whole)
     back = np.linalg.inv(root)
     size, axes = np.linalg.eigh(back @ loose @ np.swapaxes(back, 1, 2))

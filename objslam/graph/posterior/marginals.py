@@ -135,7 +135,7 @@ def joint_covariances(solved: SolvedGraph, groups: Sequence[Sequence[int]]) -> l
 
     The normal equations are factored once for all groups. GTSAM eliminates the system again for each group, which takes 20
     times as long for 150 landmarks that were seen together. GTSAM is used only if the normal equations lose too many digits.
-    It names the variable that is not determined. RuntimeError if both find the system indeterminate.
+    GTSAM names the variable that is not determined. RuntimeError if GTSAM, too, finds the system indeterminate.
     """
     if solved.inverse is not None:
         return solved.inverse.blocks(groups)
@@ -192,8 +192,8 @@ def correlated_factor(solved: SolvedGraph, landmarks: Ints, covariance: Floats) 
 class _Inverse:
     """The inverse of the normal equations of a graph, with a part for each variable.
 
-    normal: the normal equations, with columns of length 1. scale: (D,) the lengths of the columns before. begin, end: the
-    columns of each variable, by its key.
+    normal: the normal equations, with columns of length 1. scale: (D,) the lengths of the columns before this scaling.
+    begin, end: the columns of each variable, by its key.
     """
 
     normal: NormalEquations

@@ -161,7 +161,7 @@ def _scaled(squares: Squares, side: Floats, origins: Floats) -> Squares:
 
 
 def _finite(squares: Squares) -> Squares:
-    """Return the squares. A square without a side is replaced by one with side 1 at the identity."""
+    """Return the squares. A square without a side is replaced by a square with side 1 at the identity."""
     known = np.isfinite(squares.side)
     pose = np.where(known[:, None, None], squares.pose, np.eye(4))
     return Squares(squares.shape, pose, np.where(known, squares.side, 1.0))

@@ -207,7 +207,7 @@ def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
     """Return the two poses of each view of a square of side 1: 2 V squares, the first pose of every view, then the second.
 
     A flat square that is far off, or seen from the front, looks nearly alike in two poses (Schweighofer and Pinz 2006). The
-    first pose is that of the homography between the square and its image. The second one has the normal on the other side
+    first pose is that of the homography between the square and its image. The second pose has the normal on the other side
     of the line of sight. Both are then fitted to the corners of their view. shapes: (V, 4, 3).
     """
     middle = _middle(seen)
