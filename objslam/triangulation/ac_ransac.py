@@ -2,7 +2,8 @@
 
 No fixed threshold fits all objects, because the box of a large object wanders by many times the pixel noise. So the
 consensus is the subset of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon
-& Monasse, IPOL 2, 2012). The number of false alarms (NFA) measures this: how many subsets would agree as well by chance.
+& Monasse, IPOL 2, 2012). The number of false alarms (NFA) measures this: how many subsets would agree equally well by
+chance.
 """
 
 import math
@@ -109,7 +110,8 @@ def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) -> Tensor:
-    """Return for each object the midpoint (B, 3) of two rays with which its rays agree most. NaN if no midpoint exists.
+    """Return for each object the midpoint (B, 3) of two of its rays: the midpoint with which its rays agree most. NaN if no
+    midpoint exists.
 
     objects: (B,) indices. hypotheses: the most pairs tried per object. If an object has more pairs, their list is split into
     `hypotheses` equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of
@@ -172,8 +174,8 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes as close to the point (B, H, 3). It
-    is 1 for a ray that points away from the point, and for a ray that is not `real`."""
+    """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes the point (B, H, 3) at least as
+    closely. It is 1 for a ray that points away from the point, and for a ray that is not `real`."""
     xp = module_of(points)
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]

@@ -98,8 +98,8 @@ def at_edges(edges: BoxEdges, noise: Floats) -> Floats:
 def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
     """Return derivatives (B, 5, ...) by shift, size and range, from derivatives by the residuals.
 
-    If an edge of an axis is a bound, the residuals of this axis are its two edges. A shift moves both with opposite signs, a
-    size with the same sign.
+    If an edge of an axis is a bound, the residuals of this axis are its two edges. A shift changes the residuals of the two
+    edges with opposite signs, a size with the same sign.
     """
     row, axis = _axes_with_bound(edges)
     low, high = rows[row, axis], rows[row, axis + 2]
