@@ -23,8 +23,8 @@ from objslam.graph.posterior.marginals import HELD, in_camera, in_order
 from objslam.graph.variables import L0, X0, Variables
 
 _AT_ONCE = 400
-"""The most keyframes with which a graph is rebuilt in one call. A larger number delays the next image for longer. A smaller
-number spreads more rebuilds over several images."""
+"""A graph with at most this number of keyframes is rebuilt in one call. A larger number delays the next image for longer. A
+smaller number spreads more rebuilds over several images."""
 _SLICE = 100
 """The number of keyframes in one slice of a rebuild. A larger number finishes sooner, and delays the next image longer."""
 _FRESH = 10

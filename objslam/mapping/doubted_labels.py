@@ -27,11 +27,11 @@ _WITNESSES = 2
 of two objects fix a motion on the floor, so that the path between them cannot bend. With fewer, a bend can bring two things
 to one place. A larger number doubts the labels of more logs. MRCLAM and Lost in the Woods have 2 and more everywhere."""
 _GREW = 1.2
-"""The factor on the noise of the odometry, found by a solve, above which labels are doubted. A bent path needs this noise.
-In simulated drives with a turn on the spot and two things of one label, it was 1.5 to 6, and mostly 4. With one thing for
-each label and the odometry of the settings, it was at most 1.1. A larger factor doubts fewer labels."""
+"""Labels are doubted if a solve finds a larger factor than this on the noise of the odometry. A bent path needs such noise.
+In simulated drives with a turn on the spot and two things of one label, the factor was 1.5 to 6, and mostly 4. With one
+thing for each label and the odometry of the settings, it was at most 1.1. A larger factor doubts fewer labels."""
 _NOISY_BOXES = 2.0
-"""The factor on the noise of boxes, found by a solve with noisy odometry, above which all labels are doubted. If several
+"""All labels are doubted if a solve with noisy odometry finds a larger factor than this on the noise of boxes. If several
 labels have two objects each, they cannot check one another, but their boxes miss. The recorded wheel robots have 0.5 to 1.2
 with one thing for each label, and a simulated drive with two labels of two things had 4.4. A larger factor doubts fewer
 labels, and a smaller factor explores more logs without need."""
@@ -44,8 +44,8 @@ larger factor favours one object for each label."""
 
 
 CLEAR_ODDS = 7.0
-"""The log of the odds above which the evidence is clear: 1000 to 1. Bent paths of simulated drives had 107 and more. With a
-larger value, more maps need a look."""
+"""The evidence is clear if the log of the odds is above this: 1000 to 1. Bent paths of simulated drives had 107 and more.
+With a larger value, more maps need a look."""
 
 
 def doubted_names(state: JointState | Solution) -> tuple[str, ...]:

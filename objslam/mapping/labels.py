@@ -28,17 +28,18 @@ _JUDGEMENTS = 2
 """How many times `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays
 finds too little noise, so a second solve finds more. A larger number is slower."""
 _SAME_NOISE = 0.1
-"""The relative change of the noise below which `noise_explains` does not solve again. A larger value ends sooner."""
+"""`noise_explains` does not solve again if the noise changes by less than this share. A larger value ends sooner."""
 
 _CLOCKS = (-1.0, 1.0, -2.0, 2.0)
 """The clock offsets that `clock_explains` tries, in standard deviations of their prior. A solve converges from one standard
 deviation away, so a denser grid is slower and finds nothing new. A wider grid finds clocks that the prior excludes."""
 _SHORT = 500
-"""The largest number of keyframes of a log for which `clock_explains` tries clock offsets. A longer log has enough rays to
-find its clock in one solve. A larger number is slower."""
+"""`clock_explains` tries clock offsets for logs with at most this number of keyframes. A longer log has enough rays to find
+its clock in one solve. A larger number is slower."""
 
 _LARGER = 1.5
-"""The factor on the noise of the settings above which `warn_of_noise` names it. A larger factor names less noise."""
+"""`warn_of_noise` names a noise if the factor on the noise of the settings exceeds this. A larger factor names less
+noise."""
 
 
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:

@@ -41,9 +41,9 @@ noise. A larger share refutes fewer findings. Examples from a clean MRCLAM robot
 with mirrored images needs, because there the path must turn the other way. It needs 0.15 of the noise that its log with the
 identity for base_T_camera needs, but 2.9 times the noise in the settings."""
 _IN_BOTH = 0.4
-"""The least share of rays of common objects at which the halves of a log agree. Common objects are seen in both halves. The
-share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs
-have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve explains the rays of both."""
+"""The halves of a log agree if at least this share of their rays belongs to common objects. Common objects are seen in both
+halves. The share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean
+simulated logs have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve explains the rays of both."""
 
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:

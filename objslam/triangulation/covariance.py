@@ -6,7 +6,7 @@ from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
 from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.lines import Lines
 
-_EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. A larger number costs time.
+_EVERY_PAIR = 256  # Up to this number of rays of an object, `parallax` compares every pair. A larger number costs time.
 _PLACES = 1 << 13  # The most rays, with fillers, that `parallax` compares together. A larger number needs memory.
 _RANGE_ITERATIONS = 30  # The iterations of the range fit of every object. The fit starts at the median range.
 

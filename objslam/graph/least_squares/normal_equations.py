@@ -41,8 +41,7 @@ class NormalEquations:
         return found
 
     def late(self, columns: Ints, most: int) -> Ints:
-        """Return the columns among `columns` (n,) that belong to the last `most` eliminated columns. They are for
-        `last_block`."""
+        """Return those of `columns` (n,) that are among the last `most` eliminated columns. `last_block` takes them."""
         straight = np.arange(len(self.order))
         if not all(np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)):
             return columns[:0]

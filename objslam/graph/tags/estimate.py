@@ -21,7 +21,7 @@ from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 Covariances = Callable[[Sequence[Sequence[int]]], list[Floats]]
 """A function of groups of keys that returns the covariance of each group, as `marginals.joint_covariances` does."""
 LEAST_PROBABILITY = 0.01
-"""The least probability at which the second rotation of a flat square is reported. A larger value reports fewer."""
+"""The second rotation of a flat square is reported if its probability is at least this. A larger value reports fewer."""
 
 
 def with_objects(

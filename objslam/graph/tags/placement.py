@@ -14,7 +14,8 @@ _CANDIDATES = 8
 """The most views of a fiducial whose two poses are tried: half of them are the nearest, the others are spread over time. A
 larger number is slower, and finds the pose more often if many views are false."""
 _VIEWS = 64
-"""The most views of a fiducial on which a pose is judged, spread over time. A larger number is slower and judges better."""
+"""A pose of a fiducial is judged on at most this number of its views, spread over time. A larger number is slower and judges
+better."""
 _STEPS, _STEPS_LAST = 6, 15
 """The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
 _TOLD = 4.0

@@ -135,7 +135,8 @@ def with_pose_noise(seen: Corners, squares: Squares, angle: Floats, place: Float
     """Return views whose cameras have noise. angle: (V,) rad, of the rotation, place: (V,) m, of the position, per axis.
 
     The noise of a camera moves the four corners of its view together: the residuals have the covariance sigma^2 I + J S J^T.
-    J is taken at the given squares (H), so it is the same for each pose that is then compared.
+    S is the covariance of this noise. J is the derivative of the residuals by the pose of the camera, at the given squares
+    (H). So J is the same for each pose that is then compared.
     """
     _, by_point, _ = _residuals(seen, squares.corners)
     by_place = by_point.reshape(len(seen), 8, 3) * place[:, None, None]

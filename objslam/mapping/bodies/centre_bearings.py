@@ -26,9 +26,9 @@ _KEPT = 0.5
 """The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. The
 bearings of a lost object stay as they were."""
 _WORTH = 0.1
-"""The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
-shift repeats in all bearings of the object. So a shift of 0.1 equals the noise of the mean of 100 bearings. A larger value
-solves fewer logs again."""
+"""Poses are solved again if the median shift of an object's bearings exceeds this number of standard deviations of one
+bearing. A shift repeats in all bearings of the object. So a shift of 0.1 equals the noise of the mean of 100 bearings. A
+larger value solves fewer logs again."""
 
 
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:

@@ -14,19 +14,19 @@ from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
 
 FASTEST = 40.0
-"""The typical speed (m/s) above which poses are not in metres: the speed of a car on a motorway. A larger speed warns less
-often."""
+"""Poses are not in metres if their typical speed (m/s) is above this, the speed of a car on a motorway. A larger speed warns
+less often."""
 _FASTEST_TURN = 8.0
 """Headings are not in radians if the moving robot exceeds this turn rate (rad/s) in a tenth of its steps. A larger rate
 warns less often."""
 _TURN_TIME = 0.1
 """The time (s) over which turn rates are measured. A longer time suits noisy headings, and hides short turns."""
 _JUMP = 5.0
-"""The speed (m/s) above which a step of an otherwise slow path may be a jump. It equals live.max_speed. A larger speed warns
-less often."""
+"""A step of an otherwise slow path may be a jump if its speed (m/s) is above this. It equals live.max_speed. A larger speed
+warns less often."""
 _JUMP_TURN = 20.0
-"""The turn rate (rad/s) above which a step of an otherwise slow path may be a jump. As in a live session, it is 4 rad/s for
-each m/s of live.max_speed. A larger rate warns less often."""
+"""A step of an otherwise slow path may be a jump if its turn rate (rad/s) is above this. As in a live session, it is 4 rad/s
+for each m/s of live.max_speed. A larger rate warns less often."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
 _ACCELERATION = 5.0
@@ -42,13 +42,13 @@ deviations. A larger number warns less often."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
 _STILL = 1e-4
-"""The distance (m) and turn (rad) between two poses below which the robot stands still. A larger value takes slow motion for
-a stop."""
+"""The robot stands still if two poses differ by less than this distance (m) and turn (rad). A larger value takes slow motion
+for a stop."""
 _FROZEN_SECONDS = 8.0
 """The shortest time (s) without motion that may be a frozen path. If a robot really stands
 still, its boxes do not move in the image either. A larger value finds fewer frozen paths."""
 _MOVING_PX = 12.0
-"""The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves. A larger spread
+"""A camera moves if the boxes of one label spread by more than this (px) about their median, within seconds. A larger spread
 finds fewer frozen paths."""
 _LEAST_STEP = 0.01
 """The noise (m) of a position. The direction of a motion is judged if the motion is longer than three times this noise. A
@@ -59,8 +59,8 @@ _LEAST_PIECE = 0.3
 """The least distance in a time of `_PIECE` that is compared, as a share of the longest distance. Shorter distances are
 noise."""
 _OTHER_SCALE = 0.1
-"""The logarithm of the ratio between the distances by localisation and odometry, above which a run warns. Real odometry errs
-by up to 8 %. A larger value warns less often."""
+"""A run warns if the logarithm of the ratio between the distances by localisation and odometry exceeds this. Real odometry
+errs by up to 8 %. A larger value warns less often."""
 _BEFORE = 0.3
 """The time (s) over which the direction of motion is measured. A longer time suits noisy poses and slow turns."""
 

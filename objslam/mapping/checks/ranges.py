@@ -24,7 +24,7 @@ _LEAST = 0.04
 cameras that are turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger
 share warns less often."""
 _SPOILING = 0.06
-"""The error of the scale, as a share, above which positions are unreliable. With a larger share, fewer maps are
+"""Positions are unreliable if the scale has a larger error than this share. With a larger share, fewer maps are
 unreliable."""
 _SIGMAS = 5.0
 """The least error of the ranges that is reported, in standard deviations. A larger number warns less often."""
@@ -34,13 +34,12 @@ _CLOSE = 0.25
 """A factor is a unit of `_UNITS` if the logarithm of the ratio between the two is below this. A larger value names more
 units."""
 _UNIT = 0.7
-"""The logarithm of a factor above which no calibration error explains the factor. A larger value asks fewer factors for a
-unit."""
+"""No calibration error explains a factor if its logarithm exceeds this. A larger value asks fewer factors for a unit."""
 _GROUP = 8
 """The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
 _ALONE = 1.1
-"""The crowd (`Part.crowd`) up to which all boxes of a label in a window count as boxes of one thing. A larger value tests
-the ranges of more labels by whether they end at one point."""
+"""If the crowd (`Part.crowd`) is at most this, all boxes of a label in a window count as boxes of one thing. A larger value
+tests the ranges of more labels by whether they end at one point."""
 _LEAST_BY_ODOMETRY = 0.18
 """The least error of the ranges for poses by odometry. The joint mode itself corrects several percent. A larger error warns
 less often."""

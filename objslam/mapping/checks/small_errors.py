@@ -32,7 +32,7 @@ _LEAST_SHARE = 0.04
 """The least decrease by an error, as a share of all squared deviations. Rays of a real log are not independent, so the sum
 of many small deviations proves nothing. A larger value finds fewer errors."""
 _UNUSUAL = 4.0
-"""The number of prior standard deviations above which an error is unusual. A larger number calls fewer errors unusual."""
+"""An error is unusual if it exceeds this number of prior standard deviations. A larger number calls fewer errors unusual."""
 _ROUNDS = 6
 """The number of Gauss-Newton steps after each added error. A larger number is more exact."""
 _CLOCK_SIGMA = 0.05

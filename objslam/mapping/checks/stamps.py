@@ -53,7 +53,7 @@ def check_stamps(log: Log) -> Finding | None:
 
 
 def _common_unit(path: Trajectory, frames: list[Floats]) -> str | None:
-    """Return the unit in which poses and frames (F,) of each camera are stamped, or None for seconds.
+    """Return the unit of the stamps of poses and of the frames (F,) of each camera, or None for seconds.
 
     No date in s is as large as a date in ms. Stamps that begin at zero tell their unit by the time between two of them,
     if the robot also crawls.

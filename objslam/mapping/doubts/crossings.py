@@ -21,8 +21,8 @@ _LOOSE = 2.0
 """The second scale finds more rays than the first. If it finds more than this multiple, the rays only pass nearby, and do
 not meet. With a larger number, more loose groups count as groups that meet."""
 _AROUND = 4.0
-"""The surroundings of a place end at this multiple of the distance up to which a ray passes it. A larger multiple gives a
-surer estimate of how many rays pass by chance, from a larger area."""
+"""The surroundings of a place reach to this multiple of the largest distance at which a ray passes the place. A larger
+multiple gives a surer estimate of how many rays pass by chance, from a larger area."""
 _FLAT = 0.5
 """The largest angle (rad) of the surroundings, seen from a camera. Wider surroundings are not flat, so their area does not
 tell how many rays pass by chance. A larger angle counts places nearer to the path."""

@@ -42,7 +42,7 @@ do not meet, the ranges disagree, too few frames show the thing, its size is wro
 chance, none of these reasons alone."""
 _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
-"""The median deviation of the ranges from the place, in standard deviations, above which the ranges disagree. With a larger
+"""The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger
 number, fewer groups have this reason."""
 
 

@@ -15,11 +15,11 @@ from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 _ITERATIONS = 40
 """The most steps of a fit. Ten are usual. More steps are slower."""
 STILL = 1e-9
-"""The least decrease of the cost for which the fit of a body goes on. The cost is half the sum of squared deviations. The
-decrease is that of the linear model of a step. A larger value ends sooner."""
+"""The fit of a body goes on if a step decreases the cost by at least this. The cost is half the sum of squared deviations.
+The decrease is that of the linear model of a step. A larger value ends sooner."""
 _UPHILL = 1e-3
-"""The share by which a step may raise the cost. The derivatives leave out that the distance to a body changes, so steps near
-the optimum may raise the cost slightly. A larger share accepts worse steps."""
+"""A step may raise the cost by this share. The derivatives leave out that the distance to a body changes, so steps near the
+optimum may raise the cost slightly. A larger share accepts worse steps."""
 _DAMPING = (1e-3, 1e-9, 1e6)
 """The first, least and most damping of a step, as a share of the curvature. More damping makes shorter steps."""
 _LONGEST = 0.7

@@ -34,7 +34,7 @@ _POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
 _ROUNDS = 2
 """How often the noise is estimated from the residuals of the last fit. More rounds are slower and change little."""
 _PER_SIDE = 3
-"""The number of boxes from each side by which shape and noise are found. Boxes from one side repeat one error, so more boxes
+"""Shape and noise are found from this number of boxes from each side. Boxes from one side repeat one error, so more boxes
 are slower and hardly help. The last fit uses all boxes."""
 _RARE = 20.0
 """The prior odds against a sphere, because few things are balls. With larger odds, fewer bodies are spheres."""

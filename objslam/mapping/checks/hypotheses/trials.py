@@ -17,8 +17,8 @@ from objslam.mapping.progress import Progress
 _TIMES, _MORE = 1.2, 0.06
 """A hypothesis must raise the score by this factor and by this difference. Larger values name fewer causes."""
 _CROWD = 1.4
-"""The crowd (`Part.crowd`) above which rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9. With a larger
-value, fewer logs need the larger limits below."""
+"""In a larger crowd (`Part.crowd`) than this, rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9. With a
+larger value, fewer logs need the larger limits below."""
 _CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
 """`_TIMES` and `_MORE` in a crowd. Larger values name fewer causes."""
 _MORE_BOXES = 25
