@@ -59,7 +59,7 @@ class AppearanceNoise(Section):
     """The appearance vectors of boxes, and how often they confuse objects.
 
     The vector of a box is the vector of its object plus noise. The vector confuses its object if it is nearer to the vector
-    of another object with the same label. The noise is as large as the share of confused boxes demands.
+    of another object with the same label. The noise follows from the share of confused boxes.
     """
 
     confusion: Probability = 0.2  # The share of boxes that are confused, among those of labels with two objects or more.

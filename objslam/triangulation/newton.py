@@ -123,8 +123,9 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return, at points (3, B), the gradient (3, B) of Eq. 1, its second derivative (B,) along the unit vectors `axis`
-    (3, B), and the rounding error (B,) of the gradient, in units of epsilon: the sum of 1 + 1 / d, at most 1e6."""
+    """Return three values of Eq. 1 at points (3, B): the gradient (3, B), the second derivative (B,) along the unit vectors
+    `axis` (3, B), and the rounding error (B,) of the gradient. This error is in units of epsilon: the sum of 1 + 1 / d, at
+    most 1e6."""
     q = lines.offset(point)
     inverse = lines.weight / norm(q).clip(min=_TINY)
     u = q * inverse

@@ -31,12 +31,12 @@ _SIGMAS = 5.0
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
 """The name of each unit of length, by the number of units in a metre."""
 _CLOSE = 0.25
-"""A factor is a unit of `_UNITS` if the logarithm of the ratio between the two is below this. A larger value names more
-units."""
+"""A factor counts as a unit of `_UNITS` if the logarithm of their ratio is below this. A larger value names more units."""
 _UNIT = 0.7
 """No calibration error explains a factor if its logarithm exceeds this. A larger value asks fewer factors for a unit."""
 _GROUP = 8
-"""The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
+"""The ranges of a label in a window show a factor if it has at least this number of boxes there. Fewer boxes show it
+poorly."""
 _ALONE = 1.1
 """If the crowd (`Part.crowd`) is at most this, all boxes of a label in a window count as boxes of one thing. A larger value
 tests the ranges of more labels by whether they end at one point."""

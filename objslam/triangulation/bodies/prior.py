@@ -25,7 +25,8 @@ _LIKE = 2.0
 """With this many bodies of a label, the spread of their sizes weighs as much as _SIZE and _ASPECT. A larger number trusts
 the label less."""
 _LEAST = 0.1
-"""The least standard deviation of the logarithm of a half axis, given the label. A smaller value trusts the label more."""
+"""The least standard deviation of the logarithm of a half axis, in the prior of a label. A smaller value trusts the label
+more."""
 _TIE = 1e-3
 """The standard deviation, practically 0, of the logarithms by which the half axes of a sphere differ. A larger value allows
 flatter spheres."""
