@@ -39,8 +39,8 @@ _REJECTED = 0.1
 """A label is doubted if at least `MANY` of its rays, and at least this share, are rejected. A larger share doubts fewer
 labels. In a smaller share, a second object cannot be told from wrong names and false boxes."""
 _NOISIER = 1.5
-"""One object for each label may need more noise of boxes or depths than several objects for a label, up to this factor. A
-larger factor favours one object for each label."""
+"""A map with one object for each label may need this multiple of the noise of boxes or depths that a map with several
+objects needs. A larger factor favours one object for each label."""
 
 
 CLEAR_ODDS = 7.0

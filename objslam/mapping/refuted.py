@@ -122,7 +122,7 @@ def _late(solution: Solution) -> Bools:
 
 
 def _least_explained(solution: Solution) -> float:
-    """Return the share of explained rays in each half of the log, the smaller of the two."""
+    """Return the smaller of two shares: the shares of explained rays in the halves of the log."""
     explained, late = _explained(solution), _late(solution)
     return float(min(explained[mask].mean() if mask.any() else 0.0 for mask in (late, ~late)))
 

@@ -125,7 +125,7 @@ def chain(gaps: Floats, sigma: float, lasting: Lasting) -> tuple[Floats, Floats]
     The terms are exact if the whole error lasts, or if nothing of it lasts. An error with both parts has no exact terms. Its
     terms have the true information about constant errors, and about errors that change their sign from pose to pose. At the
     frequencies w between these two, the true information is larger: it is a concave function of 2 - 2 cos(w), and the terms
-    are a linear function.
+    are linear in 2 - 2 cos(w).
 
     Args:
         gaps: (K-1,) s, the times between consecutive errors.

@@ -159,10 +159,10 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
-    """Find objects that moved: one track is gone, a similar one is new elsewhere. Return all tracks except the gone tracks
-    that were found to have moved.
+    """Find objects that moved: one track is gone, and a similar track is new elsewhere. Return the tracks without these gone
+    tracks.
 
-    The new track takes the number of the gone one. begun: the tracks so far. came: the tracks that a later site brought.
+    The new track takes the number of the gone track. begun: the tracks so far. came: the tracks that a later site brought.
     They count as new, however many sessions of that site saw them.
     """
     lives = {at: life for at in begun if (life := tracks[at].life) is not None}

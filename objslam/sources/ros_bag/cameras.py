@@ -40,14 +40,18 @@ def find_cameras(
 ) -> tuple[CameraTopics, ...]:
     """Find the cameras of a recording and their topics.
 
-    With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the camera's
-    name as a part. A single calibration without such topics takes all topics. One of several calibrations without such
-    topics is left out with a warning. Without calibrations, each frame_id of detections is a camera. If there are no
-    detections either, the colour images decide: each frame_id that they share with a CameraInfo is a camera, and a single
-    topic of colour images is one too. The other topics of a camera have its frame_id. In a recording without detections and
-    images, each frame_id of a CameraInfo is a camera, and so is each calibration. If several topics fit a role, the one with
-    the most similar name is taken with a warning. rectified: whether boxes and images are rectified. None lets the topic
-    names decide.
+    The recording decides what counts as a camera:
+
+    - With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the
+      camera's name as a part. A single calibration without such topics takes all topics. One of several calibrations without
+      such topics is left out with a warning.
+    - Otherwise, each frame_id of detections is a camera.
+    - Without detections, each frame_id that colour images share with a CameraInfo is a camera. A single topic of colour
+      images is a camera too.
+    - Without detections and images, each frame_id of a CameraInfo is a camera, and each calibration.
+
+    The other topics of a camera have its frame_id. If several topics fit a role, the topic with the most similar name is
+    taken with a warning. rectified: whether boxes and images are rectified. None lets the topic names decide.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
     seeds = detections or images or pool.fitting("camera_info")
