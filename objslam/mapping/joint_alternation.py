@@ -34,7 +34,7 @@ _STILL = 0.01
 them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
 _WORSE = 2
 """The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
-takes longer, and continues after more rounds in which close objects merged."""
+takes longer, but gets over more rounds in which close objects merge."""
 
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""

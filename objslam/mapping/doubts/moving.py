@@ -22,7 +22,7 @@ _LAGS = (1, 2, 3)
 """The numbers of frames from one box of a thing that moves to its next box. Larger numbers bridge more missed detections,
 and join more boxes by chance."""
 _FAR_LAGS = (50, 51, 52)
-"""The numbers of frames after which two boxes are no longer of one motion. Such pairs show how often boxes follow one
+"""After these numbers of frames, two boxes no longer show the same motion. Such pairs show how often boxes follow one
 another by chance."""
 _ALIKE = 1.5
 """The largest ratio between the sizes of two boxes that follow one another. A larger ratio joins more boxes by chance."""

@@ -87,8 +87,8 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
 
 
 def _unchanged(before: Agreement | None, log: Log) -> Trial:
-    """Return the trial of the unchanged log. Boxes that are seen from one direction count as fitting: a hypothesis that
-    makes their rays cross does not explain more boxes."""
+    """Return the trial of the unchanged log. Boxes that are seen from one direction count as fitting. So a hypothesis that
+    makes their rays cross gains no boxes."""
     if before is None:
         return Trial(None, 0.0, 0.0, _straight(log))
     narrow = float(before.narrow.sum() / before.boxes)
