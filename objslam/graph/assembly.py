@@ -209,11 +209,11 @@ def fixed_pose_factors(
 
     With the loss `l1`, this is Eq. 1 of Staszak & Belter: the distance of each ray from its landmark, without noise and
     without ranges. Noise of the directions then draws a landmark towards the cameras, because the distance to a noisy ray is
-    smaller near the origin of the ray. The other losses are on x / s, where x is the distance of a ray and s its standard
-    deviation. At distance d, s^2 = (angle d)^2 + place^2. If the landmark moves along the line of sight, x / s changes by
-    the share d angle^2 / s^2 for each metre. The residual here is an angle that changes by the same share: the angle seen
-    from a point place^2 / (angle^2 d) behind the origin. Then neither noise of directions nor noise of places moves a
-    landmark to one side.
+    smaller near the origin of the ray. The other losses are on x / s. Here x is the distance of the landmark from a ray, and
+    s is the standard deviation of x. At distance d, s^2 = (angle d)^2 + place^2. The residual is proportional to x / s near
+    this distance: it is the angle of the landmark, seen from a point place^2 / (angle^2 d) behind the origin. If the
+    landmark moves by 1 m along the line of sight, both change by the share d angle^2 / s^2. With this residual, neither
+    noise of directions nor noise of places moves a landmark to one side.
 
     Args:
         origins, directions: (n, 3), (n, 3) the rays in map.

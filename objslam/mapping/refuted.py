@@ -2,7 +2,7 @@
 
 A finding comes from a quick check before the solve (`mapping/checks`). The check keeps odometry and calibration fixed within
 windows of some seconds. So it also reports errors that the joint solve corrects, such as a camera that is turned by some
-degrees and late by 0.1 s. So the solved map repeats the test.
+degrees and late by 0.1 s. Therefore the test is repeated on the solved map.
 """
 
 from dataclasses import replace
