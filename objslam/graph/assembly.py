@@ -43,8 +43,8 @@ class RowsOfKind(Protocol):
         """(n, c) the columns that all rows of a factor share."""
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:
-        """Return the whitened residuals (n, r) at poses (P, 4, 4) and positions (m, 3), m, their derivatives (n, r, c), and
-        the cost. Roots of robust weights are in the first two."""
+        """Return the whitened residuals (n, r), their derivatives (n, r, c) and the cost, at poses (P, 4, 4) and positions
+        (m, 3), m. The residuals and the derivatives contain the roots of the robust weights."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ class Measurements:
 
     @cached_property
     def seen_twice(self) -> Bools:
-        """(M,) whether both poses of a motion see the same fiducial, so that its corners measure the motion too.
+        """(M,) whether both poses of a motion see the same fiducial. The corners of this fiducial measure the motion too.
 
-        A tie counts if one of the motions below it does.
+        A tie between multiframes counts if one of the motions between its ends counts.
         """
         if self.motions is None:
             return np.zeros(0, dtype=bool)
@@ -205,13 +205,14 @@ def fixed_pose_factors(
     noise: tuple[Floats, float],
     loss: Loss,
 ) -> list[gtsam.NonlinearFactor]:
-    """Return the factors of rays at fixed poses: first that of each ray and its landmark, then the measured ranges.
+    """Return the factors of rays at fixed poses: first one for each ray and its landmark, then one for each measured range.
 
     With the loss `l1`, this is Eq. 1 of Staszak & Belter: the distance of each ray from its landmark, without noise and
-    without ranges. Noise of the directions then draws a landmark towards the cameras, because it is nearer to noisy rays if
-    it is nearer to their origins. The other losses are on x / s, where x is the distance of a ray and s its standard
-    deviation. At distance d, s^2 = (angle d)^2 + place^2. Along the line of sight, x / s changes by d angle^2 / s^2 of
-    itself. So does the angle seen from place^2 / (angle^2 d) behind the origin, which is the residual here. Then neither
+    without ranges. Noise of the directions then draws a landmark towards the cameras, because the distance to a noisy ray is
+    smaller near the origin of the ray. The other losses are on x / s. Here x is the distance of the landmark from a ray, and
+    s is the standard deviation of x. At distance d, s^2 = (angle d)^2 + place^2. The residual is proportional to x / s near
+    this distance: it is the angle of the landmark, seen from a point place^2 / (angle^2 d) behind the origin. If the
+    landmark moves by 1 m along the line of sight, both change by the share d angle^2 / s^2. With this residual, neither
     noise of directions nor noise of places moves a landmark to one side.
 
     Args:

@@ -124,14 +124,20 @@ def solve_joint(
     Each solve is followed by a test of all rays. Rays far outside the noise of their object are rejected, and other rays
     return. An object is added or moved if the poses now determine it better. Solve and test repeat until nothing changes. If
     most rays of a stretch of the drive were rejected, and there is only odometry, the poses of the stretch may be wrong. In
-    this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose.
-    SolveError if the linear system is indeterminate, or if the cost is not finite. start: (K, 4, 4) camera poses to start
-    from instead. places: (N, 3) m, positions to start from, NaN where unknown. They are given if start and places solve
-    nearly the same measurements. Stretches that this solution rejects are not tried again. errors: the same keyframes and
-    rays as a function of shared errors. The shared errors are estimated, starting from theta (P,) or from their mean. Their
-    covariance is added to the covariance of objects. hold: whether the shared errors stay at theta, and the noise stays too.
-    In this case, no covariance is added. progress(done, total) counts the keyframes in the growing graph. The corners of
-    fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
+    this case, its rays return once, and the solution with the lower cost is taken. Images of one stamp share one pose. The
+    corners of fiducials are landmarks of their own inside the solve, tied to squares (`graph.tags`).
+
+    Args:
+        progress: called as progress(done, total) with numbers of keyframes in the growing graph.
+        start: (K, 4, 4) camera poses to start from instead.
+        places: (N, 3) m, positions to start from, NaN where unknown. They are given if `start` and `places` are the solution
+            of nearly the same measurements. Then the stretches that this solution rejects are not tried again.
+        errors: the same keyframes and rays as a function of shared errors. The shared errors are estimated, starting from
+            theta (P,) or from their mean. Their covariance is added to the covariance of objects.
+        hold: whether the shared errors stay at theta. Then the noise stays too, and no covariance is added.
+
+    Raises:
+        SolveError: the linear system is indeterminate, or the cost is not finite.
     """
     tags = TagCorners.of(rays, association, settings)
     if trace is not None:

@@ -26,14 +26,15 @@ from objslam.graph.multiframes import Multiframes
 from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 
 _STRETCH = 150
-"""A landmark with too few rays is dropped after this number of frames without a ray, or sooner if the heading drifted by
-`HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A larger number keeps
-false landmarks longer."""
+"""A landmark with too few rays is dropped after this number of frames without a ray. It is dropped sooner if the heading
+drifted by `HORIZON`. The search for ties pauses after this number of frames without a new landmark or a tie. A larger number
+keeps false landmarks longer."""
 _RECENT = 300
-"""The number of frames after its first ray during which a landmark can be tied to an older one. A larger number is
+"""During this number of frames after its first ray, a landmark can be tied to an older landmark. A larger number is
 slower."""
 _SURE = 4.0
-"""The least log odds of a sure match over the best assignment without it. Larger odds match fewer rays."""
+"""The best assignment with a match is compared with the best assignment without it. The match is sure if the log odds are at
+least this. A larger value matches fewer rays."""
 _NEW = 0.2
 """The prior probability that a ray belongs to no known landmark. A larger value accepts fewer matches."""
 _PAIRS = 40
@@ -81,7 +82,7 @@ def is_sure(start: InitialEstimate) -> bool:
 class _Exploration:
     """The filter at the present frame. label, first, last, hits: (N,) the label, the first and last frame, and the number of
     rays of each landmark. owner: (R,) the landmark of each ray. doubtful: (R,) whether a ray may belong to a known landmark,
-    so that it makes no new one. path: (P, 4, 4) map_T_base at each frame."""
+    so that it makes no new landmark. path: (P, 4, 4) map_T_base at each frame."""
 
     def __init__(
         self,
@@ -172,7 +173,8 @@ class _Exploration:
         self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
-        """Return the first of the last `_STRETCH` frames since which the heading has drifted by less than `HORIZON`."""
+        """Return the first frame after which the heading has drifted by less than `HORIZON`, at most `_STRETCH` frames
+        back."""
         return max(0, now + 1 - _STRETCH, int(np.searchsorted(self.heading, self.heading[now] - HORIZON**2)))
 
     def _add(self, position: Floats, covariance: Floats, label: Ints, first: Ints, now: int) -> None:
@@ -237,8 +239,8 @@ def _likeliest(squared: Floats) -> Ints:
 
 
 def _log_spread(sight: ekf.Sight) -> Floats:
-    """Return the log (R,) of the area (rad^2), or with a range the volume (rad^2 m), over which rays to new landmarks
-    spread. All rays together serve as a sample of such rays."""
+    """Return the log (R,) of the area (rad^2) over which rays to new landmarks spread. For a ray with a range, it is a
+    volume (rad^2 m). All rays together serve as a sample of such rays."""
     n, noise = sight.direction, np.median(sight.sigma)
     angles = np.arctan2(n[:, 1], n[:, 0]), np.arcsin(np.clip(n[:, 2], -1.0, 1.0))
     extent = sum(0.5 * np.log(12 * np.var(angle) + 2 * np.pi * noise**2) for angle in angles)

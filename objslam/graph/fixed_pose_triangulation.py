@@ -34,7 +34,8 @@ def triangulate_landmarks(
 def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float]:
     """Return the standard deviations (R,), rad, of ray directions, and one standard deviation, m, of all ray origins.
 
-    Both contain the noise of the localisation (`noise_of_poses`). Without one, only the noise of the rays remains.
+    Both contain the noise of the localisation (`noise_of_poses`). Without a localisation, only the noise of the rays
+    remains.
     """
     yaw, place = noise_of_poses(keyframes, settings)
     return np.hypot(rays.sigma, yaw), place
@@ -43,8 +44,8 @@ def pose_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Fl
 def noise_of_poses(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
     """Return the standard deviations of localised poses: of headings, rad, and of places, m. 0 without a localisation.
 
-    Keyframes that share one measured pose share its error, so its variance is multiplied by their number. The noise is that
-    of the settings, or the larger one that the log shows.
+    Keyframes that share one measured pose share its error, so its variance is multiplied by their number. The noise is from
+    the settings, or the larger noise that the log shows.
     """
     share, (yaw, place) = float(np.sqrt(keyframes.localized_every)), keyframes.pose_noise
     return settings.localization.yaw * share * yaw, settings.localization.xy * share * place

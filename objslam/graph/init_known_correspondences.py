@@ -18,15 +18,16 @@ from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.sliding_window import SlidingWindow
 
 _ITERATIONS = 4
-"""The most iterations of each solve during growth. Few are enough, because each solve starts near its optimum and the next
-one goes on from there. A larger number is slower."""
+"""The most iterations of each solve during growth. Few are enough, because each solve starts near its optimum, and the next
+solve goes on from there. A larger number is slower."""
 _HOLDS, _FAILS = np.radians(5.0), np.radians(15.0)
 """The limits (rad) on the median angle between rays and landmarks at the predicted poses of a step. Below `_HOLDS`, the next
 step is twice as long. Above `_FAILS`, a shorter step is tried. Larger limits take longer steps. On the MRCLAM logs, all
 pairs of limits from (1, 3) to (5, 15) degrees lead to the same map."""
 _GATE, _GATE_SHARE = np.radians(5.0), 3.0
-"""During growth, a ray is an outlier if its angle to its landmark exceeds both `_GATE` (rad) and `_GATE_SHARE` times the
-median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both."""
+"""During growth, a ray is an outlier if its angle to its landmark exceeds two limits: `_GATE` (rad), and `_GATE_SHARE` times
+the median angle of the step. Larger values accept more false boxes. The odometry's drift in one step is well below both
+limits."""
 _MORE_RAYS = 1
 """The number of agreeing rays beyond association.min_rays that a new landmark needs. With a larger number, landmarks are
 added later. With a smaller one, false boxes agree by chance too often."""

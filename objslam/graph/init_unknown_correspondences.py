@@ -56,7 +56,7 @@ _PAIRS = 150
 """The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
 next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.
 A larger number finds loops sooner in logs with many landmarks of one label, and takes longer. The unnamed posts of MRCLAM
-need 45, and up to 330 with mirrored images."""
+need 45 pairs, and up to 330 pairs with mirrored images."""
 
 
 @dataclass(frozen=True)
@@ -182,8 +182,8 @@ def _recognise(
     end: int,
     looks: Looks | None,
 ) -> tuple[Ints, Floats]:
-    """Return the active landmark of each new ray (n,), or -1, and the poses (K, 4, 4), in which those from `begin` to `end`
-    - 1 are aligned."""
+    """Return the active landmark of each new ray (n,), or -1, and all poses (K, 4, 4). The poses from `begin` to `end` - 1
+    are now aligned with the landmarks."""
     if len(new) == 0 or not active.any():
         return np.full(len(new), -1, dtype=np.int64), map_T_camera
     some, which = rays.take(new), np.flatnonzero(active)

@@ -23,8 +23,8 @@ from objslam.graph.posterior.marginals import HELD, in_camera, in_order
 from objslam.graph.variables import L0, X0, Variables
 
 _AT_ONCE = 400
-"""The most keyframes with which a graph is rebuilt in one call. A larger number delays the next image for longer. A smaller
-number spreads more rebuilds over several images."""
+"""A graph with at most this number of keyframes is rebuilt in one call. A larger number delays the next image for longer. A
+smaller number spreads more rebuilds over several images."""
 _SLICE = 100
 """The number of keyframes in one slice of a rebuild. A larger number finishes sooner, and delays the next image longer."""
 _FRESH = 10
@@ -150,9 +150,9 @@ class IncrementalGraph(GrowingGraph):
     def rebuild_in_slices(self, order: Ints) -> None:
         """Start a rebuild. Each call of `continue_rebuild` runs one slice of it. Until its end, the old graph stays in use.
 
-        A graph of at most `_AT_ONCE` keyframes is rebuilt at once. So is a graph whose rebuild has not ended, because
-        frequent changes could postpone the end for ever. order: (K,) all keyframes. The keyframe at the start of a motion
-        comes before the one at its end.
+        A graph of at most `_AT_ONCE` keyframes is rebuilt at once. A graph whose rebuild has not ended is also rebuilt at
+        once, because frequent changes could postpone the end for ever. order: (K,) all keyframes. The keyframe at the start
+        of a motion comes before the one at its end.
         """
         if self._unfinished or len(order) <= _AT_ONCE:
             self.rebuild()

@@ -10,11 +10,11 @@ from objslam.graph.factor_store import FactorStore, Stored
 from objslam.graph.variables import LETTER, X0, Variables
 
 _RELINEARISE = (0.02, 0.05)
-"""The change (rad, m) of a variable above which its factors are linearised again. Larger values are faster and less exact. A
-change below these values has no noticeable effect on a bearing."""
+"""The factors of a variable are linearised again if the variable changes by more than this (rad, m). Larger values are
+faster and less exact. A change below these values has no noticeable effect on a bearing."""
 _NEVER = 1_000_000
-"""The number of updates between two automatic relinearisations, so large that none happens. The caller asks for one when it
-has time. A smaller number relinearises without a request."""
+"""The number of updates between two automatic relinearisations, so large that none happens. The caller asks for a
+relinearisation when it has time. A smaller number relinearises without a request."""
 
 
 def new_isam(others: Mapping[int, gtsam.Pose3 | Floats]) -> gtsam.ISAM2:

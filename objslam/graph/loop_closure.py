@@ -20,8 +20,8 @@ _SLIPS = (1.0, 3.0, 10.0)
 """The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
 more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _EPOCH = 40
-"""The number of keyframes in a row that are an epoch. The drift since an epoch is computed from only one of its keyframes,
-so a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
+"""An epoch is this number of consecutive keyframes. The drift since an epoch is computed from only one of its keyframes, so
+a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
 
 
 @dataclass
@@ -74,7 +74,7 @@ def find_closure(
     """Return the loop with the most evidence, None if no loop is certain, and the number of compared pairs.
 
     There are two searches. For a long drift, the recently seen landmarks (`active`, (N,)) are matched with all others. For a
-    slip or a push, only the new ones (first seen in the last `_EPOCH` keyframes) are matched with all others.
+    slip or a push, only the new landmarks (first seen in the last `_EPOCH` keyframes) are matched with all others.
 
     A pair is a recent and an old landmark of one label. It counts once for each tried drift.
 
@@ -132,8 +132,8 @@ def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:
 def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, anchors: list[int], now: int) -> list[Floats]:
     """Return covariances (3, 3) of the x, y (m) and yaw (rad) of keyframe `now` relative to each anchor, in the axes of map.
 
-    anchors: keyframes. Each anchor before `now` with a finite covariance gives one for each factor in `_SLIPS`. They include
-    `POSE_FLOOR`.
+    anchors: keyframes. Each anchor before `now` with a finite covariance gives one covariance for each factor in `_SLIPS`.
+    The covariances include `POSE_FLOOR`.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]

@@ -71,7 +71,7 @@ class Multiframes:
         path_T_camera = _path(images) @ images.base_T_camera
         first_T_camera = inverse(path_T_camera[self.first])[self.number] @ path_T_camera
         own = self.first[self.number] == np.arange(len(images))
-        first_T_camera[own] = np.eye(4)  # With rounding errors, they would need factors with an offset.
+        first_T_camera[own] = np.eye(4)  # With rounding errors, all rays would get an offset.
         offset, direction = rays.in_map(first_T_camera)
         return replace(rays, keyframe=self.number[rays.keyframe], direction=direction, offset=offset)
 

@@ -21,20 +21,20 @@ from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import make_values, read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
-"""A rejected ray gets a second chance if at least the share `_MOST` of the rays from `_BESIDE` before it to `_BESIDE` after
-it are rejected. Perhaps the poses are wrong there. A few false boxes in a row get no second chance. Larger values restore
-fewer rays."""
+"""The stretch of a ray goes from `_BESIDE` rays before it to `_BESIDE` rays after it. A rejected ray gets a second chance if
+at least the share `_MOST` of its stretch is rejected. Perhaps the poses are wrong there. A few false boxes in a row get no
+second chance. Larger values restore fewer rays."""
 ROUNDS = 4
 """The most rounds of solve and test. More rounds are slower, and late rounds change few rays."""
 _COARSE = 1e-4
 """A solve before a test of inliers ends when its cost decreases by less than this share. Robust losses converge slowly, and
 a more exact solution hardly changes an inlier. A larger value is faster."""
 _SURE = 0.95
-"""The share of inliers among an object's rays below which the object is triangulated again. A larger share is slower, and
-corrects more objects at wrong positions."""
+"""An object is triangulated again if less than this share of its rays are inliers. A larger share is slower, and corrects
+more objects at wrong positions."""
 _FEWEST = 6
-"""The least number of inliers from which the noise of an object's rays is measured. With fewer, the noise is that of the
-settings. A larger number rejects more rays of noisy objects."""
+"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise is
+that of the settings. A larger number rejects more rays of noisy objects."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,10 @@ def reject_outliers(
     """Solve, and test which rays agree with their objects, until the inliers stay the same, or at most `rounds` times.
 
     map_T_camera (K, 4, 4) and positions (N, 3): the start. An unknown position is NaN. used: (R,) the inliers of an earlier
-    solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the relative
-    decrease of the cost below which the last solve ends. Earlier solves end at `_COARSE`, if that is larger. Inliers of an
-    earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations
-    of a solve on arrays that ended near the start, with Huber's loss and the same variables. The solves go on from them.
+    solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the last
+    solve ends if the cost decreases by less than this share. Earlier solves end at `_COARSE`, if that is larger. Inliers of
+    an earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations of
+    a solve on arrays that ended near the start, with Huber's loss and the same variables. The solves go on from them.
     """
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)
@@ -96,7 +96,7 @@ def reject_outliers(
 class _Solver:
     """Solves the graph of the same measurements for different inliers.
 
-    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves. graph: the last one of GTSAM.
+    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves. graph: the last graph of GTSAM.
     """
 
     measured: Measurements
@@ -230,8 +230,8 @@ def supported(rays: Rays, association: Association, map_T_camera: Floats, positi
 
 
 def widening(residual: Floats, landmark: Ints, count: int) -> Floats:
-    """Return the factor (N,) >= 1 by which the covariance of each landmark grows if its rays miss it by more than their
-    noise.
+    """Return the factor (N,) >= 1 on the covariance of each landmark. It is above 1 if rays miss the landmark by more than
+    their noise.
 
     The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) in units of the noise
     of the settings.

@@ -38,8 +38,8 @@ def solve(
     In fixed mode the association runs once, at the given poses, unless the cameras are calibrated against these poses. In
     joint mode the poses are explored first, unless the log has a localisation. Then association and solve alternate until no
     ray changes its object. At the end, bearings may be turned to the centres of bodies. If the settings ask for it, every
-    label is one object instead. The joint mode also tries this if hardly any frame has two boxes of one label, and keeps
-    it if the rays agree.
+    label is one object, and nothing is associated. The joint mode also tries one object for each label if hardly any frame
+    has two boxes of one label. It keeps the result if the rays agree.
 
     frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With it,
     the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. They are

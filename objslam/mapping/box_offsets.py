@@ -38,8 +38,8 @@ class Sides:
     alike: (C, C) the correlation between the errors of two sides. mean: (C, A) rad, the mean angle by which the rays of a
     side miss the object, along A axes (azimuth and elevation). white: (C,) rad, the standard deviation of this mean if the
     rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset: (C, A,
-    3) rad, the derivative of the mean by an offset that all boxes of the side have, as a share of the object's size. pull:
-    (C, 3, 3) m, the derivative of the object's position by this offset.
+    3) rad, the derivative of the mean by an offset of all boxes of the side. The offset is a share of the object's size.
+    pull: (C, 3, 3) m, the derivative of the object's position by this offset.
     """
 
     alike: Floats
@@ -76,9 +76,9 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     """Return the solution with the errors that boxes share added to its covariances.
 
     The centres of an object's boxes have one offset that is equal from all sides, and one for each side. Both are a share of
-    the object's size. `rays.box_sigma` is the standard deviation of this share, and the prior of its estimate. The share is
-    estimated from the rays if `noise.rays` is true, or if `noise.rays` is auto and `rays.box_sigma` has its default value.
-    In joint mode, the path must also be planar.
+    the object's size. `rays.box_sigma` is the prior standard deviation of this share. The share is estimated from the rays
+    if `noise.rays` is true, or if `noise.rays` is auto and `rays.box_sigma` has its default value. In joint mode, the path
+    must also be planar.
     """
     estimate, prior = solution.estimate, settings.rays.box_sigma
     rays = _sized_rays(solution, cameras, settings)
@@ -188,7 +188,8 @@ def _summed(axes: Floats, cell: Ints, weight: Floats, values: Floats) -> Floats:
 
 
 def _share(seen: list[Sides], prior: float) -> float:
-    """Return the share of the object's size by which the boxes of one side are off: the root mean square over its posterior.
+    """Return by how much the boxes of one side are off, as a share of the object's size: the root mean square over the
+    posterior.
 
     seen: the sides of each object. prior: the standard deviation of a half-normal prior (Gelman 2006). The positions have
     errors too, so the likelihood is the restricted one (Patterson and Thompson 1971).

@@ -2,7 +2,7 @@
 
 A map with one object for two things bends the path, so that both things lie in one place. A solve that estimates the noise
 explains the bend by noise of the odometry, and then all rays agree. So the rays do not tell that the label has two objects.
-Only the evidence for both maps does, at the same noise.
+Only a comparison of the evidence for both maps, at the same noise, tells it.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ if TYPE_CHECKING:
     from objslam.mapping.solution import Solution
 
 _WITNESSES = 2
-"""The least number of other labels that must be seen before and after a moment, to check a label there. The places of two
-objects fix a motion on the floor, so that the path between them cannot bend. With fewer, a bend can bring two things to one
-place. A larger number doubts the labels of more logs. MRCLAM and Lost in the Woods have 2 and more everywhere."""
+"""The least number of other labels that must be seen before and after a moment, to check a label at this moment. The places
+of two objects fix a motion on the floor, so that the path between them cannot bend. With fewer, a bend can bring two things
+to one place. A larger number doubts the labels of more logs. MRCLAM and Lost in the Woods have 2 and more everywhere."""
 _GREW = 1.2
-"""The factor on the noise of the odometry, found by a solve, above which labels are doubted. A bent path needs this noise.
-In simulated drives with a turn on the spot and two things of one label, it was 1.5 to 6, and mostly 4. With one thing for
-each label and the odometry of the settings, it was at most 1.1. A larger factor doubts fewer labels."""
+"""Labels are doubted if a solve finds a larger factor than this on the noise of the odometry. A bent path needs such noise.
+In simulated drives with a turn on the spot and two things of one label, the factor was 1.5 to 6, and mostly 4. With one
+thing for each label and the odometry of the settings, it was at most 1.1. A larger factor doubts fewer labels."""
 _NOISY_BOXES = 2.0
-"""The factor on the noise of boxes, found by a solve with noisy odometry, above which all labels are doubted. If several
-labels have two objects each, they check one another in vain, but their boxes miss. The recorded wheel robots have 0.5 to 1.2
+"""All labels are doubted if a solve with noisy odometry finds a larger factor than this on the noise of boxes. If several
+labels have two objects each, they cannot check one another, but their boxes miss. The recorded wheel robots have 0.5 to 1.2
 with one thing for each label, and a simulated drive with two labels of two things had 4.4. A larger factor doubts fewer
-labels, and a smaller one explores more logs in vain."""
+labels, and a smaller factor explores more logs without need."""
 _REJECTED = 0.1
 """A label is doubted if at least `MANY` of its rays, and at least this share, are rejected. A larger share doubts fewer
-labels. In a smaller share, wrong names and false boxes hide a second object."""
+labels. In a smaller share, a second object cannot be told from wrong names and false boxes."""
 _NOISIER = 1.5
-"""One object for each label may need more noise of boxes or depths than several objects for a label, up to this factor. A
-larger factor favours one object for each label."""
+"""A map with one object for each label may need this multiple of the noise of boxes or depths that a map with several
+objects needs. A larger factor favours one object for each label."""
 
 
 CLEAR_ODDS = 7.0
-"""The log of the odds above which the evidence is clear: 1000 to 1. Bent paths of simulated drives had 107 and more. With a
-larger value, more maps need a look."""
+"""The evidence is clear if the log of the odds is above this: 1000 to 1. Bent paths of simulated drives had 107 and more.
+With a larger value, more maps need a look."""
 
 
 def doubted_names(state: JointState | Solution) -> tuple[str, ...]:
@@ -70,10 +70,9 @@ def has_labels_of(one: JointState, other: JointState) -> bool:
 
 
 def needs_noisy_boxes(named: JointState, other: JointState) -> bool:
-    """Return whether a map with one object for each label needs far noisier boxes than another map of the same log.
+    """Return whether the map `named`, with one object for each label, needs far noisier boxes than another map of the log.
 
-    Then a lower evidence of the other map is no reason to trust this one, because the exploration of the other may only have
-    missed a thing.
+    Then `named` is not trusted, even if `other` has less evidence. The exploration of `other` may only have missed a thing.
     """
     assert named.errors is not None
     assert other.errors is not None
@@ -85,13 +84,13 @@ def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, e
 
     With a localisation the path cannot bend, so no label is doubted. If the map needs noisy odometry and noisy boxes, all
     labels with enough rays for two objects are doubted. If it needs noisy odometry alone, the labels that too few others
-    check (`unchecked_labels`) are doubted. If it needs neither, only those of these labels are doubted of which the map
-    rejects many rays.
+    check (`unchecked_labels`) are doubted. If it needs neither, an unchecked label is doubted only if the map rejects many
+    of its rays.
 
     Args:
-        rays: with their labels.
-        association: of the rays. A second box of a label in one frame may have no object.
-        keyframes: of the rays.
+        rays: the rays, with their labels.
+        association: the object of each ray. A second box of a label in one frame may have no object.
+        keyframes: the keyframes of the rays.
         estimate: the solved map of one object for each label.
     """
     noise = estimate.noise
@@ -107,15 +106,15 @@ def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, e
 
 
 def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
-    """Return the labels of which too few others (`_WITNESSES`) could show that they have a second object.
+    """Return the labels for which too few other labels (`_WITNESSES`) could show a second object.
 
     The rays of a label are divided at a moment, so that each part is large enough for an object of its own. Another label is
     a witness if it has rays before and after this moment. A label is unchecked if it has such a moment with too few
     witnesses.
 
     Args:
-        rays: with their labels.
-        keyframes: of the rays.
+        rays: the rays, with their labels.
+        keyframes: the keyframes of the rays.
     """
     stamps = keyframes.stamps[rays.keyframe]
     order = np.lexsort((stamps, rays.label))
@@ -137,13 +136,14 @@ def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
 
 
 def evidence_against(named: JointState, other: JointState) -> float:
-    """Return the log of the odds for the association of a map over that of another map with one object for each label.
+    """Return the log of the odds for the association of the map `other`, against the association of the map `named`.
 
-    Both maps have the noise of the odometry that `named` found, which suits `named` best. At the noise of the settings, the
-    truth would lose in a log of a robot with worse odometry, because a second object costs less than the error of the path.
-    The noise of boxes and depths shows in each view, whatever the objects are. So if `other` found much less of this noise,
-    both maps have at most `_NOISIER` times what `other` found. A second box around one thing has no object in `named`, so
-    here it has none in `other`. Each map keeps its own shared errors, which count by their prior.
+    Both maps are compared at the noise of the odometry that `named` found. This noise suits `named` best. At the noise of
+    the settings, `named` would lose even if it is right, in a log of a robot with worse odometry: a second object costs less
+    than the error of the path. The noise of boxes and depths shows in each view, whatever the objects are. So if `other`
+    found much less of this noise, both maps have at most `_NOISIER` times what `other` found. A second box around one thing
+    has no object in `named`, so here it has none in `other`. Each map keeps its own shared errors, which count by their
+    prior.
 
     Args:
         named: solved, with one object for each label.

@@ -34,7 +34,7 @@ _STILL = 0.01
 them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
 _WORSE = 2
 """The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
-takes longer, and continues after more rounds in which close objects merged."""
+takes longer, but gets over more rounds in which close objects merge."""
 
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
@@ -46,9 +46,9 @@ class JointState:
 
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
-    (P,) their last values, None before the first solve. hold: whether they are known well enough to stay fixed until the
-    last solve. settled: whether no ray changed its object in the last round. doubted: the labels of which it is not clear
-    whether they name one object or several.
+    (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
+    until the last solve. settled: whether no ray changed its object in the last round. doubted: the labels of which it is
+    not clear whether they name one object or several.
     """
 
     frames: Keyframes
@@ -125,8 +125,8 @@ class JointState:
         """Return the state after association and solve in turns. map_T_base: (K, 4, 4) the first poses.
 
         If an earlier association returns, a few rays could change for ever. Then the best `explained` state since then is
-        returned. A few changed rays hardly change the shared errors, which take most of the time of a solve. So these stay
-        as the first round found them until the rounds end, and are then estimated again.
+        returned. A few changed rays hardly change the shared errors, but their estimation takes most of the time of a solve.
+        So the shared errors stay as the first round found them. After the last round, they are estimated again.
         """
         state, earlier, held = self, dict[bytes, Self](), False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
@@ -168,11 +168,12 @@ class JointState:
         return replace(chosen, rounds=self.rounds, settled=True)
 
     def relocalized(self) -> Self:
-        """Return the state after rounds along the most likely path through its map, if its rays are better `explained`.
+        """Return the state after rounds along the most likely path through its map, if they make the rays better
+        `explained`.
 
-        Rounds in turns keep a path that is bent onto wrong landmarks, because all its rays agree. So each round here begins
-        with the path that is most likely if any ray may belong to any landmark. Every second round holds the shared errors
-        and the noise, as they change little in one round.
+        The rounds of `alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each round
+        here begins with the path that is most likely if any ray may belong to any landmark. Every second round holds the
+        shared errors and the noise, as they change little in one round.
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return self
@@ -209,11 +210,11 @@ class JointState:
         return self.better(turns)
 
     def split(self) -> Self:
-        """Return the state after objects that may be two were split, if its rays are better `explained`.
+        """Return the state after a split of objects that may be two, if the split makes the rays better `explained`.
 
-        Rounds in turns keep two things that one object holds, because the path is bent until all rays agree. So do they keep
-        a phantom where the rays of two things cross. Here all objects whose rays come in two bundles are split at once. The
-        solve takes the bend out of the path, and bundles of one thing are merged again.
+        The rounds of `alternated` do not separate two things that share one object, because the path is bent until all rays
+        agree. They also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles
+        are split at once. The solve takes the bend out of the path, and bundles of one thing are merged again.
         """
         assert self.association is not None
         _, direction = self.rays.in_map(self.solved_poses)
@@ -233,10 +234,11 @@ class JointState:
         return replace(self, ledger=Ledger(), trace=None if self.trace is None else self.trace.aside())
 
     def better(self, attempt: Self) -> Self:
-        """Return the result of an attempt if its association explains more than that of this state, else this state.
+        """Return the result of an attempt if its association explains more than the association of this state. Otherwise
+        return this state.
 
-        The two are compared at the shared errors and the noise of each. An estimate of the noise that is off by chance would
-        otherwise decide.
+        The two associations are compared twice: at the shared errors and the noise of each state. The two gains are added.
+        Otherwise an estimate of the noise that is wrong by chance could decide.
         """
         gain = attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
         return self.replaced(attempt) if gain > 0 else self
@@ -277,7 +279,8 @@ class JointState:
         frames, rays = self.frames, self.all_rays
         if self.errors is not None and self.theta is not None:
             frames, rays, _ = self.errors.take(frames, rays).at(self.theta, drift=False)
-            # If the estimated noise is below the nominal noise, it describes inliers only. The gate needs the larger one.
+            # If the estimated noise is below the nominal noise, it describes inliers only. The gate needs the nominal noise
+            # then.
             rays = replace(rays, sigma=np.maximum(rays.sigma, self.all_rays.sigma))
         mine = self.keyframes
         at = correct_poses(frames.stamps, frames.map_T_base, mine.stamps, mine.map_T_base, map_T_base)
@@ -296,6 +299,6 @@ class JointState:
             position_sigma=place,
             seed=self.settings.seed,
             guess=guess,
-            # Landmarks of a solve hold the path together. Before it, the odometry alone says how two sights of one lie.
+            # The landmarks of a solve hold the path together. Before the first solve, only the odometry does.
             drifts=rough and frames.odom_T_base is not None and not frames.localized_every,
         )

@@ -16,7 +16,7 @@ from objslam.frontend.shared_errors import SharedErrors
 
 MANY, SECOND = 5, 0.25
 """A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
-find fewer."""
+find fewer second objects."""
 _DOUBLE = 0.1
 """One object for each label is tried if at most this share of labels has several boxes in a keyframe, over all keyframes. A
 detector draws some boxes twice, and some false ones. With a larger share, more logs are tried without success. Each try
@@ -25,20 +25,21 @@ _AGREES = 3.0
 """A ray agrees with the object of its label if it is off by at most this many standard deviations. With a larger value,
 fewer boxes can show a second object."""
 _JUDGEMENTS = 2
-"""How often `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays finds too
-little noise, so a second one finds more. A larger number is slower."""
+"""How many times `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays
+finds too little noise, so a second solve finds more. A larger number is slower."""
 _SAME_NOISE = 0.1
-"""The relative change of the noise below which `noise_explains` does not solve again. A larger value ends sooner."""
+"""`noise_explains` does not solve again if the noise changes by less than this share. A larger value ends sooner."""
 
 _CLOCKS = (-1.0, 1.0, -2.0, 2.0)
 """The clock offsets that `clock_explains` tries, in standard deviations of their prior. A solve converges from one standard
 deviation away, so a denser grid is slower and finds nothing new. A wider grid finds clocks that the prior excludes."""
 _SHORT = 500
-"""The largest number of keyframes of a log for which `clock_explains` tries clock offsets. A longer log has enough rays to
-find its clock in one solve. A larger number is slower."""
+"""`clock_explains` tries clock offsets for logs with at most this number of keyframes. A longer log has enough rays to find
+its clock in one solve. A larger number is slower."""
 
 _LARGER = 1.5
-"""The factor on the noise of the settings above which `warn_of_noise` names it. A larger factor names less noise."""
+"""`warn_of_noise` names a noise if the factor on the noise of the settings exceeds this. A larger factor names less
+noise."""
 
 
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:
@@ -55,7 +56,7 @@ def may_be_by_label(settings: Settings, rays: Rays) -> bool:
 def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> Floats:
     """Return the angle (R,), rad, between each ray and the object of its label, NaN if the object has no position.
 
-    estimate: of one object for each label. map_T_camera: (K, 4, 4) the solved poses.
+    estimate: with one object for each label. map_T_camera: (K, 4, 4) the solved poses.
     """
     origins, directions = rays.in_map(map_T_camera)
     return angles_off(origins, directions, estimate.positions[np.searchsorted(np.unique(rays.label), rays.label)])
@@ -64,10 +65,10 @@ def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> F
 def shows_second_object(
     rays: Rays, association: Association, estimate: Estimate, keyframes: Keyframes, map_T_camera: Floats, settings: Settings
 ) -> bool:
-    """Return whether the other boxes of a label meet in a point of their own, more closely than by chance.
+    """Return whether boxes of a label that have no object meet in a point of their own, more closely than by chance.
 
-    These are the boxes without an object. A box that agrees with the object of its label, or that is drawn around the same
-    thing in the same keyframe, shows no second object. keyframes: of the rays. map_T_camera: (K, 4, 4) the solved poses.
+    A box that agrees with the object of its label, or that is drawn around the same thing in the same keyframe, shows no
+    second object. keyframes: the keyframes of the rays. map_T_camera: (K, 4, 4) the solved poses.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
@@ -79,8 +80,8 @@ def shows_second_object(
 
 
 def _drawn_twice(rays: Rays, association: Association) -> Bools:
-    """Return which rays (R,) have the centre of their box inside the box of their label's object in the same keyframe, or
-    the centre of that box inside their own."""
+    """Return which rays (R,) have a box that is drawn around the object of their label. In the same keyframe, the object has
+    a box of its own, and the centre of one of the two boxes is inside the other box."""
     held = np.flatnonzero(association.object >= 0)
     key = rays.keyframe * len(rays.label_names) + rays.label
     order = held[np.argsort(key[held], kind="stable")]
@@ -133,7 +134,8 @@ def noise_explains(
     With too little noise in the settings, poses cannot move far enough. Then the rays of one object look like rays of
     several. So the noise is estimated, even if the settings fix it, and the labels are judged again.
 
-    estimate: in which some label has many rejected rays. errors: the shared errors of the log. solve: solves once.
+    estimate: a solution in which some label has many rejected rays. errors: the shared errors of the log. solve: solves
+    once.
     """
     errors = errors.with_unknown_noise()
     before = NOMINAL if estimate.noise is None else estimate.noise

@@ -148,7 +148,7 @@ def _solve(
             noise = errors.noise if estimate.noise is None else estimate.noise
             images = errors.keyframes
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
-            rays = replace(rays, direction=solution.rays.direction)  # In the solution they may point to centres of bodies.
+            rays = replace(rays, direction=solution.rays.direction)  # They may point to centres of bodies.
         rays = share_bias(rays, solution.association, settings)
         measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images))
     resolved = np.array(there, dtype=np.int64)

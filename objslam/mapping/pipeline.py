@@ -59,7 +59,7 @@ def run(
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
     with _stage("load", seconds, progress):
-        load_libraries()  # In a stage of its own, because this takes longer than a small solve.
+        load_libraries()  # Loading is a stage of its own, because it takes longer than a small solve.
     diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
         if settings.checks.use:

@@ -32,8 +32,8 @@ _BLOCK = 6
 """The number of voxels along the edge of a block. Compared with 8, a value of 6 takes a tenth less time and a quarter less
 memory. A larger number is slower: 16 takes twice the time."""
 _FIRST_BLOCKS = 32_768
-"""The number of blocks for which the grid has memory at first, enough for one room of a house. A full grid doubles its
-memory. A larger number takes more memory in a small scene."""
+"""At first, the grid has memory for this number of blocks, enough for one room of a house. A full grid doubles its memory. A
+larger number takes more memory in a small scene."""
 _SPARE = 1024
 """The number of blocks in the grid that always stay free. Open3D would enlarge a grid on its own, past the limit, if one
 call touches more blocks than are free. A larger number takes more memory."""

@@ -2,7 +2,7 @@
 
 A finding comes from a quick check before the solve (`mapping/checks`). The check keeps odometry and calibration fixed within
 windows of some seconds. So it also reports errors that the joint solve corrects, such as a camera that is turned by some
-degrees and late by 0.1 s. So the solved map repeats the test.
+degrees and late by 0.1 s. Therefore the test is repeated on the solved map.
 """
 
 from dataclasses import replace
@@ -34,28 +34,29 @@ _NOISE = 2.0
 noise, wrong boxes fit too. Larger values refute more findings. Corrected simulated logs have at most 1.6."""
 _MORE = 0.05
 """A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
-more."""
+more findings."""
 _QUIETER = 0.5
-"""If a solve explains the boxes only with noise, a finding stands if its corrected log needs at most this share of the
-noise. A larger share refutes fewer findings. A clean MRCLAM robot has 0.17 of the noise that it has with mirrored images,
-because with these the path must turn the other way. It has 0.15 of the noise that it has with the identity for
-base_T_camera, but 2.9 times the noise in the settings."""
+"""A solve may explain the boxes only with noise. Then a finding stands if its corrected log needs at most this share of the
+noise. A larger share refutes fewer findings. Examples from a clean MRCLAM robot: it needs 0.17 of the noise that its log
+with mirrored images needs, because there the path must turn the other way. It needs 0.15 of the noise that its log with the
+identity for base_T_camera needs, but 2.9 times the noise in the settings."""
 _IN_BOTH = 0.4
-"""The least share of rays of common objects at which the halves of a log agree. Common objects are seen in both halves. The
-share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean simulated logs
-have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve explains the rays of both."""
+"""The halves of a log agree if at least this share of their rays belongs to common objects. Common objects are seen in both
+halves. The share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean
+simulated logs have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve explains the rays of both."""
 
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
     """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
 
-    solution: of the unchanged log. It explains boxes only if its noise is near the settings. The test depends on the basis
-    of a finding. "boxes": the finding is wrong if the solution explains the boxes, or if a solution of the log without the
-    fault explains them no better. If the solution needs noisy odometry, the log without the fault must need it too. If the
-    log without the fault needs noisy odometry, the finding is right only if the solution needs far more noise, of any kind.
-    If neither of the two explains the boxes, the solves show nothing, and a finding stands if the quick look is clear.
-    "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves agree on the objects.
-    "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
+    solution: the solution of the unchanged log. It explains boxes only if its noise is near the settings. The test depends
+    on the basis of a finding. "boxes": the finding is wrong if the solution explains the boxes. It is also wrong if a
+    solution of the log without the fault explains the boxes no better. If the solution needs noisy odometry, the log without
+    the fault must need it too. If the log without the fault needs noisy odometry, the finding is right only if the solution
+    needs far more noise, of any kind. If neither of the two explains the boxes, the solves show nothing, and a finding
+    stands if the quick check is clear. "halves": the finding is wrong if the solution explains the boxes of both halves, or
+    if both halves agree on the objects. "frames": the finding is wrong if the solution explains similar shares of the rays
+    in all frames.
     """
     kept = tuple(
         one
@@ -87,7 +88,7 @@ def _refuted(
     except ObjslamError:
         return unclear
     fits = _least_explained(other) >= _EXPLAINED and _noise(other, rays_only=True) <= _NOISE
-    if not fits:  # A solve may miss right boxes too, as when it takes two things for one. It is no evidence then.
+    if not fits:  # A solve may miss right boxes too, as when it takes two things for one. Such a solve is no evidence.
         return unclear
     quieter = _noise(other) <= _QUIETER * _noise(solution)
     if explained:  # A path that is free to bend explains boxes of a mirrored image too.
@@ -121,7 +122,7 @@ def _late(solution: Solution) -> Bools:
 
 
 def _least_explained(solution: Solution) -> float:
-    """Return the share of explained rays in each half of the log, the smaller of the two."""
+    """Return the smaller of two shares: the shares of explained rays in the halves of the log."""
     explained, late = _explained(solution), _late(solution)
     return float(min(explained[mask].mean() if mask.any() else 0.0 for mask in (late, ~late)))
 

@@ -25,7 +25,8 @@ _MOST_ISLANDS = 100
 def write_site(islands: Sequence[Island], names: Sequence[str], out: Path, warnings: Sequence[str] = ()) -> list[Path]:
     """Write the largest island into the folder `out`, the others into `out`/island_2 and so on. Return their folders.
 
-    names: of all sessions, in their order. warnings: each summary.json gets them. OutputError if a folder cannot be written.
+    names: the names of all sessions, in their order. warnings: each summary.json gets them. OutputError if a folder cannot
+    be written.
     """
     folders = [out if number == 0 else out / f"island_{number + 1}" for number in range(len(islands))]
     for folder, island in zip(folders, islands, strict=True):

@@ -32,7 +32,8 @@ def load_summary(out: Path) -> dict[str, Any]:
 
 
 def load_up(path: Path) -> Up:
-    """Read the axis that points up, of a result folder or of the objects.json in it. It is z for a map without a summary."""
+    """Read which axis points up in the map of a result folder, or of the objects.json in it. It is z for a map without a
+    summary."""
     out = path.parent if path.is_file() else path
     known = (out / files.SUMMARY).is_file() and (not path.is_file() or path.name == files.OBJECTS)
     up: Up = load_summary(out).get("up", "z") if known else "z"
@@ -126,7 +127,8 @@ def load_truth(path: Path) -> Truth | None:
 
     Args:
         path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
-            of its log. The objects.json of a result folder is not a truth. To compare two results, give that file itself.
+            of its log. The objects.json of a result folder is not taken for the truth. To compare two results, give the path
+            of that file itself.
     Raises:
         LogError: the path does not exist, or the truth is malformed.
     """

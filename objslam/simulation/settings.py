@@ -58,8 +58,8 @@ class DepthNoise(Section):
 class AppearanceNoise(Section):
     """The appearance vectors of boxes, and how often they confuse objects.
 
-    A vector is that of its object plus noise. It confuses its object if it is nearer to the vector of another object of the
-    label. The noise is as large as the share of confused boxes demands.
+    The vector of a box is the vector of its object plus noise. The vector confuses its object if it is nearer to the vector
+    of another object with the same label. The noise follows from the share of confused boxes.
     """
 
     confusion: Probability = 0.2  # The share of boxes that are confused, among those of labels with two objects or more.

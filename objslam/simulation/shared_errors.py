@@ -47,7 +47,7 @@ def _wrong_odometry(odometry: Trajectory, errors: Mapping[str, float]) -> Trajec
     yaw, place = np.unwrap(plane[:, 2]), plane[:, :2]
     turns = (np.diff(yaw) - turn_bias * np.diff(odometry.stamps)) / (1 + turn_scale)
     said = yaw[0] + np.append(0.0, np.cumsum(turns))
-    # A step is along the mean of the headings at its ends, so an error of the headings turns it by their mean error.
+    # A step is along the mean of the headings at its ends, so errors of these headings turn the step by their mean.
     chord = np.diff(place, axis=0) @ [1, 1j] * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
     ways = chord / (1 + scale) * np.exp(0.5j * (said[1:] + said[:-1]))
     path = place[0] @ [1, 1j] + np.append(0, np.cumsum(ways))

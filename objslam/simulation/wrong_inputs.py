@@ -171,7 +171,7 @@ def _camera_moved(log: Log) -> Log:
 
 
 def join(first: Log, second: Log, *, interleaved: bool) -> Log:
-    """Return a log with boxes of two recordings: in turns frame by frame if `interleaved`, else one half of each.
+    """Return a log with boxes of two recordings. If `interleaved`, their frames alternate, else each gives one half.
 
     Poses, stamps and calibration are from the first recording.
     """

@@ -7,7 +7,7 @@ from objslam.core.camera import Camera, spoken_name, undistort
 _SECTORS = ("ahead", "ahead and left", "left", "behind and left", "behind", "behind and right", "right", "ahead and right")
 _STEEP = 60.0  # From this elevation, degrees, a camera "looks up" or "looks down". With a larger value, fewer do.
 _LEVEL = 5.0  # The text omits an elevation or a tilt of at most this, degrees. A larger value omits more of them.
-_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx is larger. Real lenses are below 1.1. Larger reports fewer.
+_ASPECT = 1.2  # A camera is reported if fx / fy or fy / fx exceeds this. Real lenses are below 1.1. More reports fewer.
 
 
 def view_of(camera: Camera) -> str:
@@ -41,7 +41,8 @@ def doubts_of(camera: Camera) -> list[str]:
 
 
 def _has_no_rotation(camera: Camera) -> bool:
-    """Return whether base_T_camera has no rotation. On a robot, it is then not set, and says nothing of the direction."""
+    """Return whether base_T_camera has no rotation. On a robot, nobody has set it then, and it says nothing about the
+    direction of the camera."""
     return np.allclose(camera.base_T_camera[:3, :3], np.eye(3), atol=1e-6)
 
 

@@ -41,8 +41,8 @@ _KINDS = "Kind of the recording: log, ros, mrclam, tum, tum_numbered, journal. [
 @dataclass(frozen=True)
 class AnyOptions:
     """The options of every source. format: the name of the source. None chooses the source by the recording's content.
-    class_names: of `frontend.class_names.load_names`, for labels that are numbers. None keeps the numbers. begin, end: the
-    stamps, s, between which the recording is used. None for no limit.
+    class_names: the names for labels that are numbers, as `frontend.class_names.load_names` takes them. None keeps the
+    numbers. begin, end: the stamps, s, between which the recording is used. None for no limit.
     """
 
     format: Annotated[str | None, Option("--format", _KINDS)] = None

@@ -128,8 +128,9 @@ def path_length(positions: Floats) -> float:
     """Return the length of a path, m, without the steps of its noise.
 
     A chord goes from a position to the next one that is `_STEP` sigmas of the noise away. The noise along a path cancels
-    from chord to chord, and the noise across it makes a chord longer by the square of sigma over its length, 1 %. positions:
-    (N, 3), m. White noise is large in their second differences, and motion is small there.
+    from chord to chord. The noise across the path makes a chord longer by the share (sigma / length)^2, 1 %. positions: (N,
+    3), m. The noise is measured from the second differences of the positions: white noise is large there, and motion is
+    small.
     """
     bends = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=1)
     sigma = float(np.median(bends)) / (RAYLEIGH_MEDIAN * np.sqrt(6.0)) if len(bends) else 0.0

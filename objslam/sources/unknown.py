@@ -30,7 +30,7 @@ def unknown_recording(path: Path, is_recording: Callable[[Path], bool], looked_f
 
 
 def _file(path: Path) -> tuple[str, str]:
-    """Return what a file is, and what to do."""
+    """Return what a file is, and what the user can do with it."""
     ending = path.suffix.lower()
     if not path.is_file():
         return "this is neither a file nor a folder", _NEEDED
@@ -46,7 +46,7 @@ def _file(path: Path) -> tuple[str, str]:
 
 
 def _folder(path: Path, is_recording: Callable[[Path], bool], looked_for: str) -> tuple[str, str]:
-    """Return what a folder holds, and what to do."""
+    """Return what a folder holds, and what the user can do with it."""
     inside = sorted(item for item in path.iterdir() if not item.name.startswith("."))
     if not inside:
         return "the folder is empty", _NEEDED

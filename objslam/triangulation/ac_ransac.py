@@ -2,7 +2,8 @@
 
 No fixed threshold fits all objects, because the box of a large object wanders by many times the pixel noise. So the
 consensus is the subset of rays whose agreement is the least likely by chance (Moisan & Stival, IJCV 57, 2004; Moisan, Moulon
-& Monasse, IPOL 2, 2012). The number of false alarms (NFA) measures this: how many subsets would agree as well by chance.
+& Monasse, IPOL 2, 2012). The number of false alarms (NFA) measures this: how many subsets would agree equally well by
+chance.
 """
 
 import math
@@ -22,11 +23,12 @@ from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.point_to_lines import PointSolution, minimise_distances
 
 _VIEW_CAP = 1 - math.cos(math.radians(45))
-"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle."""
+"""The solid angle, in units of 2 pi sr, in which wrong boxes are evenly distributed: a cone of 45 degrees half angle. With a
+larger angle, agreement counts as chance more rarely."""
 _NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score the same.
-_MOST_NOISE = 0.25  # Noise takes at most this share of the view. With a larger share, very noisy rays agree with any point.
+_MOST_NOISE = 0.25  # Noise covers at most this share of the view. With a larger share, noisy rays agree with any point.
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a hypothesis computed together. A larger value needs more memory.
-_MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end earlier if the agreement stops growing.
+_MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end if the agreement stops growing. More are slower.
 
 
 def fit_consensus(
@@ -37,8 +39,9 @@ def fit_consensus(
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
     far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
     within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
-    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. So does a `judged` (N,)
-    object, whose rays do not meet by chance, if all agree within noise. hypotheses, jitter: for `best_pair`.
+    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. A `judged` (N,) object also
+    keeps all its rays if they agree within noise, because its rays do not meet by chance. hypotheses, jitter: as in
+    `best_pair`.
     """
     xp = module_of(bundle.origin)
     used = xp.ones_like(bundle.index, dtype=xp.bool)
@@ -107,7 +110,8 @@ def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) -> Tensor:
-    """Return for each object the midpoint (B, 3) of two rays with which its rays agree most. NaN if no midpoint exists.
+    """Return for each object the midpoint (B, 3) of two of its rays: the midpoint with which its rays agree most. NaN if no
+    midpoint exists.
 
     objects: (B,) indices. hypotheses: the most pairs tried per object. If an object has more pairs, their list is split into
     `hypotheses` equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of
@@ -135,7 +139,7 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
 
 
 def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the indices (B, H) `first` < `second` of the two rays of each pair among the rays of an object, and whether the
+    """Return the two rays of each pair, as indices (B, H) `first` < `second` among the rays of an object, and whether the
     pair exists. number: (B,) rays of each object. which, jitter: (H,) the indices and the jitter of the hypotheses."""
     xp = module_of(number)
     n = as_type(number[:, None], jitter)
@@ -170,8 +174,8 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 
 
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
-    """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes as close to the point (B, H, 3). It
-    is 1 for a ray that points away from the point, and for a ray that is not `real`."""
+    """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes the point (B, H, 3) at least as
+    closely. It is 1 for a ray that points away from the point, and for a ray that is not `real`."""
     xp = module_of(points)
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
@@ -186,8 +190,8 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
 
 
 def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the lowest log NFA (B, H) over all k, and the k-th lowest chance for this k. The k rays with the lowest chances
-    are the ones that agree. chance: (B, H, n) of each ray.
+    """Return the lowest log NFA (B, H) over all numbers k of agreeing rays, and the k-th lowest chance for this k. The
+    agreeing rays are those with the lowest chances. chance: (B, H, n) of each ray.
 
     NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
     and 3 of them determine the point. Each p counts for 2 coordinates.

@@ -8,7 +8,7 @@ from objslam.core.array_module import Tensor, indices_of, module_of
 _SIMILAR = (2, 32)
 """The numbers a and b. If the smallest object of a block has n rays, the largest one has at most a n + b rays. Fillers make
 all objects of a block equally long. Larger values make fewer blocks with more fillers. With these values, at most about half
-of a block is fillers. It is more if objects have few rays, but then they cost little."""
+of a block is fillers. The share is larger if objects have few rays, but such a block costs little."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
 from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.lines import Lines
 
-_EVERY_PAIR = 256  # The most rays of an object for which `parallax` compares every pair. A larger number costs time.
+_EVERY_PAIR = 256  # Up to this number of rays of an object, `parallax` compares every pair. A larger number costs time.
 _PLACES = 1 << 13  # The most rays, with fillers, that `parallax` compares together. A larger number needs memory.
 _RANGE_ITERATIONS = 30  # The iterations of the range fit of every object. The fit starts at the median range.
 
@@ -18,9 +18,9 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     & Ronchetti, Robust Statistics, ch. 6). The offset of ray i is Gaussian with standard deviation s_i along both axes
     across the ray. Then the direction u of the offset has E[u u^T] = P / 2, where P projects across the ray. The length d of
     the offset is independent of u, and E[1 / d] = sqrt(pi / 2) / s_i. So a ray adds sqrt(pi / 2) / (2 s_i) P to A, and P / 2
-    to B. Residuals above s_i widen the result. Smaller ones do not narrow it. Eq. 1 also has a bias that more rays do not
-    reduce: rays miss a nearer object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2) sigma_i^2
-    r_i / s_i, where r_i is the length of the ray. The result includes the square of this bias.
+    to B. Residuals above s_i widen the result. Smaller residuals do not narrow it. Eq. 1 also has a bias that more rays do
+    not reduce: rays miss a nearer object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2)
+    sigma_i^2 r_i / s_i, where r_i is the length of the ray. The result includes the square of this bias.
     """
     xp = module_of(point)
     rays = bundle.select(use)
@@ -122,7 +122,7 @@ def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
-    Of more than `_EVERY_PAIR` rays, only the ones nearest to 64 evenly spread axes are compared. The angle is then exact to
+    Of more than `_EVERY_PAIR` rays, only the rays nearest to 64 evenly spread axes are compared. The angle is then exact to
     1 %."""
     xp = module_of(bundle.direction)
     rays = bundle.select(use)
@@ -171,9 +171,9 @@ def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
     """Return the factor (N,), at least 1, by which the variance of the residuals exceeds its expectation.
 
     miss: (R,) normalised residuals. Their mean is used, because it is more robust than their mean square. taken: how many of
-    the 2 n degrees of freedom of n rays the fit uses up. The excess over 1 is enlarged, because an estimate from few degrees
-    of freedom, `rest`, is uncertain. The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest), divided by its
-    limit for a large rest. It is exact to 3 % from 4 rays on.
+    the 2 n degrees of freedom of n rays the fit uses up. The excess over 1 is enlarged, because few remaining degrees of
+    freedom (`rest`) give an uncertain estimate. The enlargement 1 + 3.2 / (rest - 2) is the 95 % quantile of F(3, rest),
+    divided by its limit for a large rest. It is exact to 3 % from 4 rays on.
     """
     number = as_type(rays.number, miss)
     mean = group_sum(miss, rays.index, len(number)) / number.clip(min=1) / RAYLEIGH_MEAN

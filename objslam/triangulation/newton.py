@@ -1,7 +1,7 @@
 """Newton's method for Eq. 1, for all objects of a block at once.
 
-The distance d from a line along n has the gradient u = q / d and the Hessian t t^T / d, where q is the offset of the point
-from the line and t = n x u. The unit of length is about the mean distance of an object from its lines.
+Let q be the offset of the point from a line along n, and d its length, the distance. The distance has the gradient u = q / d
+and the Hessian t t^T / d, where t = n x u. The unit of length is about the mean distance of an object from its lines.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ improve a single-precision point."""
 _STEPS = 6
 """The most Newton steps in double precision. An object that needs more has a line through or near its solution."""
 _LINE_STEPS = 6
-"""The number of Newton steps along the nearest line."""
+"""The number of Newton steps along the nearest line. More steps are more exact and slower."""
 _SHORTER = 0.3
-"""The factor for a step that did not lower the cost enough."""
+"""The factor for a step that did not lower the cost enough. A larger factor shortens the step less."""
 _SINGLE, _DOUBLE = 2.0**-23, 2.0**-52
 """The relative distance between neighbouring numbers near 1, in single and in double precision."""
 _TINY = 1e-30
@@ -87,7 +87,7 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
 
 
 def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return what `newton` does.
+    """Solve objects whose nearest line to the start (3, B) passes through or near the solution. Return the same as `newton`.
 
     First, the point on this line with the least sum of distances from the other lines is found. Across the line, this sum
     has a gradient at the point. If the gradient is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming 4,
@@ -123,8 +123,9 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
 
 
 def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return, at points (3, B), the gradient (3, B) of Eq. 1, its second derivative (B,) along the unit vectors `axis`
-    (3, B), and the rounding error (B,) of the gradient, in units of epsilon: the sum of 1 + 1 / d, at most 1e6."""
+    """Return three values of Eq. 1 at points (3, B): the gradient (3, B), the second derivative (B,) along the unit vectors
+    `axis` (3, B), and the rounding error (B,) of the gradient. This error is in units of epsilon: the sum of 1 + 1 / d, at
+    most 1e6."""
     q = lines.offset(point)
     inverse = lines.weight / norm(q).clip(min=_TINY)
     u = q * inverse

@@ -28,7 +28,8 @@ _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
 more than one of numpy. Larger blocks do not fit into the cache of a CPU: blocks four times as large take 1.1 (numpy) and 1.2
 times (torch) as long. On CUDA, a ray needs 1 kB. The number for CUDA was not measured."""
 _ROUNDS = 3
-"""The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest."""
+"""The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest.
+More rounds leave fewer objects for it."""
 _LEAST_REGULAR = 1e-6
 """If a matrix is less regular than this (from 0 to 1), its eigenvalues decide whether the lines fix a point. A larger value
 computes eigenvalues more often."""

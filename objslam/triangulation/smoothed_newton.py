@@ -99,11 +99,11 @@ def _newton_step(lines: LineBlock, o: Tensor, q: Tensor, y: Tensor, epsilon: Ten
 
 
 def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float) -> tuple[Tensor, Tensor]:
-    """Return the exact optimum (3, B) next to the smoothed one, and the norm (B,) of its smallest subgradient.
+    """Return the exact optimum (3, B) next to the smoothed optimum, and the norm (B,) of its smallest subgradient.
 
-    Lines within the distance `on_line` of the smoothed solution are assumed to pass through the exact one. The point moves
-    onto these lines. Newton steps then move it in the directions that the lines leave free. The subgradient shows whether
-    the assumption is right. Its norm is inf if the lines do not meet.
+    Lines within the distance `on_line` of the smoothed solution are assumed to pass through the exact solution. The point
+    moves onto these lines. Newton steps then move it in the directions that the lines leave free. The subgradient shows
+    whether the assumption is right. Its norm is inf if the lines do not meet.
     """
     xp = module_of(point)
     on = xp.where(norm(lines.offset(point)) <= on_line, lines.weight, 0.0)

@@ -70,15 +70,15 @@ def triangulate(
     An object is ok under three conditions. At least 2 rays agree more closely than by chance. Their parallax and the
     relative precision meet the limits of the settings. The object lies ahead of most of them. A measured range replaces the
     parallax. Without `settings.consensus`, all rays are used, and chance is not judged. Ranges are fused only for an object
-    whose rays fail these limits, or for which all ranges are more precise than all rays. Other objects keep the position of
-    Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result for an object does not
-    depend on other objects or on ray order.
+    whose rays fail these limits, or whose ranges, taken together, are more precise than its rays. Other objects keep the
+    position of Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result for an object
+    does not depend on other objects or on ray order.
 
     Args:
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.
         object_index: (R,) the object of each ray, -1 for none, of `count` objects.
         sigma: (R,) or one number, rad, the noise of a ray's angle along each perpendicular axis.
-        seed: of the random pairs of rays that are tried.
+        seed: the seed for the random choice of pairs of rays.
         ranges: (R,) m along the rays, NaN if unknown. range_sigma: (R,) or one number, m, the noise of the ranges.
         range_bias: (R,) or one number, m, the standard deviation of the error that all ranges of an object share.
         position_sigma: m, the noise of the origins along each axis.
@@ -234,8 +234,8 @@ def _vector(values: ArrayLike, length: int, name: str) -> Floats:
 
 
 def _positive(values: ArrayLike, length: int, name: str, needed: Floats | None = None) -> Floats:
-    """Return one value per ray. ValueError if one is not finite and above 0. Where `needed` (R,) is not finite, no value is
-    needed: a wrong one becomes 1."""
+    """Return one value per ray. ValueError if a value is not finite and above 0. Where `needed` (R,) is not finite, no value
+    is needed: a wrong value becomes 1."""
     vector = _vector(values, length, name)
     fine = np.isfinite(vector) & (vector > 0)
     if not (fine if needed is None else fine | ~np.isfinite(needed)).all():

@@ -108,7 +108,8 @@ def virtual_cameras(origins: Floats, directions: Floats) -> list[gtsam.Pose3]:
 def tangent_basis(directions: Floats) -> Floats:
     """Return two unit vectors (R, 3, 2) across unit directions (R, 3), as GTSAM chooses them (`Unit3::basis`).
 
-    The first one is the cross product of the direction and the axis along which its component is smallest in absolute value.
+    The first vector is the cross product of the direction and an axis: the axis along which the direction has its smallest
+    component in absolute value.
     """
     first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)

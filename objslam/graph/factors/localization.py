@@ -2,8 +2,9 @@
 
 The error of a pose may be new in each pose, or last for seconds, or both. A lasting error is a first-order Gauss-Markov
 process (Jazwinski 1970, 4.5): between two poses it keeps the share r = exp(-t / T), and r^2 of its variance. The information
-of such a chain is a sum of terms on single errors and on differences of consecutive errors. So poses whose errors last are
-weak absolute poses, and precise motions from pose to pose: priors and between-factors, without further variables.
+of such a chain is a sum of terms on single errors and on differences of consecutive errors. So a localisation whose errors
+last gives weak absolute poses, and precise motions from pose to pose. They become priors and between-factors, without
+further variables.
 """
 
 from dataclasses import dataclass
@@ -81,8 +82,8 @@ def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: 
 def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> LocalizedMotions | None:
     """Return the motions that a localisation measures because its errors last. None if its errors are new in each pose.
 
-    A motion is known in the frame of the robot, whose heading errs. The error of the heading turns the motion to a side. It
-    may last too, so it counts with the noise of the absolute heading.
+    A motion is known in the frame of the robot, whose heading errs. The error of the heading turns the motion to a side. The
+    error of the heading may last too. So it counts with the noise of the absolute heading.
     """
     if not keyframes.localized_every or not any(one.share for one in keyframes.lasting) or len(keyframes) < 2:
         return None
@@ -121,9 +122,10 @@ def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floa
 def chain(gaps: Floats, sigma: float, lasting: Lasting) -> tuple[Floats, Floats]:
     """Return the standard deviations (K,) of errors, and (K-1,) of their differences, as independent terms.
 
-    The two are exact if the whole error lasts, or nothing of it. An error with both parts has no such terms. It gets those
-    with its information about constant errors and about errors that change their sign from pose to pose. Between these two,
-    the true information is larger, because it is a concave function of 2 - 2 cos(w), and the terms are linear in it.
+    The terms are exact if the whole error lasts, or if nothing of it lasts. An error with both parts has no exact terms. Its
+    terms have the true information about constant errors, and about errors that change their sign from pose to pose. At the
+    frequencies w between these two, the true information is larger: it is a concave function of 2 - 2 cos(w), and the terms
+    are linear in 2 - 2 cos(w).
 
     Args:
         gaps: (K-1,) s, the times between consecutive errors.

@@ -35,7 +35,7 @@ class LocalizedRows:
         return whitening(self.of.covariance)
 
     def weighted_roots(self, map_T_camera: Floats) -> Floats:
-        """Return `roots` with the roots of Huber's weights at poses (P, 4, 4)."""
+        """Return `roots` times the roots of Huber's weights at poses (P, 4, 4)."""
         off = log_se3(inverse(self.of.motion) @ self.moved(map_T_camera))
         weight, _ = huber_roots(np.linalg.norm((self.roots @ off[..., None])[..., 0], axis=1))
         return self.roots * weight[:, None, None]
@@ -45,8 +45,8 @@ class LocalizedRows:
         return np.asarray(inverse(map_T_camera[self.of.before]) @ map_T_camera[self.of.after])
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:
-        """Return the whitened residuals (s, 6) at poses (P, 4, 4), their derivatives (s, 6, 12), and the cost. Landmarks do
-        not count."""
+        """Return the whitened residuals (s, 6) at poses (P, 4, 4), their derivatives (s, 6, 12), and the cost. The landmarks
+        are not used."""
         moved = self.moved(map_T_camera)
         off = log_se3(inverse(self.of.motion) @ moved)
         white = (self.roots @ off[..., None])[..., 0]

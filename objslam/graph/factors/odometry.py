@@ -25,9 +25,9 @@ def motions(
     """Return the camera motions (M, 4, 4) between pairs of keyframes, and their covariances (M, 6, 6).
 
     A motion is E_prev^-1 * odo * E_next. E is base_T_camera, and odo is the motion of base. The covariance is Ad(E_next^-1)
-    S Ad(E_next^-1)^T plus a floor for each keyframe, with the rotation first. S is the covariance that the odometry
-    accumulated between the two keyframes, in the base frame at the second one, plus that of their interpolated poses. Rows
-    where `Keyframes.measured` is false have no meaning. ValueError if the keyframes have no odometry.
+    S Ad(E_next^-1)^T plus a floor for each keyframe, with the rotation first. S is in the base frame at the second keyframe.
+    It is the covariance that the odometry accumulated between the two keyframes, plus the covariance of their interpolated
+    poses. Rows where `Keyframes.measured` is false have no meaning. ValueError if the keyframes have no odometry.
 
     Args:
         on_plane: whether the path is planar. If it is None, the poses decide.
@@ -51,7 +51,8 @@ def motions(
 def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) -> Floats:
     """Return the covariances (M, 6, 6) that the interpolation between poses of the odometry adds to motions.
 
-    Like `Keyframes.drift`, they are in the frame of odom_T_base. Half of the noise of a motion inside a step is at each end.
+    Like `Keyframes.drift`, they are in the frame of odom_T_base. If a motion is inside one step of the odometry, half of its
+    noise is at each end of the motion.
 
     Args:
         before, after: (M,), (M,) the keyframes, with odometry.

@@ -2,9 +2,10 @@
 
 Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent, because the odometry
 knows the whole step: a robot that turned late in one motion turned more in the next. So the motions inside a step get the
-loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact: let motions
-with the shares d of a step have the noise D d of the odometry and the bridge W (diag(d) - d d'). Then their information is
-the sum of two: that of independent motions with the noise (D + W) d, and that of a tie, 1 / D - 1 / (D + W).
+loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact. Let the
+motions take the shares d of a step. Their noise is D diag(d) from the odometry, plus the bridge W (diag(d) - d d'). Then
+their information is a sum: the information of independent motions with the noise (D + W) d, plus the information 1 / D - 1 /
+(D + W) of a tie.
 """
 
 from dataclasses import dataclass, replace
@@ -21,18 +22,18 @@ from objslam.graph.factors.odometry import motions, wander
 
 _LEAST_TOLD = 0.1
 """A tie is used if it gives at least this share of the information about a motion in some direction. With a larger share,
-fewer ties are used, and the motions below them count as independent. With a smaller one, faster odometry has ties too, which
-hardly change the solution but take time."""
+fewer ties are used, and the motions below them count as independent. With a smaller share, faster odometry has ties too.
+They hardly change the solution, but take time."""
 _NOTHING = 1e-6
-"""A tie gives at least this share of the information about a motion in each direction, so that its information matrix has an
-inverse. A tie has no information in directions in which the motions inside a step are not loose. A larger share adds more
-false information there."""
+"""The least share of the information about a motion that a tie gives in each direction. It makes sure that the information
+matrix of a tie has an inverse. A tie has no information in directions in which the motions inside a step are not loose. A
+larger share adds more false information there."""
 
 
 @dataclass(frozen=True)
 class OdometryMotions:
-    """M camera motions: first those between consecutive keyframes, then the ties. The motions below a tie are those between
-    its two keyframes.
+    """M camera motions: first the motions between consecutive keyframes, then the ties. The motions below a tie are the
+    motions between its two keyframes.
 
     before, after: (M,) the keyframes. motion: (M, 4, 4). noise: (M, 6, 6) of the odometry. wander: (M, 6, 6) of the
     interpolated path, which adds to the noise. loose: (T, 6, 6) for each of the T ties, the noise and wander of the
@@ -82,7 +83,7 @@ class OdometryMotions:
 
     @cached_property
     def covariance(self) -> Floats:
-        """(M, 6, 6). The covariance of a tie is that of the information it adds to the motions below it."""
+        """(M, 6, 6). For a tie, the inverse of the information that the tie adds to the motions below it."""
         covariance = self.noise + self.wander
         ties = slice(len(self) - len(self.loose), len(self))
         if len(self.loose):
@@ -101,8 +102,7 @@ def _in_camera(keyframes: Keyframes, last: Ints, covariance: Floats) -> Floats:
 
 
 def below_ties(ties: Ints, count: int) -> Bools:
-    """Return which motions (count - 1,) between consecutive keyframes lie between the two keyframes of one of the ties (T,
-    2)."""
+    """Return which motions (count - 1,) between consecutive keyframes are below one of the ties (T, 2)."""
     ends = np.zeros(count, dtype=np.int64)
     np.add.at(ends, ties[:, 0], 1)
     np.add.at(ends, ties[:, 1], -1)
@@ -112,8 +112,8 @@ def below_ties(ties: Ints, count: int) -> Bools:
 def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
     """Return the pairs (T, 2) of keyframes that need a tie, one after the other along the path.
 
-    A tie connects the keyframes that are nearest to two poses of the odometry, if there are others between them. If the
-    interpolation errs by less than the odometry, the tie is left out.
+    A tie connects the keyframes that are nearest to two poses of the odometry, if other keyframes lie between the two. If
+    the interpolation errs by less than the odometry, the tie is left out.
     """
     nothing = np.zeros((0, 2), dtype=np.int64)
     if keyframes.step is None or keyframes.wander is None or len(keyframes) < 3:
@@ -133,8 +133,8 @@ def find_ties(keyframes: Keyframes, settings: Settings) -> Ints:
 
 
 def _told(whole: Floats, loose: Floats) -> tuple[Floats, Floats]:
-    """Return the shares (T, 6) of the information 1 / `whole` that is not in 1 / `loose`, and the axes (T, 6, 6) of these
-    shares."""
+    """Return which share (T, 6) of the information of `whole` is not in the information of `loose`, along each of six axes,
+    and these axes (T, 6, 6)."""
     root = np.linalg.cholesky(whole)
     back = np.linalg.inv(root)
     size, axes = np.linalg.eigh(back @ loose @ np.swapaxes(back, 1, 2))

@@ -134,7 +134,8 @@ class JointGraph:
         return np.asarray(np.einsum("nji,nj->ni", poses[:, :3, :3], landmarks[self.landmark] - poses[:, :3, 3]))
 
     def bearing_axes(self, to_landmark: Floats) -> Floats:
-        """Return the axes (n, 3, 2) of the residuals of rays with landmarks at `to_landmark` (n, 3) from their origins."""
+        """Return the axes (n, 3, 2) of the residuals of rays. to_landmark: (n, 3) from the origin of each ray to its
+        landmark."""
         return residual_axes(self.rays.direction, to_landmark, self.rays.offset, self._metric)
 
     def bearing_residuals(self, directions: Floats, to_landmark: Floats, axes: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Load the libraries of every solve. What a library loads for other purposes is not loaded."""
+"""Load the libraries of every solve. Parts of a library that serve other purposes are not loaded."""
 
 import sys
 from importlib import import_module

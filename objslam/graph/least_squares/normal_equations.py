@@ -41,7 +41,7 @@ class NormalEquations:
         return found
 
     def late(self, columns: Ints, most: int) -> Ints:
-        """Return those of some columns (n,) that are eliminated among the `most` last ones, for `last_block`."""
+        """Return those of `columns` (n,) that are among the last `most` eliminated columns. `last_block` takes them."""
         straight = np.arange(len(self.order))
         if not all(np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)):
             return columns[:0]
@@ -50,9 +50,9 @@ class NormalEquations:
     def last_block(self, columns: Ints) -> Floats:
         """Return the block (n, n) of the inverse at some columns (n,), which are `late`.
 
-        With J^T J = L U, the last block of the inverse is the inverse of the last block of L times the last block of U.
-        Landmarks are eliminated late, because many poses see them. So their covariances come from a small dense matrix,
-        where `solve` would go through all poses for each column.
+        Let J^T J = L U. Multiply the last block of L by the last block of U. The inverse of this product is the last block
+        of the inverse of J^T J. Landmarks are eliminated late, because many poses see them. So their covariances come from a
+        small dense matrix. `solve` would go through all poses for each column.
         """
         if not len(columns):
             return np.zeros((0, 0))

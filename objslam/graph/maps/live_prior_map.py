@@ -25,8 +25,8 @@ def tie_frame(graph: IncrementalGraph, map_T_graph: Floats) -> None:
 def tie_objects(graph: IncrementalGraph, landmarks: Ints, own: Floats, position: Floats, covariance: Floats) -> None:
     """Tie landmarks (n,) to objects of the map with positions (n, 3) m and covariances (n, 3, 3) m^2.
 
-    F must be in the graph. own: (n, 3, 3) m^2, in the frame of the graph: the covariance of errors of the landmarks that the
-    graph does not contain, such as the offsets of boxes.
+    F must be in the graph. own: (n, 3, 3) m^2, in the frame of the graph: the covariance of those errors that the graph does
+    not contain, such as the offsets of boxes.
     """
     frame = map_T_graph(graph)
     assert frame is not None

@@ -2,12 +2,12 @@
 
 The graph of the drive stays in its own frame. The pose of this frame in the map is one more variable, F. Each object has two
 points. The rays of the drive point to L(j), in the frame of the drive. P(j) = F * L(j) + e(j) is in the map. The error e(j)
-has the errors that the graph of the drive does not contain, such as the offsets of boxes. If the map has the object, its
-estimate is the prior of P(j).
+is the sum of the errors that the graph of the drive does not contain, such as the offsets of boxes. If the map has the
+object, its estimate is the prior of P(j).
 
-The registration gives only the start and the matches, so that the map counts once. The objects of a drifted map share
-errors, but the map does not tell which. The priors count as independent. So the largest error that all objects can share is
-added to the covariance of the frame. Otherwise many objects would make the frame look too exact.
+The registration gives only the start and the matches, so that the map counts once. The objects of a drifted map share errors
+that the map does not tell, and the priors count as independent. So many objects would make the frame look too exact.
+Therefore, the largest error that all objects can share is added to the covariance of the frame.
 """
 
 from dataclasses import dataclass
@@ -139,7 +139,7 @@ def _drive_factors(
 def _unknown_to(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
 ) -> Floats:
-    """Return the part (n, 3, 3), m^2, of the covariances of the objects `there` that the graph does not contain."""
+    """Return the covariances (n, 3, 3), m^2, of those errors of the objects `there` that the graph does not contain."""
     floor = LEAST**2 * np.eye(3)
     if measured is None:  # `_drive_factors` has the other half. Equal halves condition the linear system best.
         return estimate.covariance[there] / 2 + floor

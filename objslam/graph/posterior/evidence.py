@@ -26,12 +26,12 @@ def log_evidence(
     """Return the log evidence for an association, up to a constant that all associations of the same rays share.
 
     Args:
-        measured: with the noise at which the graph was solved.
-        association: of the rays.
+        measured: the measurements, with the noise at which the graph was solved.
+        association: the landmark of each ray.
         used: (R,) the rays in the graph. All others are strays.
         distance: (n,) m, from the origin of each used ray to its landmark.
         solved: the graph at its solution, with its Gaussian noise.
-        cost: of the solution, half the sum of the squared residuals, with the robust losses.
+        cost: the cost of the solution, which is half the sum of the squared residuals, with the robust losses.
 
     Returns:
         The log evidence, -inf if the linear system is indeterminate.
@@ -45,15 +45,16 @@ def log_evidence(
         total += _of_ranges(measured, association, used, distance)
     if measured.covariance is not None:
         total -= float(np.linalg.slogdet(measured.covariance[measured.keyframes.measured])[1].sum()) / 2
-    unknowns = len(inverse.scale) - 6 * len(measured.keyframes)  # Of landmarks. Each has a weak prior.
+    unknowns = len(inverse.scale) - 6 * len(measured.keyframes)  # Those of landmarks. Each has a weak prior.
     return float(total - unknowns * np.log(settings.joint.prior_sigma) - inverse.log_determinant / 2)
 
 
 def _of_ranges(measured: Measurements, association: Association, used: Bools, distance: Floats) -> float:
     """Return the log density of all ranges, plus their cost in the graph. used, distance: as in `log_evidence`.
 
-    In the graph, each range has more noise instead of the bias that it shares with the other ranges of its landmark. So the
-    cost in the graph is subtracted. A stray range has the distribution of all ranges of the log.
+    In the graph, each range has more noise instead of the bias that it shares with the other ranges of its landmark. So this
+    cost is taken out of the evidence, and the log density takes its place. A stray range has the distribution of all ranges
+    of the log.
     """
     rays, ranged = measured.rays, np.isfinite(measured.rays.range)
     spread = float(np.log(12 * np.var(rays.range[ranged]) + 2 * np.pi * np.median(rays.range_sigma[ranged]) ** 2)) / 2

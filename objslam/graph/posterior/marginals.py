@@ -24,8 +24,9 @@ deviation of a landmark is still above half of this value, no measurement determ
 the landmarks less. With too large a value, the system stays indeterminate."""
 
 _LEAST_PIVOT = 1e-11
-"""The least pivot of the information matrix, scaled to 1 on its diagonal, of a system with one solution. Rounding leaves
-about 1e-15 if a system has none. A larger value refuses more systems that have a solution, but are badly conditioned."""
+"""A system has a single solution if every pivot of its information matrix, scaled to 1 on the diagonal, is at least this.
+Rounding leaves a pivot of about 1e-15 if a system has no single solution. A larger value refuses more systems that have a
+solution, but are badly conditioned."""
 
 _DIRECTIONS = 20
 """The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven.
@@ -101,7 +102,8 @@ def seen_covariances(solved: SolvedGraph, landmarks: Ints, witnesses: Ints, ledg
 
 
 def in_camera(joint: Floats, map_T_camera: Floats, point: Floats) -> Floats:
-    """Return the covariance (3, 3), m^2, of a landmark in the frame of a camera, from the covariance (9, 9) of both.
+    """Return the covariance (3, 3), m^2, of a landmark in the frame of a camera, from the joint covariance (9, 9) of camera
+    and landmark.
 
     The camera comes first in `joint`. map_T_camera: (4, 4) its pose. point: (3,) the position of the landmark in map.
     """
@@ -133,7 +135,7 @@ def joint_covariances(solved: SolvedGraph, groups: Sequence[Sequence[int]]) -> l
 
     The normal equations are factored once for all groups. GTSAM eliminates the system again for each group, which takes 20
     times as long for 150 landmarks that were seen together. GTSAM is used only if the normal equations lose too many digits.
-    It names the variable that is not determined. RuntimeError if both find the system indeterminate.
+    GTSAM names the variable that is not determined. RuntimeError if GTSAM, too, finds the system indeterminate.
     """
     if solved.inverse is not None:
         return solved.inverse.blocks(groups)
@@ -156,8 +158,9 @@ def correlated_factor(solved: SolvedGraph, landmarks: Ints, covariance: Floats) 
     """Return the correlated errors of landmarks (n,), as a factor (n, 3, m), m, of their joint covariance.
 
     covariance: (n, 3, 3) m^2 of the landmarks. A few products with the joint covariance find its strongest directions
-    (subspace iteration), so the time grows with the number of landmarks, not with its square. The factor comes from the
-    Nystroem approximation, which is nowhere above the joint covariance. m is 0 if the linear system is indeterminate.
+    (subspace iteration). So the time grows with the number of landmarks, not with the square of this number. The factor
+    comes from the Nystroem approximation, which is nowhere above the joint covariance. m is 0 if the linear system is
+    indeterminate.
     """
     none = np.zeros((len(landmarks), 3, 0))
     inverse = solved.inverse
@@ -189,8 +192,8 @@ def correlated_factor(solved: SolvedGraph, landmarks: Ints, covariance: Floats) 
 class _Inverse:
     """The inverse of the normal equations of a graph, with a part for each variable.
 
-    normal: the normal equations, with columns of length 1. scale: (D,) the lengths of the columns before. begin, end: the
-    columns of each variable, by its key.
+    normal: the normal equations, with columns of length 1. scale: (D,) the lengths of the columns before this scaling.
+    begin, end: the columns of each variable, by its key.
     """
 
     normal: NormalEquations

@@ -19,10 +19,10 @@ class TagCorners:
     """The T fiducials among N objects, as four landmarks each: the corners. M = N + 3 T landmarks in all.
 
     source: (n,) the original ray of each new ray, non-decreasing. corner: (n,) the corner, 0 to 3, of each new ray, -1 for a
-    ray that is not to a corner. association: of the new rays with the landmarks. The first corner of a fiducial has the
-    number of its object. count: N. object: (T,) the object of each fiducial. landmarks: (T, 4) its corners. shape: (T, 4, 3)
-    the corners at side 1. side: (T,) m, NaN if unknown. first: (V,) the new ray to the first corner of each view of a
-    fiducial; the rays to the other corners follow. tag: (V,) the fiducial of each view.
+    ray that is not to a corner. association: the landmark of each new ray. The first corner of a fiducial has the number of
+    its object. count: N. object: (T,) the object of each fiducial. landmarks: (T, 4) its corners. shape: (T, 4, 3) the
+    corners at side 1. side: (T,) m, NaN if unknown. first: (V,) the new ray to the first corner of each view of a fiducial;
+    the rays to the other corners follow. tag: (V,) the fiducial of each view.
     """
 
     source: Ints
@@ -77,7 +77,7 @@ class TagCorners:
         )
 
     def sized(self, names: Sequence[str], settings: Settings) -> Self:
-        """Return the fiducials with the sizes of the settings. names: of the labels."""
+        """Return the fiducials with the sizes of the settings. names: the names of the labels."""
         return replace(self, side=_sides(names, self.association.label[self.object], settings))
 
     def rays(self, rays: Rays) -> Rays:
@@ -110,7 +110,7 @@ class TagCorners:
         return np.isin(np.arange(count - 1), again)
 
     def tied(self, landmarks: Ints) -> Ints:
-        """Return the fiducials (t,) all of whose corners are among the landmarks (m,)."""
+        """Return the fiducials (t,) whose four corners are all among the landmarks (m,)."""
         return np.flatnonzero(np.isin(self.landmarks, landmarks).all(axis=1))
 
     def of_objects(self, values: Floats) -> Floats:

@@ -21,7 +21,7 @@ from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 Covariances = Callable[[Sequence[Sequence[int]]], list[Floats]]
 """A function of groups of keys that returns the covariance of each group, as `marginals.joint_covariances` does."""
 LEAST_PROBABILITY = 0.01
-"""The least probability at which the second rotation of a flat square is reported. A larger value reports fewer."""
+"""The second rotation of a flat square is reported if its probability is at least this. A larger value reports fewer."""
 
 
 def with_objects(
@@ -45,7 +45,7 @@ def with_objects(
         values: the solved values of the graph. covariances: those of its variables.
         wider: (M,) the factor on the covariance of each landmark.
         sensitivity: (M, 3, P) of the landmarks by the shared errors of `estimate.calibration`, None without such errors.
-        ledger: for a warning if the graph has no covariances.
+        ledger: gets a warning if the graph has no covariances.
     """
     which = tags.tied(np.flatnonzero(estimate.solved))
     corners = estimate.positions[tags.landmarks]
@@ -97,8 +97,8 @@ def with_objects(
 def _marginals(
     values: gtsam.Values, covariances: Covariances, tags: TagCorners, which: Ints, ledger: Ledger
 ) -> Floats | None:
-    """Return the covariances (t, 7, 7) of the rotation (rad) and position (m) of fiducials in their own frames, and of the
-    logarithm of their side. If the linear system is indeterminate, return None, and warn in the ledger."""
+    """Return the covariances (t, 7, 7) of fiducials: rotation (rad) and position (m) in their own frames, then the logarithm
+    of their side. If the linear system is indeterminate, return None, and warn in the ledger."""
     covariance = np.zeros((len(which), 7, 7))
     free = np.flatnonzero(~np.isfinite(tags.side[which]))
     keys = [(TAG0 + t,) for t in which.tolist()] + [(TAG_SIZE0 + t,) for t in which[free].tolist()]

@@ -24,8 +24,9 @@ _STEPS = 5
 def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> dict[int, TagPose]:
     """Return the rotation and size of each fiducial by the index of its object, from all its views at fixed poses.
 
-    The error of a pose is common to the four corners of a view (`square_fit.with_pose_noise`). The covariance is that of the
-    nominal noise. It is larger if the views scatter more. A fiducial has no entry if its views do not determine its size.
+    The error of a pose is common to the four corners of a view (`square_fit.with_pose_noise`). The covariance follows from
+    the nominal noise. It is larger if the views scatter more. A fiducial has no entry if its views do not determine its
+    size.
     """
     tags = TagCorners.of(rays, association, settings)
     if tags is None:
@@ -64,7 +65,8 @@ def tags_at_poses(keyframes: Keyframes, rays: Rays, association: Association, se
 
 
 def _excess(covariance: Floats, nominal: Floats) -> Floats:
-    """Return by how much covariances (n, d, d) exceed the nominal ones, in the directions in which they do."""
+    """Return by how much covariances (n, d, d) exceed the nominal covariances, in the directions in which they are
+    larger."""
     root = np.linalg.cholesky(nominal)
     inverse = np.linalg.inv(root)
     ratio, axes = np.linalg.eigh(inverse @ covariance @ np.swapaxes(inverse, 1, 2))

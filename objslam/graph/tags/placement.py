@@ -14,7 +14,8 @@ _CANDIDATES = 8
 """The most views of a fiducial whose two poses are tried: half of them are the nearest, the others are spread over time. A
 larger number is slower, and finds the pose more often if many views are false."""
 _VIEWS = 64
-"""The most views of a fiducial on which a pose is judged, spread over time. A larger number is slower and judges better."""
+"""A pose of a fiducial is judged on at most this number of its views, spread over time. A larger number is slower and judges
+better."""
 _STEPS, _STEPS_LAST = 6, 15
 """The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
 _TOLD = 4.0
@@ -29,7 +30,7 @@ A decrease by 1 means odds of e^(1/2). A larger value leaves more fiducials wher
 
 @dataclass(frozen=True)
 class Placement:
-    """The best pose of each of T fiducials for given camera poses, and a second one.
+    """The best pose of each of T fiducials for given camera poses, and a second pose.
 
     best, other: the squares at these poses. cost, other_cost: (T,), Cauchy's loss, infinite for a fiducial without that
     pose. information: (T, 7, 7) of the best, as in `square_fit.fit`.
@@ -43,11 +44,11 @@ class Placement:
 
 
 def place(seen: Corners, shapes: Floats, sides: Floats) -> Placement:
-    """Return the best pose of each of T fiducials, and its second one.
+    """Return the best pose of each of T fiducials, and its second pose.
 
     A single view gives two poses. The two poses of each of `_CANDIDATES` views are tried in `_VIEWS` views. The best pose is
-    fitted to the `_VIEWS` views. The mirror image of the best is fitted too, because both fit if the views have little
-    parallax. An unknown side comes from the parallax of the views.
+    fitted to the `_VIEWS` views. The mirror image of the best pose is fitted too, because both poses fit if the views have
+    little parallax. An unknown side comes from the parallax of the views.
 
     seen: views of the fiducials. shapes: (T, 4, 3). sides: (T,) m, NaN if unknown.
     """
@@ -153,14 +154,15 @@ def _side_of_parallax(squares: Squares, origins: Floats, seen: Corners) -> Float
 
 
 def _scaled(squares: Squares, side: Floats, origins: Floats) -> Squares:
-    """Return squares of side 1 after a scaling to sides (H,) m. The points `origins` (H, 3) m are the fixed points."""
+    """Return squares of side 1 after a scaling to sides (H,) m. The scaling leaves the points `origins` (H, 3) m where they
+    are."""
     pose = squares.pose.copy()
     pose[:, :3, 3] = origins + side[:, None] * (pose[:, :3, 3] - origins)
     return Squares(squares.shape, pose, side)
 
 
 def _finite(squares: Squares) -> Squares:
-    """Return the squares. A square without a side is replaced by one with side 1 at the identity."""
+    """Return the squares. A square without a side is replaced by a square with side 1 at the identity."""
     known = np.isfinite(squares.side)
     pose = np.where(known[:, None, None], squares.pose, np.eye(4))
     return Squares(squares.shape, pose, np.where(known, squares.side, 1.0))

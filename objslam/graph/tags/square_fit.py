@@ -12,17 +12,16 @@ from objslam.core.statistics import CAUCHY_K
 from objslam.graph.factors.bearing import tangent_basis
 
 _BEHIND = 1e-3
-"""The least part of the way from the camera to a corner that must be along the corner's ray, as a share of the distance. A
-corner with a smaller share counts as behind the camera: it costs `_BEHIND_COST` and has no gradient. A larger share counts
-more corners as behind."""
+"""The least depth of a corner along its ray, as a share of its distance from the camera. A corner with a smaller share
+counts as behind the camera: it costs `_BEHIND_COST` and has no gradient. A larger share counts more corners as behind."""
 _BEHIND_COST = 1e6
 """The squared deviation of a corner behind its camera. A larger value excludes such poses more surely."""
 _DAMPING = 1e-3
 """The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
 
 _MOST_LEVERAGE = 0.9
-"""The part of a view's influence on its own residuals that is corrected. It is below 1, because the residuals of a view that
-decides alone are 0. A larger part widens the covariances of squares that few views show."""
+"""The share of a view's influence on its own residuals that is corrected. It is below 1, because the residuals of a view
+that decides alone are 0. A larger share widens the covariances of squares that few views show."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,8 @@ class Corners:
     """The corners that V views of squares show. Each view belongs to one square.
 
     square: (V,) index of the square. origin: (V, 3) m in map, where the rays begin. direction: (V, 4, 3) unit, in map.
-    sigma: (V,) rad, the noise of one corner. whitening: (V, 8, 8) what the eight residuals of a view are multiplied with,
-    after a division by sigma: the identity if the corners err independently (see `with_pose_noise`).
+    sigma: (V,) rad, the noise of one corner. whitening: (V, 8, 8) the matrix that multiplies the eight residuals of a view
+    after their division by sigma. It is the identity if the corners err independently (see `with_pose_noise`).
     """
 
     square: Ints
@@ -133,10 +132,11 @@ def _middle(seen: Corners) -> Floats:
 
 
 def with_pose_noise(seen: Corners, squares: Squares, angle: Floats, place: Floats) -> Corners:
-    """Return views whose cameras have noise in their rotation, angle (V,) rad, and position, place (V,) m, per axis.
+    """Return views whose cameras have noise. angle: (V,) rad, of the rotation, place: (V,) m, of the position, per axis.
 
     The noise of a camera moves the four corners of its view together: the residuals have the covariance sigma^2 I + J S J^T.
-    J is taken at the given squares (H), so it is the same for each pose that is then compared.
+    S is the covariance of this noise. J is the derivative of the residuals by the pose of the camera, at the given squares
+    (H). So J is the same for each pose that is then compared.
     """
     _, by_point, _ = _residuals(seen, squares.corners)
     by_place = by_point.reshape(len(seen), 8, 3) * place[:, None, None]
@@ -187,8 +187,8 @@ def _linearised(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, F
 
 
 def _jacobians(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Floats, Floats, Bools]:
-    """Return the derivatives (V, 8, 7) of the residuals of views by their squares, the same times the weights of Cauchy's
-    loss, the residuals (V, 4, 2), and which corners (V, 4) are ahead."""
+    """Return four arrays: the derivatives (V, 8, 7) of the residuals of views by their squares, these derivatives times the
+    weights of Cauchy's loss, the residuals (V, 4, 2), and which corners (V, 4) are ahead of the camera."""
     count, rotation = len(squares.side), squares.pose[:, :3, :3]
     residual, by_point, ahead = _residuals(seen, squares.corners)
     local = squares.shape * squares.side[:, None, None]
@@ -208,7 +208,7 @@ def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
     """Return the two poses of each view of a square of side 1: 2 V squares, the first pose of every view, then the second.
 
     A flat square that is far off, or seen from the front, looks nearly alike in two poses (Schweighofer and Pinz 2006). The
-    first pose is that of the homography between the square and its image. The second one has the normal on the other side
+    first pose is that of the homography between the square and its image. The second pose has the normal on the other side
     of the line of sight. Both are then fitted to the corners of their view. shapes: (V, 4, 3).
     """
     middle = _middle(seen)

@@ -1,7 +1,7 @@
 """The rows that hold the corners of fiducials together as squares, without variables of their own.
 
-The square nearest to four corners is computed from the corners. The residual is the corners minus those of this square. So a
-step that only moves or turns the square does not change the residual.
+The square nearest to four corners is computed from the corners. The residual is the corners minus the corners of this
+square. So a step that only moves or turns the square does not change the residual.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ class SquareRows:
 
     @classmethod
     def of(cls, tags: TagCorners | None, landmarks: Ints) -> Self:
-        """Return the squares all of whose corners are among the landmarks (m,), which are in increasing order."""
+        """Return the squares whose four corners are all among the landmarks (m,). The landmarks are in increasing order."""
         if tags is None:
             return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 4), dtype=np.int64), np.zeros((0, 4, 3)), np.zeros(0))
         tied = tags.tied(landmarks)
@@ -52,7 +52,7 @@ class SquareRows:
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:
         """Return the whitened residuals (T, 12) at landmarks (m, 3), m, their derivatives (T, 12, 12) by the corners, and
-        the cost. The poses (P, 4, 4) do not count."""
+        the cost. The poses (P, 4, 4) are not used."""
         corners = landmarks[self.corner]
         rotation, centre, found = squares_of(corners, self.shape)
         free = np.isnan(self.side)

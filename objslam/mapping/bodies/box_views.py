@@ -60,7 +60,8 @@ class BoxViews:
         return replace(self, rays=self.rays.take(boxes), body=self.body[boxes], bound=self.bound[boxes])
 
     def contacts(self, touched: Floats) -> Floats:
-        """Return where (B, 4), px, the edges touch the images of bodies, given the touched points (B, 4, 3), m."""
+        """Return where (B, 4), px, the edges touch the images of bodies. touched: (B, 4, 3) m, the points where the bodies
+        touch."""
         found, poses = np.zeros((len(self.body), 4)), self.poses
         for i in np.unique(self.camera):
             mine = np.flatnonzero(self.camera == i)
@@ -68,7 +69,8 @@ class BoxViews:
         return found
 
     def edges(self, touched: Floats | None = None) -> BoxEdges:
-        """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch them, if known."""
+        """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch these planes, if
+        known."""
         rays, settings, poses, camera = self.rays, self.settings, self.poses, self.camera
         count = len(self.body)
         normal, turn, bound = np.zeros((count, 4, 3)), np.ones((count, 4)), self.bound.copy()

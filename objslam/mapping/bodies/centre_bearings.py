@@ -26,19 +26,19 @@ _KEPT = 0.5
 """The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. The
 bearings of a lost object stay as they were."""
 _WORTH = 0.1
-"""The median shift of an object's bearings, in standard deviations of one bearing, above which poses are solved again. A
-shift repeats in all bearings of the object, so 0.1 is as much as the noise of 100 of them. A larger value solves fewer logs
-again."""
+"""Poses are solved again if the median shift of an object's bearings exceeds this number of standard deviations of one
+bearing. A shift repeats in all bearings of the object. So a shift of 0.1 equals the noise of the mean of 100 bearings. A
+larger value solves fewer logs again."""
 
 
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
     """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
 
     Nothing is added to a ray that the solve rejects.
-    The bearings of an object that would be lost stay at the centres of its boxes. If no body shifts its bearings enough
-    (`_WORTH`), or if an object would still be lost, the estimate is as before, and the second value is None. A second
-    round, from the bodies at the new poses, would change the path by 1 mm and the objects by less than their noise (24
-    simulated drives between large objects).
+    The bearings of an object that would be lost stay at the centres of its boxes. The estimate stays as before, and the
+    second value is None, in two cases: no body shifts its bearings enough (`_WORTH`), or an object would still be lost.
+    There is no second round, from the bodies at the new poses. In 24 simulated drives between large objects, it would change
+    the path by 1 mm, and the objects by less than their noise.
     """
     if not state.settings.bodies.use:
         return estimate, None
@@ -63,8 +63,8 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
         return estimate, None
     if state.trace is not None:
         state.trace.end_round("bodies", association, solved)
-    # A rejected ray shows something else than its object, so it has no centre of this body. Turned, such rays of a second
-    # thing would no longer meet in its place.
+    # A rejected ray may show a second thing, so it keeps its direction. Rays that were turned to the centre of this body
+    # would no longer meet at the second thing.
     return solved, np.where((solved.weight > 0)[:, None], shift, 0.0)
 
 
@@ -73,7 +73,7 @@ def _solve(
 ) -> Estimate:
     """Solve poses and objects once more, from the estimate, with `shift` (R, 3) added to the measured directions.
 
-    keyframes, rays: those of the state without the shared errors of the estimate.
+    keyframes, rays: those of the state, with the shared errors of the estimate removed.
     """
     from objslam.graph import batch_solver
 

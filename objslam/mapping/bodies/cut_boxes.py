@@ -26,22 +26,24 @@ from objslam.triangulation.bodies.shared import spread_of
 from objslam.triangulation.bodies.solve import Bodies
 
 _CHI2 = 13.28
-"""The largest squared deviation of a box from its predicted one, chi-squared of 4 degrees of freedom at 99 %. A larger value
+"""The largest squared deviation of a box from its predicted box, chi-squared of 4 degrees of freedom at 99 %. A larger value
 accepts boxes of other things."""
 _FEWEST = 2
-"""A box is used if at least this number of its edges are no bounds. With a larger number, fewer boxes are used. One edge
-alone agrees with too many bodies. In simulated drives, boxes with fewer such edges made centres a little worse."""
+"""A box is used if at least this number of its edges are edges of the body, not bounds. With a larger number, fewer boxes
+are used. One edge alone agrees with too many bodies. In simulated drives, boxes with fewer such edges made centres a little
+worse."""
 _WITHIN = 0.1
-"""An edge is a bound if the body touches it outside the image, or inside it, but at most this share of the box away from the
-cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly differ in simulated drives."""
+"""An edge is a bound if the body touches it outside the image. It is also a bound if the body touches it inside the image,
+but at most this share of the box away from the cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly
+differ in simulated drives."""
 
 
 def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solution) -> BoxEdges | None:
     """Return the edges of the cut off boxes that belong to bodies, None if there are none.
 
     A box belongs to a body of its label under three conditions. It is near the predicted box. No other body is near the box.
-    No other box of the image is near the body or belongs to it. bodies: n, of the objects (n,) in the association of the
-    solution. boxes: the whole boxes of the bodies.
+    No other box of the image is near the body or belongs to it. bodies: n bodies, of the objects (n,) in the association of
+    the solution. boxes: the whole boxes of the bodies.
     """
     cut = solution.rays.cut
     if cut is None or not len(cut):

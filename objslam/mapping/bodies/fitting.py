@@ -32,9 +32,9 @@ table that a noisy detector sees. With a larger value, more objects stay where t
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
     """Return a solution with a body for each object whose boxes show one. The points and their covariances stay.
 
-    The covariance of a centre contains the noise of the boxes and the errors that they share. It also contains what the
-    covariance of the point has beyond the noise of its rays, such as the noise of solved poses, or errors of given poses
-    that last.
+    The covariance of a centre contains the noise of the boxes and the errors that they share. The covariance of the point
+    may be larger than the noise of its rays explains, because solved poses have noise, or because errors of given poses
+    last. This excess is added too.
     """
     if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution
@@ -110,8 +110,8 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
 def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
     """Return whether the centre of each body (n,) is farther from the centres of its boxes than their shared error.
 
-    If it is not, the rays through the centres of the boxes give the place at least as well, and the body gives only the
-    size.
+    If it is not farther, the rays through the centres of the boxes give the place at least equally well. Then the body gives
+    only the size.
     """
     edges = views.boxes.edges()
     shared = found.share[0] * edges.size / 2 * edges.turn.mean(axis=1)

@@ -27,7 +27,7 @@ _WAY, _TURN = 5.0, 5.0
 _DRIFT_YAW, _DRIFT_XY = 0.015, 0.03
 """The errors (rad, m) that the odometry may have within a window. With larger values, wrong input may fit too."""
 _SIGMAS = 3.0
-"""The deviation of a ray from its point, in standard deviations, up to which it fits. A larger value lets false rays fit."""
+"""A ray fits a point if it deviates by at most this number of standard deviations. A larger value lets false rays fit."""
 _COST = 3.0
 """The number of boxes that a point must explain before it counts, one for each coordinate. A larger number drops points with
 few boxes."""

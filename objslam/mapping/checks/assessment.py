@@ -25,8 +25,8 @@ _UNEXPLAINED = 0.25
 false boxes and moving things. A larger value gives fewer warnings."""
 _LOOSE = 9.0
 """A result needs a look if the noise of the odometry is this multiple of the settings, or more. Right maps of recorded
-robots have up to 8.1. If it is more, the odometry is often not what is wrong: a camera that turns on the robot looks the
-same. A larger value gives fewer warnings."""
+robots have up to 8.1. If the multiple is larger, the fault is often not in the odometry: a camera that turns on the robot
+looks the same. A larger value gives fewer warnings."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
 gives more warnings."""
@@ -49,7 +49,7 @@ class Evidence:
     frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
     journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
     whether they name one object or several. odometry: the largest factor on a noise of the odometry that the log shows.
-    scale: the standard deviation of the scale of the odometry, as a share, if the log does not tell it, else None.
+    scale: the standard deviation of the scale of the odometry, as a share. None if the log tells the scale.
     """
 
     resolved: int

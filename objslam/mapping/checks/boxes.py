@@ -17,19 +17,22 @@ _PART = 0.9
 """If more than this share of the boxes has no coordinate above 1.5, the boxes are probably shares of the image, not px. A
 smaller share also reports logs with a few wrong boxes."""
 _WITHOUT_AREA = 0.2
-"""If more than this share of the boxes has no area, the corners are not x1 y1 x2 y2. No detector writes such boxes."""
+"""If more than this share of the boxes has no area, the corners are not x1 y1 x2 y2. No detector writes such boxes. A larger
+share warns less often."""
 _OUTSIDE = 0.1
-"""If more than this share of the boxes has its centre outside the image, the boxes belong to a larger image."""
+"""If more than this share of the boxes has its centre outside the image, the boxes belong to a larger image. A larger share
+warns less often."""
 _LEAST_SPAN = 0.55
 """The least share of the image's width and height that the boxes of a long log cover. A larger share warns more often."""
 _LONG = 200
-"""A log with at least this many boxes is long, so that its boxes should cover most of the image."""
+"""A log with at least this many boxes is long, so that its boxes should cover most of the image. A larger number judges
+fewer logs."""
 
 
 def refuse_shares(log: Log) -> None:
     """Raise a LogError if all boxes of a camera lie between 0 and 1: they are shares of the image.
 
-    No detector finds boxes of less than a pixel in one corner of the image, so the fault is certain, and no box is of use.
+    No detector finds boxes of less than a pixel in one corner of the image. So the fault is certain, and no box is of use.
     """
     for one in log.cameras:
         found, size = one.detections, one.camera.size.astype(int).tolist()
@@ -44,7 +47,7 @@ def refuse_shares(log: Log) -> None:
 def check_boxes(log: Log, ledger: Ledger) -> list[Finding]:
     """Return the findings about the boxes of a log, from their corners alone.
 
-    ledger: of the reading of the log, because most readers drop the boxes that have no area.
+    ledger: from the reading of the log. It counts the boxes without area, because most readers drop these boxes.
     """
     found: list[Finding] = []
     read = [c.detections.boxes for c in log.cameras if c.detections is not None]

@@ -29,9 +29,9 @@ from objslam.mapping.progress import Progress
 
 _ALARM = 0.6
 """A run tries hypotheses if the score (`Agreement.score`) at poses of a localisation is below this. With wrong input, most
-boxes may still fit, but only with several points for each thing, and each point costs a part of the score. Poses by odometry
-need a point for each thing in each window, so their share of fitting boxes is compared instead. With a larger value, more
-runs take a few seconds longer."""
+boxes may still fit, but only with several points for each thing. Each point costs a part of the score. At poses by odometry,
+each window needs its own point for each thing. So the share of fitting boxes is compared there, not the score. With a larger
+value, more runs take a few seconds longer."""
 _FITTING = 0.82
 """If the fitting boxes fit worse than this on average (`Agreement.fit`), a run tries hypotheses. Gaussian noise gives 0.9.
 With a larger value, more runs take a few seconds longer."""
@@ -43,11 +43,11 @@ With a larger value, more logs are compared, which takes longer."""
 _FEWEST = 60
 """The fewest boxes of a log that are judged by their agreement. Fewer boxes agree by chance."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
-"""The clock offsets (s) that are tried besides 0. The search for small errors starts from the one that fits best. More
+"""The clock offsets (s) that are tried besides 0. The search for small errors starts from the offset that fits best. More
 offsets take longer."""
 _GAIN = 0.02
-"""The least growth of the score by a clock offset of `_CLOCKS`, and by the removal of the errors that the run does not
-estimate. A larger value reports fewer errors."""
+"""The least growth of the score that shows an error: by a clock offset of `_CLOCKS`, or by the removal of the errors that
+the run does not estimate. A larger value reports fewer errors."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def diagnose(
 ) -> Diagnosis:
     """Return the diagnosis of a log. thorough: whether to try hypotheses even if all looks right.
 
-    ledger: of the reading of the log. LogError if stamps are not in s, or boxes not in px.
+    ledger: from the reading of the log. LogError if stamps are not in s, or boxes not in px.
     """
     if log.localization is None and log.odometry is None:
         return Diagnosis()
@@ -126,7 +126,8 @@ def diagnose(
     if found is not None and part.boxes >= _FEWEST:
         doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
         none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part)
-        # Where boxes agree only by chance, they say nothing of single frames, of halves, and of how a camera is turned.
+        # Where boxes agree only by chance, they say nothing about single frames, about halves, or about how a camera is
+        # turned.
         findings += [none_fits] if none_fits else _parts_differ(part, found, settings)
         if not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
@@ -150,8 +151,10 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 
 
 def _corrected(part: Part, found: Agreement | None, settings: Settings) -> tuple[float, str]:
-    """Return the score of a log without the small errors that a run in this mode estimates from given poses, 0 if there are
-    none. Also return those of the errors, in words, that are too large for a usual camera."""
+    """Return the score of a log without small errors, and the errors, in words, that are too large for a usual camera.
+
+    The small errors are those that a run in this mode estimates from given poses. If there are none, the score is 0.
+    """
     estimated = _estimated(part, settings)
     if found is None or part.drifts or settings.mode == "joint" or not estimated:
         return 0.0, ""
@@ -196,7 +199,8 @@ def _small_errors(part: Part, found: Agreement, settings: Settings) -> SmallErro
 
 
 def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Finding]:
-    """Return findings if the boxes of some frames, or of one half, fit worse than the others, or if a camera was turned."""
+    """Return findings about parts that differ: some frames fit worse than others, one half fits worse than the other, or
+    somebody turned a camera."""
     middle = float(np.median(found.keyframes.stamps))
     late = found.keyframes.stamps[found.rays.keyframe] > middle
     long = bool(min(late.sum(), (~late).sum()) >= _FEWEST)
@@ -206,7 +210,7 @@ def _parts_differ(part: Part, found: Agreement, settings: Settings) -> list[Find
 
     one = differ(found)
     if one is not None and not part.drifts:
-        # The robot does not turn equally fast in all frames. So a clock, too, lets the boxes of some frames fit badly.
+        # The robot does not turn equally fast in all frames. So a wrong clock, too, lets the boxes of some frames fit badly.
         one = differ(without_usual_errors(part, found, settings)[0])
     if one is not None:
         return [one]

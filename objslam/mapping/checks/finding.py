@@ -9,7 +9,7 @@ class Finding:
     """One thing that is wrong with the input.
 
     name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the fault makes
-    the positions of a map unreliable. It does if the error is not corrected. basis: the evidence. "log" is the input itself.
+    the positions of a map unreliable, because the run does not correct it. basis: the evidence. "log" is the input itself.
     The other values say which boxes do not agree at the given poses: all "boxes", those of the two "halves" of the log, or
     those of single "frames". A joint solve may refute a finding with such evidence.
     """

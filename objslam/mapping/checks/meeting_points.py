@@ -22,10 +22,11 @@ _FEWEST = 4
 _LEAST_ANGLE = np.radians(4.0)
 """The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
 _NARROW = 0.9
-"""The rays of a label that are left show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction.
-With a smaller share, false rays are excused too."""
+"""The remaining rays of a label show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction. With
+a smaller share, false rays are excused too."""
 _NEAREST = 0.25
-"""The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself."""
+"""The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself. A larger distance
+loses points near a camera."""
 _MOST_POINTS = 40
 """The most points of one label. More points explain more boxes by chance."""
 _REFITS = 2
@@ -37,10 +38,10 @@ cache."""
 
 @dataclass(frozen=True)
 class Meeting:
-    """The points that R rays meet in. point: (R,) the index into points of each ray, -1 for none. points: (N, 3) m.
+    """The points in which R rays meet. point: (R,) the index into points of each ray, -1 for none. points: (N, 3) m.
 
-    fit: (R,) how well each ray fits, from 1 on its point to 0 from its tolerance on, and without a point. narrow: (R,)
-    whether a ray has no point because the rays of its label are nearly parallel, so that they neither meet nor miss.
+    fit: (R,) how well each ray fits: 1 on its point, 0 beyond its tolerance, 0 without a point. narrow: (R,) whether a ray
+    has no point because the rays of its label are nearly parallel, so that they neither meet nor miss.
     """
 
     point: Ints
@@ -131,8 +132,8 @@ def fit_points(origins: Floats, directions: Floats, tolerance: Floats, place: fl
 def nearest_point(origins: Floats, directions: Floats, start: Floats, used: Bools | None = None) -> Floats:
     """Return the points (..., 3) that are nearest to rays (..., N, 3) in least squares of angles.
 
-    start: (..., 3) points near them, whose distances turn offsets into angles. used: (..., N) which rays count, by default
-    all.
+    start: (..., 3) points near the returned points. Their distances turn offsets into angles. used: (..., N) which rays
+    count, by default all.
     """
     to = start[..., None, :] - origins
     weight = 1 / np.maximum(np.einsum("...ni,...ni->...n", to, to), _NEAREST**2)
@@ -193,7 +194,7 @@ def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
 
 
 def _nearly_parallel(rows: _Rows) -> Bools:
-    """Return the labels (L,) whose rays are so close to parallel that no point of theirs can be told."""
+    """Return the labels (L,) whose rays are so close to parallel that they tell no point."""
     mean = (rows.directions * rows.real[:, :, None]).sum(axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     near = (np.einsum("lni,li->ln", rows.directions, mean) >= np.cos(_LEAST_ANGLE)) & rows.real
@@ -203,7 +204,7 @@ def _nearly_parallel(rows: _Rows) -> Bools:
 def _tried_points(rows: _Rows, size: Ints, dice: Floats) -> tuple[Floats, Bools]:
     """Return the points (L, P, 3) where pairs of rays come closest, and which of them (L, P) are ahead of both cameras.
 
-    All pairs of a label are tried if there are few enough, else random ones.
+    All pairs of a label are tried if there are few enough, else random pairs.
     """
     tried = int(_tried(size).max())
     order = np.arange(tried)

@@ -14,18 +14,19 @@ from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
 
 FASTEST = 40.0
-"""The typical speed (m/s) above which poses are not in metres: the speed of a car on a motorway. A larger speed warns less
-often."""
+"""Poses are not in metres if their typical speed (m/s) is above this, the speed of a car on a motorway. A larger speed warns
+less often."""
 _FASTEST_TURN = 8.0
-"""The turn rate (rad/s) above which headings are not in radians, if the moving robot exceeds it in a tenth of its steps. A
-larger rate warns less often."""
+"""Headings are not in radians if the moving robot exceeds this turn rate (rad/s) in a tenth of its steps. A larger rate
+warns less often."""
 _TURN_TIME = 0.1
 """The time (s) over which turn rates are measured. A longer time suits noisy headings, and hides short turns."""
 _JUMP = 5.0
-"""The speed (m/s) above which a step of an otherwise slow path may be a jump. It equals live.max_speed."""
+"""A step of an otherwise slow path may be a jump if its speed (m/s) is above this. It equals live.max_speed. A larger speed
+warns less often."""
 _JUMP_TURN = 20.0
-"""The turn rate (rad/s) above which a step of an otherwise slow path may be a jump. As in a live session, it is 4 rad/s for
-each m/s of live.max_speed."""
+"""A step of an otherwise slow path may be a jump if its turn rate (rad/s) is above this. As in a live session, it is 4 rad/s
+for each m/s of live.max_speed. A larger rate warns less often."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
 _ACCELERATION = 5.0
@@ -35,28 +36,31 @@ _TIMES = 5.0
 """The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. The same
 holds for turn rates. A larger number warns less often."""
 _TIMES_ODD = 3.5
-"""The least oddness of a jump, as a multiple of what a tenth of the steps exceeds. The oddness is how far a step differs
-from the steps beside it, or from that of the odometry. For normal noise in a plane, 3.5 is 7.5 standard deviations. A larger
-number warns less often."""
+"""The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
+difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
+deviations. A larger number warns less often."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
 _STILL = 1e-4
-"""The distance (m) and turn (rad) between two poses below which the robot stands still."""
+"""The robot stands still if two poses differ by less than this distance (m) and turn (rad). A larger value takes slow motion
+for a stop."""
 _FROZEN_SECONDS = 8.0
 """The shortest time (s) without motion that may be a frozen path. If a robot really stands
 still, its boxes do not move in the image either. A larger value finds fewer frozen paths."""
 _MOVING_PX = 12.0
-"""The spread (px) of the boxes of one label about their median, within seconds, above which a camera moves."""
+"""A camera moves if the boxes of one label spread by more than this (px) about their median, within seconds. A larger spread
+finds fewer frozen paths."""
 _LEAST_STEP = 0.01
-"""The noise (m) of a position. The direction of a motion is judged if the motion is more than three times as long. A larger
-value suits noisy poses."""
+"""The noise (m) of a position. The direction of a motion is judged if the motion is longer than three times this noise. A
+larger value suits noisy poses."""
 _PIECE = 1.0
 """The time (s) over which distances are compared. A longer time suits noisy poses."""
 _LEAST_PIECE = 0.3
-"""The least distance in a time of `_PIECE` that is compared, as a share of the longest one. Shorter distances are noise."""
+"""The least distance in a time of `_PIECE` that is compared, as a share of the longest distance. Shorter distances are
+noise."""
 _OTHER_SCALE = 0.1
-"""The logarithm of the ratio between the distances by localisation and odometry, above which a run warns. Real odometry errs
-by up to 8 %. A larger value warns less often."""
+"""A run warns if the logarithm of the ratio between the distances by localisation and odometry exceeds this. Real odometry
+errs by up to 8 %. A larger value warns less often."""
 _BEFORE = 0.3
 """The time (s) over which the direction of motion is measured. A longer time suits noisy poses and slow turns."""
 
@@ -108,7 +112,7 @@ def _compare_steps(localization: Trajectory, odometry: Trajectory, max_gap: floa
         return
     by_map, by_wheels = (inverse(poses[pair]) @ poses[pair + 1] for poses in (localization.poses, wheels))
     way = np.linalg.norm(by_map[:, :3, 3] - by_wheels[:, :3, 3], axis=1)
-    # A step that only the odometry makes is one of the odometry, such as a slip.
+    # A step that only the odometry makes is an error of the odometry, such as a slip.
     own = _beside(by_map[:, :3, 3]) > _beside(by_wheels[:, :3, 3])
     own |= _beside(rotation_vector(by_map[:, :3, :3])) > _beside(rotation_vector(by_wheels[:, :3, :3]))
     angle = np.linalg.norm(rotation_vector(np.swapaxes(by_wheels[:, :3, :3], 1, 2) @ by_map[:, :3, :3]), axis=1)
@@ -202,8 +206,8 @@ def _pulses(path: Trajectory, moving: Bools) -> Bools:
 
 
 def _beside(steps: Floats) -> Floats:
-    """Return how far (N,) each of the steps (N, 3) differs from the more similar one beside it. The first and the last step
-    have one neighbour only, as a start and a stop have, and give 0."""
+    """Return how far (N,) each of the steps (N, 3) differs from the more similar of its two neighbours. The first and the
+    last step give 0, because they have only one neighbour."""
     change = np.linalg.norm(np.diff(steps, axis=0), axis=1)
     found = np.minimum(np.append(change, np.inf), np.append(np.inf, change))
     found[[0, -1]] = 0.0

@@ -8,39 +8,41 @@ from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 
 _FEWEST = 40
-"""The fewest ranges that are judged. A few ranges show a scale error poorly."""
+"""The fewest ranges that are judged. A few ranges show a scale error poorly. A larger number judges fewer logs."""
 _POINTS = 4
-"""The fewest points whose ranges are judged. A few points may be at wrong positions by chance."""
+"""The fewest points whose ranges are judged. A few points may be at wrong positions by chance. A larger number judges fewer
+logs."""
 _PARALLAX = np.radians(20.0)
 """The least angle (rad) between the rays of a point for a reliable distance. A larger angle leaves fewer points."""
 _SPREAD = 0.1
 """The largest median deviation of the points' ratios from their median, as a share. A wrong unit or scale is equal for all
-points. The ratios of points at wrong positions differ."""
+points. The ratios of points at wrong positions differ. A larger value also judges such points."""
 _SPREAD_OF_UNITS = 0.3
-"""`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`)."""
+"""`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`). A larger value also judges points at wrong positions."""
 _LEAST = 0.04
 """The least error of the ranges that is reported, as a share. Smaller errors also come from the depth of things and from
 cameras that are turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger
 share warns less often."""
 _SPOILING = 0.06
-"""The error of the scale, as a share, above which positions are unreliable. With a larger share, fewer maps are
+"""Positions are unreliable if the scale has a larger error than this share. With a larger share, fewer maps are
 unreliable."""
 _SIGMAS = 5.0
 """The least error of the ranges that is reported, in standard deviations. A larger number warns less often."""
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
 """The name of each unit of length, by the number of units in a metre."""
 _CLOSE = 0.25
-"""A factor is a unit of `_UNITS` if the logarithm of the ratio between the two is below this. A larger value names more
-units."""
+"""A factor counts as a unit of `_UNITS` if the logarithm of their ratio is below this. A larger value names more units."""
 _UNIT = 0.7
-"""The logarithm of a factor above which no calibration error explains the factor."""
+"""No calibration error explains a factor if its logarithm exceeds this. A larger value asks fewer factors for a unit."""
 _GROUP = 8
-"""The fewest boxes of a label in a window whose ranges show a factor. Fewer boxes show it poorly."""
+"""The ranges of a label in a window show a factor if it has at least this number of boxes there. Fewer boxes show it
+poorly."""
 _ALONE = 1.1
-"""The crowd (`Part.crowd`) up to which all boxes of a label in a window count as boxes of one thing. A larger value tests
-the ranges of more labels by whether they end at one point."""
+"""If the crowd (`Part.crowd`) is at most this, all boxes of a label in a window count as boxes of one thing. A larger value
+tests the ranges of more labels by whether they end at one point."""
 _LEAST_BY_ODOMETRY = 0.18
-"""The least error of the ranges for poses by odometry. The joint mode itself corrects several percent."""
+"""The least error of the ranges for poses by odometry. The joint mode itself corrects several percent. A larger error warns
+less often."""
 _FACTORS = np.exp(np.linspace(np.log(1 / 5000), np.log(5000), 1200))
 """The tried factors on ranges. More factors find the best one more exactly."""
 _TELLS = 0.5

@@ -52,10 +52,10 @@ def _promised(objects: ObjectMap, keyframes: Keyframes, rays: Rays, association:
 def check_pose_noise(
     objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, *, calibrated: bool
 ) -> Finding | None:
-    """Return a finding if the noise of the poses that the log shows makes most rays far noisier than the settings say.
+    """Return a finding if the log shows so much noise of the poses that most rays are far noisier than the settings say.
 
-    The covariances of the map contain this noise, so they are honest. With better poses it would be more exact. calibrated:
-    whether the cameras were calibrated against the poses.
+    The covariances of the map contain this noise, so they are honest. With better poses, the map would be more exact.
+    calibrated: whether the cameras were calibrated against the poses.
     """
     if keyframes.pose_noise == (1.0, 1.0) or not _held(objects, association).any():
         return None
@@ -94,7 +94,8 @@ def check_residuals(
     *,
     calibrated: bool,
 ) -> Finding | None:
-    """Return a finding if the rays miss the objects that are ok by far more than the noise of boxes and localisation.
+    """Return a finding if rays miss their objects by far more than the noise of boxes and localisation. Only objects that
+    are ok count.
 
     residual: (R,) rad between each ray and its object. calibrated: whether the cameras were calibrated against the poses.
     All rays of an object count, also rejected ones. Rays of one keyframe share its pose error, so they count as one.

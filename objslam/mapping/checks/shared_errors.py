@@ -63,7 +63,7 @@ def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
 
 
 def at_bounds(estimate: Estimate, bounds: Floats) -> list[Finding]:
-    """Return a finding for each shared error that ended at its bound (P,), and for each noise that did."""
+    """Return a finding for each shared error that ended at its bound (P,), and for each noise that ended at its bound."""
     errors = [] if estimate.calibration is None else _uncorrected(estimate.calibration, bounds)
     return errors + ([] if estimate.noise is None else _with_most_noise(estimate.noise))
 
@@ -91,7 +91,8 @@ def _with_most_noise(noise: NoiseFactors) -> list[Finding]:
     """Return a finding for each noise that ended at its bound. With noise at its bound, wrong input fits too.
 
     Wheels may slip that far, and a depth image may be that bad, but hardly both in one log. No detector errs by that many
-    pixels. So the positions are spoilt if the noise of the boxes ends at its bound, or that of both depths and odometry.
+    pixels. So the positions are spoilt if the noise of the boxes ends at its bound. They are also spoilt if the noise of the
+    depths and the noise of the odometry both end at their bounds.
     """
     limits = {name: MOST_POSE_NOISE if name in _POSES else MOST_NOISE for name in _NOISES}
     ended = [name for name, limit in limits.items() if getattr(noise, name) >= 0.999 * limit]

@@ -26,12 +26,13 @@ _USUAL = {"focal": 0.05, "translation": 0.1}
 larger error."""
 _KINDS = tuple(_HARMFUL)
 _LEAST_GAIN = 40.0
-"""The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer."""
+"""The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer
+errors."""
 _LEAST_SHARE = 0.04
 """The least decrease by an error, as a share of all squared deviations. Rays of a real log are not independent, so the sum
 of many small deviations proves nothing. A larger value finds fewer errors."""
 _UNUSUAL = 4.0
-"""The number of prior standard deviations above which an error is no usual one. A larger number calls fewer unusual."""
+"""An error is unusual if it exceeds this number of prior standard deviations. A larger number calls fewer errors unusual."""
 _ROUNDS = 6
 """The number of Gauss-Newton steps after each added error. A larger number is more exact."""
 _CLOCK_SIGMA = 0.05
@@ -102,7 +103,8 @@ class SmallErrors:
         return ", ".join(parts)
 
     def remedy(self, settings: Settings) -> str:
-        """Return the options with which a run estimates the harmful errors. settings: of a run without these options."""
+        """Return the options with which a run estimates the harmful errors. settings: the settings of a run without these
+        options."""
         held = [kind(name) for name in self.harmful if prior_sigma(name, settings) == 0]
         given = dict.fromkeys("translation" if what in ("x", "y") else what for what in held)
         options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
@@ -166,9 +168,10 @@ def find_small_errors(
 
 
 def with_clock(errors: SmallErrors | None, offset: float, log: Log, found: Agreement, settings: Settings) -> SmallErrors:
-    """Return the errors of a log, from the errors of the same log with the stamps of its frames later by an offset (s).
+    """Return the errors of a log. They are `errors`, with an offset (s) added to each clock.
 
-    errors: None if the search found none. Then the clocks of the cameras are the only errors.
+    errors: the errors of the same log with the stamps of its frames later by the offset. None if the search found none. Then
+    the clocks of the cameras are the only errors.
     """
     own = shared(log, found.keyframes, found.rays, settings)
     values = dict.fromkeys((name for name in own.names if kind(name) == "clock"), offset)

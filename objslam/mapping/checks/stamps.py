@@ -14,11 +14,11 @@ _UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
 _DATES = (1e8, 1e10)
 """Stamps of dates between 1973 and 2286, s. A wider range leaves the unit of fewer stamps open."""
 _RARE = 10.0
-"""Poses and frames that come less often than this, s, in the median, are probably not in s. At 10 s, a robot hardly
-measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
+"""If the median time between two poses or frames is above this, s, their stamps are probably not in s. At 10 s, a robot
+hardly measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
 _CRAWL = 0.01
-"""A robot that is slower than this, m/s, all along its path probably has stamps that are not in s. Even a lawn mower is 30
-times as fast. A larger value accuses more robots that hardly drive."""
+"""If a robot is slower than this, m/s, all along its path, its stamps are probably not in s. Even a lawn mower is 30 times
+as fast. A larger value accuses more robots that hardly drive."""
 
 
 def check_stamps(log: Log) -> Finding | None:
@@ -53,7 +53,7 @@ def check_stamps(log: Log) -> Finding | None:
 
 
 def _common_unit(path: Trajectory, frames: list[Floats]) -> str | None:
-    """Return the unit in which poses and frames (F,) of each camera are stamped, or None for seconds.
+    """Return the unit of the stamps of poses and of the frames (F,) of each camera, or None for seconds.
 
     No date in s is as large as a date in ms. Stamps that begin at zero tell their unit by the time between two of them,
     if the robot also crawls.

@@ -13,7 +13,8 @@ from objslam.mapping.checks.meeting_points import nearest_point
 from objslam.mapping.checks.small_errors import shared
 
 _STEPS = 2
-"""The number of Gauss-Newton steps of a point. A small error hardly moves the rays, so few steps are enough."""
+"""The number of Gauss-Newton steps of a point. A small error hardly moves the rays, so few steps are enough. More steps are
+slower."""
 
 
 def say(diagnosis: Diagnosis, ledger: Ledger) -> None:

@@ -1,4 +1,4 @@
-"""Whether rays or boxes lie closer together than by chance, judged by how many lie around them."""
+"""Judge whether rays or boxes lie closer together than by chance, from the number of rays or boxes around them."""
 
 import numpy as np
 
@@ -12,8 +12,8 @@ shows a group by chance. A larger value finds fewer groups."""
 def crowded(inside: Floats | Ints, around: Floats | Ints, share: float, tried: int) -> Floats:
     """Return the log odds that a region holds more boxes than it would by chance.
 
-    Without a group, the boxes lie evenly, so the number inside is binomial (scan statistic with the surroundings as the
-    estimate of the density).
+    Without a group, the boxes lie evenly, so the number inside is binomial. The surroundings give the density (scan
+    statistic).
 
     inside: how many lie inside, any shape. around: how many lie inside or in the surroundings. share: the share of the whole
     region that is inside. tried: how many places were tried. With more places, a crowd by chance is more likely.

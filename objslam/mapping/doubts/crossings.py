@@ -1,4 +1,4 @@
-"""Find places of boxes without an object: points that more rays pass closely than by chance."""
+"""Find places of boxes without an object: points with more rays close by than chance explains."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _SCALES = (1.0, 3.0)
 """The largest distance of a ray from its place, in gates. The first finds rays that meet, the second also rays that only
 pass nearby. Larger numbers find looser groups, and join different groups more often."""
 _LOOSE = 2.0
-"""If the second scale finds more than this many times as many rays as the first, the rays only pass nearby, and do not meet.
-With a larger number, more loose groups count as narrow ones."""
+"""The second scale finds more rays than the first. If it finds more than this multiple, the rays only pass nearby, and do
+not meet. With a larger number, more loose groups count as groups that meet."""
 _AROUND = 4.0
-"""The surroundings of a place end at this multiple of the distance up to which a ray passes it. A larger multiple gives a
-surer estimate of how many rays pass by chance, from a larger area."""
+"""The surroundings of a place reach to this multiple of the largest distance at which a ray passes the place. A larger
+multiple gives a surer estimate of how many rays pass by chance, from a larger area."""
 _FLAT = 0.5
-"""The largest angle (rad) of the surroundings, seen from a camera. Wider ones are not flat, so their area does not tell how
-many rays pass by chance. A larger angle counts places nearer to the path."""
+"""The largest angle (rad) of the surroundings, seen from a camera. Wider surroundings are not flat, so their area does not
+tell how many rays pass by chance. A larger angle counts places nearer to the path."""
 _PAIRS = 3000
 """The number of pairs of rays that are tried for a label. More pairs find groups of fewer rays, and take longer."""
 _NEXT = 30
@@ -37,8 +37,8 @@ longer."""
 _MOST = 12
 """The most groups of one label. Nobody reads a report with more."""
 _PARALLAX = np.radians(1.0) ** 2
-"""The least squared sine of the angle between two rays whose crossing is tried. With a smaller one, more places are far
-off."""
+"""The least squared sine of the angle between two rays whose crossing is tried. With a smaller value, more of the tried
+places are far away."""
 _FAR = 3.0
 """A crossing counts up to this multiple of the greatest distance at which an object was seen. A larger multiple tries more
 places far away."""
@@ -78,7 +78,7 @@ def _of_label(evidence: Evidence, mine: Ints, reach: float) -> Iterator[Ints]:
         scale = int(standing_out[0])
         place = int(odds[scale].argmax())
         open_[scale, place] = False
-        loose = np.flatnonzero(number[:, place] > _LOOSE * number[scale, place])  # They include the narrow crowd.
+        loose = np.flatnonzero(number[:, place] > _LOOSE * number[scale, place])  # A loose crowd includes the narrow one.
         scale = max([scale, *loose.tolist()])
         group = _gathered(obs, mine, free, places[place], inside[scale, place], _SCALES[scale] * radius)
         if group.sum() >= _FEWEST:
@@ -108,8 +108,8 @@ def _places(obs: Observations, mine: Ints, reach: float, rng: np.random.Generato
 def _deviations(obs: Observations, places: Floats, widest: float = 0.0) -> Floats:
     """Return by how many standard deviations each ray passes each place, (P, R).
 
-    It is inf for a place behind the camera, and for one so near to it that the surroundings fill its view. widest: the
-    deviation up to which the surroundings reach.
+    It is inf for a place behind the camera, and for a place so near to the camera that the surroundings fill the view.
+    widest: the deviation up to which the surroundings reach.
     """
     centre = obs.origin.mean(axis=0)
     point, origin = places - centre, obs.origin - centre

@@ -18,12 +18,13 @@ from objslam.mapping.doubts.unmapped import in_assessment, unmapped_labels
 from objslam.mapping.doubts.words import in_words
 
 _DOUBLE = 0.5
-"""The probability from which a pair that may be one counts in the assessment. With a larger value, more maps are good."""
+"""A pair of objects counts in the assessment if it is one object with at least this probability. With a larger value, more
+maps are good."""
 
 
 _LOST = 0.1
-"""The share of the boxes of a label from which a group of boxes that became no object counts in the assessment. A detector's
-false boxes of one kind at one place are rarer. With a larger share, more maps are good."""
+"""A group of boxes that became no object counts in the assessment if it has at least this share of the boxes of its label. A
+detector's false boxes of one kind at one place are rarer. With a larger share, more maps are good."""
 _FEWEST_LOST = 5
 """The fewest boxes of such a group. With a larger number, more maps are good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
@@ -49,9 +50,9 @@ def find_doubts(result: RunResult) -> Doubts:
 def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
-    A map with objects that are more likely doubles than not is not called good. Neither is a map that holds a place twice,
-    one with an object of many sizes, nor one without an object where many boxes of a label meet. A label without an object
-    is named, but its boxes may be false, so the level stays.
+    A map is not called good in four cases: some objects are more likely doubles than not, a place is in the map twice, an
+    object has many sizes, or many boxes of a label meet where the map has no object. A label without an object is named, but
+    its boxes may be false, so the level stays.
     """
     found = find_doubts(result)
     doubts = tuple(in_words(result, found.pairs, found.splits, found.groups))
@@ -76,7 +77,7 @@ def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -
     last."""
     if assessment["level"] == "bad" or not (doubles or lost):
         return assessment
-    if assessment["level"] == "good":  # Its first reason praises it, and the others are no reasons for a look.
+    if assessment["level"] == "good":  # The first reason praises the map. The others only describe it.
         return {**assessment, "level": "check", "reasons": [*doubles, *lost, *assessment["reasons"][1:]]}
     return {**assessment, "reasons": [*doubles, *assessment["reasons"], *lost]}
 
@@ -95,7 +96,8 @@ def _of_doubles(doubles: int) -> list[str]:
 
 
 def _of_lost_things(groups: BoxGroups, result: RunResult) -> list[str]:
-    """Return a reason for each label with a thing that is not in the map, though many of its boxes meet in one place."""
+    """Return a reason for each label with a lost thing: many boxes of the label meet in one place, but the map has no object
+    there."""
     if not len(groups):
         return []
     labels = result.rays.label_names

@@ -36,13 +36,13 @@ Reason = Literal[
     "unclear",
 ]
 REASONS: tuple[Reason, ...] = get_args(Reason)
-"""Why boxes are no object. In this order: they stay at one place of the image, they lie on an object, they follow one
-another and no place explains them, too few rays, no parallax, the rays do not meet, the ranges disagree, too few frames show
-the thing, its size is wrong, it moves a little, as many strays meet by chance, no reason alone. The first three belong to no
-place."""
+"""Why boxes are no object. The first three reasons belong to no place: the boxes stay at one place of the image, they lie on
+an object, or they follow one another and no place explains them. The others, in order: too few rays, no parallax, the rays
+do not meet, the ranges disagree, too few frames show the thing, its size is wrong, it moves a little, as many strays meet by
+chance, none of these reasons alone."""
 _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
-"""The median deviation of the ranges from the place, in standard deviations, above which the ranges disagree. With a larger
+"""The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger
 number, fewer groups have this reason."""
 
 
@@ -58,8 +58,8 @@ class BoxGroups:
     objects of its label, 0 if unknown. way: (G,) m, how far a moving point that explains the rays best moves. range,
     distance: (G,) m, the median measured range, NaN without one, and the median distance to the place. odds: (G,) the log
     odds that association gives to an object there. object: (G,) the index of the nearest object in the map, -1 for none.
-    away: (G,) m, its distance from the place. double: (G,) the number of these boxes in frames in which this object has a
-    box of its own.
+    away: (G,) m, the distance of this object from the place. double: (G,) the number of the group's boxes in frames in which
+    this object has a box of its own.
     """
 
     ray: Ints
@@ -176,8 +176,9 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
 
 
 def _nearest(evidence: Evidence, points: Points, owner: Ints) -> tuple[Ints, Floats, Ints]:
-    """Return the nearest object (G,) in the map or -1, its distance (G,), m, and how many of the boxes (G,) are in frames in
-    which it has a box of its own. owner: (G,) the landmark on which the boxes lie, or -1 for the nearest to their place."""
+    """Return the nearest object (G,) in the map or -1, its distance (G,), m, and the number (G,) of boxes in frames in which
+    this object has a box of its own. owner: (G,) the landmark on which the boxes lie, or -1 for the nearest to their
+    place."""
     state, count = evidence.state, len(owner)
     if not state.count:
         return owner, np.full(count, np.nan), np.zeros(count, dtype=np.int64)

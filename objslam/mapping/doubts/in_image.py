@@ -18,15 +18,15 @@ _SAME_BOX, _LIKE_BOX = 0.7, 0.3
 """Boxes are at one place of the image if their intersection over union with one box is above the first value. The number of
 boxes above the second value shows how many are there by chance. With a larger first value, only steadier boxes are found."""
 _BY_CHANCE = 0.1
-"""Of the random boxes above the second overlap, this share is also above the first one. It follows from the four coordinates
-of a box: ((1 - 0.7) / (1 - 0.3))^4 is 0.03, and boxes of one detector have similar sizes. A larger share finds fewer
-groups."""
+"""Of random boxes that overlap by more than `_LIKE_BOX`, this share overlaps by more than `_SAME_BOX`. It follows from the
+four coordinates of a box: ((1 - 0.7) / (1 - 0.3))^4 is 0.03, and boxes of one detector have similar sizes. A larger share
+finds fewer groups."""
 _TRIED = 64
 """For each label and camera, boxes at one place of the image are counted around at most this number of boxes. A larger
 number finds smaller groups."""
 _TURNED = np.cos(np.radians(20.0))
-"""The cosine of the least angle (rad) by which the camera must turn. A far thing ahead of a robot that drives straight on
-also stays at its place of the image. A smaller cosine finds fewer groups."""
+"""The camera must turn by at least an angle with this cosine. A far thing ahead of a robot that drives straight on also
+stays at its place of the image. A smaller cosine finds fewer groups."""
 
 
 def fixed_in_image(evidence: Evidence, left: Ints) -> Iterator[Ints]:

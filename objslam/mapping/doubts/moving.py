@@ -19,10 +19,10 @@ _SPEED = np.radians(25.0)
 """The highest angular speed (rad/s), seen from the camera, of a thing whose boxes follow one another. A larger value follows
 faster things, and joins more boxes by chance."""
 _LAGS = (1, 2, 3)
-"""The numbers of frames from one box of a thing that moves to its next. Larger numbers bridge more missed detections, and
-join more boxes by chance."""
+"""The numbers of frames from one box of a thing that moves to its next box. Larger numbers bridge more missed detections,
+and join more boxes by chance."""
 _FAR_LAGS = (50, 51, 52)
-"""The numbers of frames after which two boxes are no longer of one motion. Such pairs show how often boxes follow one
+"""After these numbers of frames, two boxes no longer show the same motion. Such pairs show how often boxes follow one
 another by chance."""
 _ALIKE = 1.5
 """The largest ratio between the sizes of two boxes that follow one another. A larger ratio joins more boxes by chance."""
@@ -30,7 +30,8 @@ _SMOOTH = 0.25
 """The largest `_jitter` of a thing that moves. Noise has 1, and a smooth motion nearly 0. A larger value finds more things
 that move, and also boxes that jump about one place."""
 _SIGMAS = 3.0
-"""The noise that two boxes may have beside the motion, in standard deviations. A larger number joins more by chance."""
+"""The noise that two boxes may have beside the motion, in standard deviations. A larger number joins more boxes by
+chance."""
 
 
 def moving_things(evidence: Evidence, left: Ints) -> Iterator[Ints]:
@@ -47,7 +48,7 @@ def moving_things(evidence: Evidence, left: Ints) -> Iterator[Ints]:
     frame = _frame_of_camera(evidence)[left]
     one, two = _links(evidence, left, frame, _LAGS, evidence.state.obs.direction)
     rotation = evidence.state.view.map_T_camera[evidence.state.obs.frame, :3, :3]
-    in_camera = np.einsum("rji,rj->ri", rotation, evidence.state.obs.direction)  # Chance fills images, not the map.
+    in_camera = np.einsum("rji,rj->ri", rotation, evidence.state.obs.direction)  # Chance boxes are anywhere in images.
     by_chance = (len(_links(evidence, left, frame, _FAR_LAGS, in_camera)[0]) + 1) / (len(left) + 2)
     least = max(_FEWEST, 1 + (np.log(len(left)) + LEAST_LOG_ODDS) / -np.log(by_chance))
     graph = coo_array((np.ones(len(one)), (one, two)), shape=(len(left), len(left)))
@@ -61,8 +62,8 @@ def moving_things(evidence: Evidence, left: Ints) -> Iterator[Ints]:
 
 
 def _jitter(evidence: Evidence, points: Points) -> Floats:
-    """Return how little the offsets of consecutive rays from their point agree (G,): 1 if they are independent, near 0 for a
-    smooth motion (half of von Neumann's ratio, 1941, by medians)."""
+    """Return the jitter (G,) of groups: how little the offsets of consecutive rays from their point agree. It is 1 for
+    independent offsets, and near 0 for a smooth motion (half of von Neumann's ratio, 1941, by medians)."""
     obs, count = evidence.state.obs, len(points.position)
     to = points.position[points.group] - obs.origin[points.ray]
     distance = np.maximum(np.linalg.norm(to, axis=1), 1e-6)

@@ -30,7 +30,8 @@ _BESIDES = 0.2
 """The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
 number, few frames tell less."""
 _PAD = 1.0
-"""The margin (m) around the objects in which others of their label may lie. A larger margin makes close pairs rarer."""
+"""The margin (m) around the objects in which other objects of their label may lie. A larger margin makes close pairs
+rarer."""
 _SHARED = 0.35
 """Two objects fill one space if they are closer than this share of the smaller size, as in association. A larger share
 reports more pairs."""
@@ -40,7 +41,7 @@ reports more pairs."""
 class Pairs:
     """P pairs of objects that may be one, the likeliest first.
 
-    first, second: (P,) indices into the map. distance: (P,) m. sigmas: (P,) the distance in standard deviations of both
+    first, second: (P,) indices into the map. distance: (P,) m. sigmas: (P,) the distance in standard deviations, by both
     covariances. probability: (P,) that they are one object. together: (P,) the number of frames with boxes of both.
     expected: (P,) the number of frames that would show both if they were two.
     """
@@ -65,8 +66,8 @@ def find_pairs(evidence: Evidence) -> Pairs:
     """Return the pairs of objects that may be one.
 
     Two explanations are compared. If they are one object, the covariance of their offset is the sum of their covariances,
-    and hardly any frame shows both (`TOGETHER`). If they are two, the second lies anywhere among the objects of its label,
-    and the frames that have both in view show both. Objects that fill one space are candidates too, because two things
+    and hardly any frame shows both (`TOGETHER`). If they are two objects, the second lies anywhere among the objects of its
+    label, and each frame with both in view shows both. Objects that fill one space are candidates too, because two things
     cannot do so.
     """
     state, covariance = evidence.state, evidence.covariance

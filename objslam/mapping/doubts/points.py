@@ -14,8 +14,8 @@ from objslam.core.statistics import grouped_median
 from objslam.mapping.doubts.evidence import Evidence
 
 MISSED = 3.0
-"""The median deviation, in standard deviations, above which the rays of a group do not meet in a point. It is 1.2 for rays
-that meet. With a larger number, fewer groups have rays that do not meet."""
+"""The rays of a group do not meet in a point if their median deviation exceeds this number of standard deviations. The
+median deviation is 1.2 for rays that meet. With a larger number, fewer groups have rays that do not meet."""
 _NEAR, _FAR = 0.2, 100.0
 """The least and the greatest distance (m) of the point where a fit starts. Larger values suit larger places."""
 _PAIRS = 64

@@ -18,8 +18,8 @@ _LEAST_SHARE = 0.1
 fewer objects that are two."""
 _APART = (3.8, 85.0)
 """The least distance between the groups, in standard deviations within them: the first number, plus the second divided by
-the number of rays. Of objects whose rays scatter evenly, 1 in 10,000 has two-means as far apart (simulated for 15 to 300
-rays); with Gaussian scatter fewer. Larger numbers find fewer objects that are two."""
+the number of rays. Of objects whose rays scatter evenly, 1 in 10,000 has groups at this distance (simulated for 15 to 300
+rays). With Gaussian scatter, fewer objects have. Larger numbers find fewer objects that are two."""
 _ABOVE_NOISE = 3.0
 """The least distance between the groups, in standard deviations of a ray by the noise that the label's rays show in this
 log. A larger number finds fewer objects that are two."""
@@ -27,7 +27,7 @@ _WITHIN_SIZE = 0.35
 """The least distance between the groups, as a share of the object's size. Box centres wander within their object. A larger
 share finds fewer objects that are two."""
 _ROUNDS = 8
-"""The rounds of two-means. They converge in fewer."""
+"""The rounds of two-means. They converge in fewer rounds. A larger number is slower."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ def find_splits(evidence: Evidence) -> Splits:
     """Return the objects that may be two.
 
     The offsets between an object and its rays have a direction along which they scatter most. Two-means along it gives two
-    groups. They are two things if they lie far apart compared with their own scatter, with the noise of the rays of this
-    label in this log, and with the size of the object.
+    groups. The groups are two things if the distance between them is large compared with three lengths: their own scatter,
+    the noise of the rays of this label in this log, and the size of the object.
     """
     state, count = evidence.state, evidence.state.count
     obs, owner, ray = state.obs, state.owner, state.assigned
@@ -71,7 +71,7 @@ def find_splits(evidence: Evidence) -> Splits:
     scatter = grouped_sums((scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 9), owner, count).reshape(-1, 3, 3)
     worst = np.linalg.eigh(scatter)[1][:, :, -1][owner]
     across = worst - np.einsum("pi,pi->p", worst, obs.direction[ray])[:, None] * obs.direction[ray]
-    seen = np.einsum("pi,pi->p", across, across)  # A ray along the worst direction tells nothing of it.
+    seen = np.einsum("pi,pi->p", across, across)  # A ray along the worst direction tells nothing about it.
     along = np.einsum("pi,pi->p", offset, across) / np.maximum(seen, 0.05)
     weight = np.where(depth > 0, seen / sigma**2, 0.0)
     upper, low, high = _two_means(along, weight, owner, count)

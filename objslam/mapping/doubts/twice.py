@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from objslam.association.registration.map_registration import Registration
 
 _FEWEST = 4
-"""The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number does
-less work."""
+"""The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number saves
+time, and misses losses among few objects."""
 _SPANNING = 0.5
-"""The largest share of objects that both parts of the drive show. After a loss, these are objects whose place another one
-has by chance. A larger share searches more maps."""
+"""The largest share of objects that both parts of the drive show. After a loss, an object is in both parts only if another
+object is at its place by chance. A larger share searches more maps."""
 _FEWEST_MATCHES = 0.5
 """The least share of the objects of the smaller part that the other part has too. Rooms of a building have some furniture in
 common. A larger share finds fewer losses."""
@@ -48,8 +48,8 @@ def find_twice(objects: ObjectMap) -> Twice | None:
     """Return the place that a map holds twice, None if there is none.
 
     A robot that loses its place sees all objects again as new ones. So there is a time at which nearly all known objects are
-    seen for the last time, and after which all are new. If the parts before and after it register to each other, they are
-    one place.
+    seen for the last time. All objects that are seen later are new. If the parts before and after it register to each other,
+    they are one place.
     """
     usable = [i for i, o in enumerate(objects.objects) if o.status == "ok" and o.covariance is not None]
     first = np.array([objects.objects[i].first_seen for i in usable])
@@ -77,5 +77,6 @@ def _cut(first: Floats, last: Floats) -> float | None:
     good = np.flatnonzero((smaller >= _FEWEST) & (spanning <= _SPANNING * len(first)))
     if not len(good):
         return None
-    # An object that both parts show is evidence against the cut, as much as one more of the smaller part is for it.
+    # An object that both parts show is evidence against the cut. An object of the smaller part is evidence for the cut, of
+    # the same weight.
     return float(times[good[np.argmax((smaller - spanning)[good])]])

@@ -12,7 +12,7 @@ _FEWEST = 3
 """The fewest frames with a label that is named. With a larger number, fewer labels of false boxes are named, but also fewer
 things that were seen only for a moment."""
 _NAMED = 3
-"""The most labels that the assessment names. A larger number makes it longer where a detector knows many labels."""
+"""The most labels that the assessment names. A larger number makes the assessment longer if a detector knows many labels."""
 
 
 def unmapped_labels(result: RunResult) -> list[Doubt]:

@@ -15,8 +15,8 @@ from objslam.mapping.doubts.pairs import Pairs
 from objslam.mapping.doubts.splits import Splits
 
 _BESIDE = 0.5
-"""The distance (m) up to which a sentence names the nearest object, if it has the label of the boxes. An object of another
-label is named within its own size. A larger distance names more."""
+"""A sentence names the nearest object up to this distance (m), if the object has the label of the boxes. An object of
+another label is named within its own size. A larger distance names more objects."""
 
 
 def in_words(result: RunResult, pairs: Pairs, splits: Splits, groups: BoxGroups) -> tuple[Doubt, ...]:

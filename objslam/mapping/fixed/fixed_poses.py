@@ -27,20 +27,20 @@ if TYPE_CHECKING:
 
 _ROUNDS = 12
 """The most rounds of association and calibration. Two or three are usual. A clock that is off by a second moves by 0.03 s in
-a round, so it needs ten to reach its bound. More rounds are slower if they do not settle."""
+a round, so it reaches its bound after ten rounds. A larger number is slower for logs that do not settle."""
 _SAME = 0.05
-"""An association is repeated only if ray directions, or their noise, differ from those of each earlier round by more than
+"""An association is repeated only if ray directions or their noise are new: they differ from each earlier round by more than
 this share of the noise. A smaller change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A larger
 share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the association
 can swing between two states for ever."""
 _FIRST = 0.05
-"""The noise (rad) of ray directions, in addition to that of the settings, in an association that shows the noise of the
-poses. The priors of the shared errors of a camera allow about as much. With a larger value, near objects become one, and
-then their rays show nothing of the poses."""
+"""The noise (rad) of ray directions that is added to the noise in the settings, for the association from which the noise of
+the poses is taken. The priors of the shared errors of a camera allow errors of about this size. With a larger value, near
+objects become one, and then their rays show nothing of the poses."""
 _EXPLAINED = 0.5
-"""If an association with wide gates explains at most this share of the rays, one with narrow gates is tried as well. The
-narrow one is taken if the wide one explains less than this share of the rays that the narrow one explains. With a larger
-share, the narrow one is tried and taken more often."""
+"""If an association with wide gates explains at most this share of the rays, a second association with narrow gates is
+tried. The second is taken if the first explains less than this share of the rays that the second explains. With a larger
+share, the second is tried and taken more often."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +71,16 @@ class FixedPoses:
 
     @property
     def noise_unknown(self) -> bool:
-        """Whether the noise of the poses is estimated: if the poses are localised, and as `noise.localization` says."""
+        """Whether the noise of the poses is estimated. The poses must be localised, and `noise.localization` must ask for
+        it."""
         use, usual = self.settings.noise.localization, self.settings.localization == Settings().localization
         return bool(self.frames.localized_every and (usual if use == "auto" else use))
 
     def noise_of_poses(self, association: Association, positions: Floats, weight: Floats) -> tuple[float, float]:
         """Return the factors on `localization.yaw` and `localization.xy` that the rays show, 1 if they are not estimated.
 
-        positions: (N, 3) m, NaN for an object without a position. weight: (R,) 0 for a rejected ray. It does not count."""
+        positions: (N, 3) m, NaN for an object without a position. weight: (R,) 0 for a rejected ray. A rejected ray does not
+        count."""
         if not self.noise_unknown:
             return 1.0, 1.0
         agreeing = replace(association, object=np.where(weight > 0, association.object, -1))
@@ -107,7 +109,7 @@ class FixedPoses:
     def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
         """Add the objects that can be found from few rays, if the poses are localised and the settings allow it.
 
-        estimate: of the objects, None if there are none. more: as in `associate`."""
+        estimate: the estimate of the objects, None if there are none. more: as in `associate`."""
         from objslam.association.few_rays.additional_objects import add_few_ray_objects
         from objslam.graph.fixed_pose_triangulation import pose_noise
 
@@ -152,8 +154,8 @@ def associate_fixed(
     """Find the objects, and the noise of the poses if the settings allow it.
 
     With too narrow gates, one object becomes several, and their rays show hardly any noise. So the noise is first taken from
-    an association with wide gates. Then both alternate until the noise stays. Returns the input with this noise, the
-    association, the estimate, and the number of objects in each round if there were several.
+    an association with wide gates. Then the association and the noise are found in turns until the noise stays. Returns the
+    input with this noise, the association, the estimate, and the number of objects in each round if there were several.
     """
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[float, float]] = []
@@ -243,7 +245,7 @@ def _placed(estimate: Estimate) -> Floats:
 
 
 def _own(at: FixedPoses) -> Floats:
-    """Return the standard deviations (R,), rad, of ray directions by their own noise and that of the headings."""
+    """Return the standard deviations (R,), rad, of ray directions, from the noise of rays and of headings."""
     from objslam.graph.fixed_pose_triangulation import pose_noise
 
     return pose_noise(at.rays_seen, at.seen, at.settings)[0]

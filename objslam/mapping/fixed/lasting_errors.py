@@ -15,7 +15,8 @@ from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
 
 _CELL = 1.0
-"""The shortest time (s) whose rays count as one. A longer time is faster, and sees shorter errors as noise."""
+"""The length (s) of the shortest cell. The rays of an object in one cell count as one ray. A longer time is faster, and sees
+shorter errors as noise."""
 _MOST_CELLS = 48
 """The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
 slower."""
@@ -36,10 +37,10 @@ settings more."""
 class Cells:
     """The rays of one object by time, in C cells.
 
-    times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left. white: (C,) rad, its
-    standard deviation from noise that does not last. shift: (C, 2) rad per m, its derivative by the object's x and y. size:
-    (C,) rad, the error of this angle by one standard deviation of the poses. pull: (C, 3) m, the shift of the object by such
-    an error in the cell.
+    times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left. white: (C,) rad, the
+    standard deviation of the mean from noise that does not last. shift: (C, 2) rad per m, the derivative of the mean by the
+    object's x and y. size: (C,) rad, the error of the mean by one standard deviation of the poses. pull: (C, 3) m, the shift
+    of the object by such an error in the cell.
     """
 
     times: Floats
@@ -57,9 +58,10 @@ class Cells:
 def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
     """Return the solution of a run at given poses with their lasting errors added to its covariances.
 
-    A pose has an error of its heading and of its place, which both turn a ray to a side as seen from the object. Its size is
-    `localization` times a factor, with a half-normal prior of 1, and its correlation falls exponentially over time. Both are
-    estimated by restricted maximum likelihood (Patterson and Thompson 1971), and averaged over their posterior.
+    A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. The
+    size of the errors is `localization` times a factor with a half-normal prior of 1. Their correlation falls exponentially
+    over time. The factor and the correlation time are estimated by restricted maximum likelihood (Patterson and Thompson
+    1971), and averaged over their posterior.
     """
     if not solution.keyframes.localized_every:
         return solution
@@ -78,7 +80,8 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
 
 
 def lasting_variances(seen: list[Cells]) -> Floats:
-    """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum is the factor of all errors.
+    """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum over these times is the
+    squared factor of all errors.
 
     seen: the cells of each object.
     """

@@ -22,19 +22,20 @@ _MOST_POSES = 500
 """The most poses that count, spread evenly. They determine a factor to 3 %. More poses are more exact and slower."""
 _BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])
 """The logarithms of the least and largest factors on the noise of rays, headings and places. The noise of poses never falls
-below the settings: a few frames with small errors do not promise the same of the others."""
+below the settings: a few frames with small errors do not promise small errors of the other frames. Wider bounds allow
+noisier poses."""
 _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
 """The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
 _CHANCE = 1e-3
-"""The chance of a false alarm: that poses which are as good as the settings say are found noisier. With a larger value,
-shorter logs can show noisy poses, and more good logs seem to have such poses."""
+"""The chance of a false alarm: poses that have the noise of the settings are found noisier. With a larger value, shorter
+logs can show noisy poses, and more good logs seem to have such poses."""
 _SIGNIFICANT = -2 * np.log(_CHANCE)
-"""The poses count as noisier if this lowers -2 ln of the posterior density by at least this value. It is the quantile of
-chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are the noises of headings and of
+"""The poses count as noisier if more noise lowers -2 ln of the posterior density by at least this value. It is the quantile
+of chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are the noises of headings and of
 places."""
 _STRAY = 3.0
 """The deviation of a stray ray, in standard deviations of all noise together. A larger number lets false boxes raise the
-noise, a smaller one lowers the noise of true boxes: by 1.3 % at 3."""
+noise. A smaller number lowers the noise of true boxes: the number 3 lowers it by 1.3 %."""
 _ROUNDS = 4
 """The most rounds in which stray rays are told from noisy poses. More rounds hardly change a factor."""
 
@@ -44,8 +45,8 @@ class _Sums:
     """Sums over the rays of each of K poses, in units of the nominal noise of rays.
 
     shared: (K, 3, 3) the information about an error of the pose: heading (rad), x and y (m). pulled: (K, 3) this information
-    times the error that fits best. squares: of all rays, their sum. rays: their number. noise: (3,) the nominal standard
-    deviations of the error. prior: the weight of the nominal noise, as a number of residuals.
+    times the error that fits best. squares: the sum of the squared misses of all rays. rays: the number of rays. noise: (3,)
+    the nominal standard deviations of the error. prior: the weight of the nominal noise, as a number of residuals.
     """
 
     shared: Floats
@@ -72,10 +73,11 @@ def noise_in_frames(
 ) -> tuple[float, float]:
     """Return the factors (at least 1) on `localization.yaw` and `localization.xy` that agree best with the rays.
 
-    A variance component model (Searle, Casella and McCulloch 1992): the miss of a ray, seen from above, is the sum of its
-    own noise, of the error of its pose's heading, and of the error of the pose's place as seen from the object. The three
-    sizes are those of the largest posterior density. Both factors are 1 unless the rays refute the settings. Only poses with
-    rays to two objects and more count, because a single ray does not tell which of the three errors it has.
+    A variance component model (Searle, Casella and McCulloch 1992): seen from above, the miss of a ray is a sum of three
+    errors: the noise of the ray, the error of the heading of its pose, and the error of the place of its pose, as seen from
+    the object. The sizes of the three errors are those of the largest posterior density. Both factors are 1 unless the rays
+    refute the settings. Only poses with rays to two objects and more count, because a single ray does not tell which of the
+    three errors it has.
 
     positions: (N, 3) m, NaN for an object without a position.
     """
@@ -117,7 +119,7 @@ def noise_in_frames(
 
 def _summed(miss: Floats, by_pose: Floats, pose: Ints, noise: tuple[float, float], settings: Settings) -> _Sums:
     """Return the sums over the rays of each pose. miss: (R,), by_pose: (R, 3) its derivative by the error of the pose, both
-    in standard deviations of the rays. noise: of headings, rad, and of places, m."""
+    in standard deviations of the rays. noise: the noise of headings, rad, and of places, m."""
     count, pose = len(np.unique(pose)), np.unique(pose, return_inverse=True)[1]
     shared, pulled = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(shared, pose, by_pose[:, :, None] * by_pose[:, None, :])
@@ -129,14 +131,14 @@ def _summed(miss: Floats, by_pose: Floats, pose: Ints, noise: tuple[float, float
 def _most_likely(sums: _Sums) -> Floats:
     """Return the factors (3,) on the noise of rays, headings and places with the least cost.
 
-    The last two are 1 unless larger ones cost significantly less."""
+    The factors on headings and places are 1 unless larger factors cost significantly less."""
     usual, cost_usual = _searched(sums, np.array([True, False, False]), np.zeros(3))
     found, cost = _searched(sums, np.ones(3, dtype=bool), usual)
     return np.exp(found if cost < cost_usual - _SIGNIFICANT else usual)
 
 
 def _searched(sums: _Sums, free: Bools, start: Floats) -> tuple[Floats, float]:
-    """Return the logarithms (3,) of factors with the least cost, and this cost: steps along the axes, then smaller ones.
+    """Return the logarithms (3,) of factors with the least cost, and this cost, by steps along the axes that become smaller.
 
     free: (3,) which factors change. start: (3,) logarithms."""
     best, cost = start, sums.cost(start)

@@ -32,9 +32,9 @@ def measured_objects(rows: list[Row], shared: Sequence[Floats | None]) -> Measur
 def site_covariances(solved: JointFrames, rows: list[Row], shared: Sequence[Floats | None]) -> tuple[Floats, Floats]:
     """Return the covariances (N, 3, 3) m^2 of the tracks, and their correlated part as a factor (N, 3, m) m.
 
-    Errors repeat from session to session: those of an object's boxes, and the scale of a robot's odometry. Many sessions do
-    not average them out. So the own error of an object is at least its error in the best session. The size of the site is
-    at least as uncertain as in the best session.
+    Some errors repeat from session to session: the errors of an object's boxes, and the scale of a robot's odometry. Many
+    sessions do not average them out. So the own error of an object is at least its error in the best session. The size of
+    the site is at least as uncertain as in the best session.
     """
     measured = measured_objects([(s, k, replace(o, life=None)) for s, k, o in rows], shared)
     assert measured.roots is not None

@@ -27,9 +27,9 @@ object."""
 class Track:
     """One object over the sessions of a site.
 
-    item: the object as seen last. number: its id in the site, None for a new object. life: after the sessions so far, None
-    before the first. places: its measurements, as rows of the joint solve. begun, met: the first and the last session that
-    found it, as indices in the order of time. since: when it was seen first, s.
+    item: the object as seen last. number: its id in the site, None for a new object. life: the life after the sessions so
+    far, None before the first session. places: its measurements, as rows of the joint solve. begun, met: the first and the
+    last session that found it, as indices in the order of time. since: when it was seen first, s.
     """
 
     item: MapObject

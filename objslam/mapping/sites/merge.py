@@ -26,7 +26,7 @@ from objslam.mapping.sites.session import Session
 
 _YOUNG = 2
 """An object that at most this number of sessions saw may have moved to its place. A larger number finds more moves, and
-takes more added objects for moved ones."""
+takes more added objects for moved objects."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Island:
 def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
     """Join each group of sessions that share objects to one island. The largest island comes first.
 
-    sessions: in the order of time. The first session of an island gives its frame. A session that fits no other one is an
-    island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions (`visits`) are
+    sessions: in the order of time. The first session of an island gives its frame. A session that fits no other session is
+    an island of its own. If a session is a whole site, its objects bring their lives along. Its own sessions (`visits`) are
     read only for the objects that it lacks.
     """
     islands = [_island(sessions, part) for part in place_sessions(sessions)]
@@ -126,8 +126,7 @@ def _live(
 
 
 def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject]) -> None:
-    """Join the lives of the objects that both the tracks in `begun` and a site have. here: the objects of the site, by
-    track."""
+    """Join the lives of the objects that are in `begun` and in a site. here: the objects of the site, by track."""
     for at in begun:
         old, new = tracks[at].life, here[at].life if at in here else None
         if old is not None and new is not None:
@@ -160,9 +159,10 @@ def _in_site(item: MapObject, before: MapObject | None, site_T_session: Floats) 
 
 
 def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequence[int]) -> list[int]:
-    """Find objects that moved: one track is gone, a similar one is new elsewhere. Return the tracks except these gone ones.
+    """Find objects that moved: one track is gone, and a similar track is new elsewhere. Return the tracks without these gone
+    tracks.
 
-    The new track takes the number of the gone one. begun: the tracks so far. came: the tracks that a later site brought.
+    The new track takes the number of the gone track. begun: the tracks so far. came: the tracks that a later site brought.
     They count as new, however many sessions of that site saw them.
     """
     lives = {at: life for at in begun if (life := tracks[at].life) is not None}

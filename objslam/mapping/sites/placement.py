@@ -1,8 +1,9 @@
 """Place the frames of many sessions: which sessions share objects, how they lie to each other, and which objects are one.
 
-A session is registered to the map of all sessions that are placed so far, not to each of them. So a session costs one
-registration, however many there are. The map has more objects than any of its sessions, and its labels are the majority's.
-So it also gives more evidence. What this module finds is a start: one joint solve of all sessions follows.
+A session is registered to the map of all sessions that are placed so far, not to each of these sessions. So a session costs
+one registration, however many sessions there are. The map also gives more evidence: it has more objects than any single
+session, and the label that most sessions gave to an object. What this module finds is a start: one joint solve of all
+sessions follows.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ class Part:
     """Sessions that share objects, as one map.
 
     objects: the map, in the frame of one of the sessions. Its objects are those of `tracks`, in the same order: first all
-    that are present in a session, then those that are gone. tracks: each object as its sessions have it. site_T_session: how
-    each session lies in this frame. log_odds: of the registration that tied each session to the others, NaN for the one that
-    gives the frame.
+    objects that are present in a session, then the gone objects. tracks: each object as its sessions have it.
+    site_T_session: how each session lies in this frame. log_odds: the log odds of the registration that tied each session to
+    the others, NaN for the session that gives the frame.
     """
 
     objects: ObjectMap
@@ -55,7 +56,7 @@ def place_sessions(sessions: Sequence[Session]) -> list[Part]:
         while k < len(parts):
             found = register(new.objects, parts[k].objects)
             if found.accepted:
-                new, k = _joined(parts.pop(k), new, found.b_T_a, found.log_odds), 0  # It grew, so others may accept it now.
+                new, k = _joined(parts.pop(k), new, found.b_T_a, found.log_odds), 0  # It grew, so others may match now.
             else:
                 k += 1
         parts = sorted([*parts, new], key=lambda one: -len(one.site_T_session))
@@ -123,7 +124,7 @@ def _with_labels_of(ours: MapObject, theirs: MapObject, often: Sequence[int]) ->
 
 
 def sessions_behind(item: MapObject) -> int:
-    """Return how many sessions an object stands for: those that saw it if it is of a site, else one."""
+    """Return how many sessions an object stands for: 1, or for an object of a site the number of sessions that saw it."""
     return 1 if item.life is None else item.life.sessions_seen
 
 

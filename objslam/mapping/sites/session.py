@@ -90,8 +90,8 @@ class Visit:
 
 
 def _boxes(rays: RaysTable, objects: ObjectMap, views: Views) -> tuple[Observations, Floats]:
-    """Return the boxes of all frames, in the order of the frames, and the distance (R,) m of each box's object, NaN if
-    unknown.
+    """Return the boxes of all frames, in the order of the frames. Also return the distance (R,) m of the object of each box,
+    NaN if unknown.
 
     Boxes without a camera frame are left out.
     """

@@ -39,7 +39,7 @@ def draw_boxes(image: Array, boxes: Floats, labels: Sequence[str], scores: Float
 
 
 def free_plate(wanted: Plate, taken: Sequence[Plate], width: int, height: int) -> Plate:
-    """Return the plate of a label: the wanted one, moved into the image and down to the first free place, if there is one.
+    """Return the plate of a label: the wanted plate, moved into the image, and down to a free place if there is one.
 
     taken: the plates that are drawn already. width, height: the size of the image, px.
     """

@@ -21,12 +21,12 @@ _MAX_RAYS = 2000  # The picture shows at most this many used rays. More rays wou
 _MAX_REJECTED = 400  # The picture shows at most this many rejected rays, because they cross the whole map.
 _MAX_LABELS = 150  # The picture has at most this many labels. The objects with the most rays come first.
 _PATH_POINTS = 1500  # Labels avoid at most this many points of the path.
-_WEIGHT = 5  # A label avoids each point of a cross or of an ellipse as much as this many points of the path.
+_WEIGHT = 5  # For a label, a point of a cross or of an ellipse counts like this many points of the path.
 _CROSS = 17.0  # The cross of a true object has this width and height, px.
 _DOT, _START = 11.0, 15.0  # The dot of an object, and the circle at the start of the path, have these diameters, px.
 _ELLIPSE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map, and its least width, px. Its least height is 300 px.
-_EDGE = 0.985  # The triangle of a far object is this share of the way from the centre of the picture to its edge.
+_EDGE = 0.985  # The triangle of a far object is at this share of the way from the centre of the picture to the edge.
 _TRIANGLE = 18.0  # The triangle of a far object has this length, px.
 _PATH = 2.0  # The width, px, of a path.
 _TAG, _NORMAL = 4.0, 0.3  # The width, px, of the outline of a fiducial, and the length, m, of the line along its normal.
@@ -177,8 +177,8 @@ def _ellipse(o: MapObject, plane: list[int]) -> Floats | None:
 
 
 def _at_edge(points: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Return, for each far point (F, 2), the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
-    between both, all in m."""
+    """For each far point (F, 2), return the point (F, 2) at the picture's edge in the same direction, and the distance (F,)
+    between the two. All are in m."""
     centre, half = (low + high) / 2, (high - low) / 2
     at = centre + (points - centre) * (_EDGE / (np.abs(points - centre) / half).max(axis=1, initial=1e-9))[:, None]
     return at, np.linalg.norm(points - at, axis=1)

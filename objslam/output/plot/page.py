@@ -170,7 +170,7 @@ def _ticks(figure: Figure) -> Ticks:
 
 
 def _draw_ticks(page: Image, ticks: Ticks, left: int, top: int, bottom: int) -> None:
-    """Draw the ticks of an area whose left, upper and lower edges are at these px of the page."""
+    """Draw the ticks of an area. left, top, bottom: the edges of the area, px of the page."""
     for x, text in ticks[0]:
         draw_line(page, np.array([[left + x, bottom], [left + x, bottom + _TICK]]), _BLACK, 1)
         draw_text(page, text, (left + x - text_width(text, FONT) / 2, bottom + _TICK + 3), FONT, _BLACK)

@@ -16,16 +16,16 @@ from objslam.errors import printable
 RayKind = Literal["used", "rejected", "unexplained"]
 """The kind of a ray: used for its object, rejected as an outlier of its object, or unexplained by any object."""
 
-REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value.
+REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value. A larger value rejects more.
 _USUAL_REACH = 2.0  # Rays are drawn with this length, m, if no ray has an object.
 _SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
 """Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
 either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _CORE, _AROUND = 0.1, 1.5
-"""The shown area without a path. The box of the objects leaves out the first share of them on each side. A picture shows
-objects up to the second number times the box's diagonal from it. A larger share hides more far objects, and a larger
-multiple fewer."""
+"""They limit the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects on
+each side. A picture shows objects up to `_AROUND` times the box's diagonal away from the box. A larger share hides more far
+objects. A larger multiple hides fewer."""
 _OUTLINE_POINTS = 96  # A round body is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _FENCE = (3.0, 0.5, 1.0)
 """A picture shows an object if its distance from the path is at most the largest of three distances: this multiple of the
@@ -43,7 +43,8 @@ def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:
 def ray_ends(result: RunResult) -> Floats:
     """Return the point (R, 3), m in map, at which the drawing of each ray ends.
 
-    A ray is as long as the distance to its object. A ray without an object gets the median length of the rays with one.
+    A ray is as long as the distance to its object. A ray without an object gets the median length of the rays with an
+    object.
     """
     index = result.association.object
     reach = np.full(len(index), np.nan)

@@ -85,9 +85,9 @@ def best_rays(rays: RaysTable, mine: Ints, count: int) -> Ints:
 def choose_rays(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
     """Return the indices of the rays for the pictures of an object, each with its kind.
 
-    best: up to `count` rays of `best_rays`. worst: of the other used rays, those with the largest residuals, in sigmas.
-    rejected: evenly chosen. Worst and rejected rays are up to half of `count` each, rounded up. mine: (M,) the indices of
-    the object's rays, in the order of time.
+    best: up to `count` rays of `best_rays`. worst: the other used rays with the largest residuals, in sigmas. rejected:
+    evenly chosen. There are up to half of `count` worst rays, rounded up, and the same number of rejected rays. mine: (M,)
+    the indices of the object's rays, in the order of time.
     """
     found: dict[int, Kind] = dict.fromkeys(best_rays(rays, mine, count).tolist(), "best")
     few = (count + 1) // 2 if count else 0
@@ -104,7 +104,7 @@ def choose_unexplained(rays: RaysTable, label: str, count: int) -> dict[int, Kin
 
 
 def spread_over_time(rays: RaysTable, mine: Ints, count: int) -> dict[int, Kind]:
-    """Return up to `count` of the rays `mine` (M,), as for boxes of no object.
+    """Return up to `count` of the rays `mine` (M,), spread over the time.
 
     The rays are split into `count` parts in the order of time. Each part gives its ray with the highest score.
     """

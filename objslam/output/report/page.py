@@ -41,7 +41,7 @@ from objslam.results.read import (
 
 _BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
 _LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.
-_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # A yaw is shown if its standard deviation (rad) is below this. Others are unknown.
+_KNOWN_YAW = 0.999 * UNKNOWN_YAW  # A yaw is unknown if its standard deviation (rad) is at least this.
 _COUNTS = {
     "images": "colour images",
     "detection_frames": "camera frames",
@@ -156,7 +156,7 @@ def _unexplained(rays: RaysTable, crops: int) -> dict[str, dict[int, Kind]]:
 def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None) -> dict[str, Images]:
     """Return the images of each camera with corrected stamps: the clock offset that the run estimated is added.
 
-    images: by camera name. calibration: the entry of summary.json, None if the run estimated no shared errors.
+    images: the images by camera name. calibration: the entry of summary.json, None if the run estimated no shared errors.
     """
     found = calibration["parameters"] if calibration else {}
     clock = {name: found.get(f"{name}.clock", {"value": 0.0})["value"] for name in images}

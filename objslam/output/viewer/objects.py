@@ -32,13 +32,13 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
     `uncertainty` has the 2-sigma ellipsoids of resolved objects, and `extent` has boxes of their size. `bodies` has
     filled ellipsoids, and `cuboids` has boxes, of objects with a body. `tags` has the outlines of fiducials, and `tags/axes`
-    their axes: x red, y green, z blue. `unresolved` has the
-    ray of each unresolved object. `labels` has the captions of all objects.
+    has their axes: x red, y green, z blue. `unresolved` has the ray of each unresolved object. `labels` has the captions of
+    all objects.
 
     Args:
         path: (K, 3) points, m in map, that labels should not cover.
         static: whether the objects are static. If not, they are logged at the current time of the recording, and an entity
-            without objects is logged to clear the earlier ones.
+            without objects is logged to clear the earlier objects.
     """
     every, texts, colour = objects.objects, captions(objects), colours(objects)
 

@@ -13,7 +13,8 @@ from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.times import iteration_column, stamp_column
 
 _GAP, _GAP_STEPS = 1.0, 5.0
-"""A pause breaks a curve if it is longer than `_GAP`, s, and than `_GAP_STEPS` times the median step between stamps."""
+"""A pause breaks a curve if it is longer than `_GAP`, s, and longer than `_GAP_STEPS` times the median step between stamps.
+Larger values break curves more rarely."""
 _BLUE, _ORANGE, _GREEN, _GREY = (62, 128, 214), (240, 150, 50), (90, 170, 90), (120, 120, 120)  # RGB, of curves.
 _MANY = (
     *(_BLUE, _ORANGE, _GREEN, (190, 70, 70), (140, 90, 190), (140, 100, 80)),

@@ -54,7 +54,7 @@ class ViewPoint:
 
 
 def first_view_point(objects: ObjectMap, path: Floats, up: Up = "z") -> ViewPoint:
-    """Return the view point from which the objects, without far ones, and the path (K, 3) fill the view.
+    """Return the view point from which the objects and the path (K, 3) fill the view. Far objects do not count.
 
     up: the axis of the map that points up.
     """

@@ -172,7 +172,8 @@ def _add_connection(fields: _Fields, data: bytes, reading: _Reading) -> None:
         return
     name, definition = (details.get(key, b"").decode("utf-8", "replace") for key in (b"type", b"message_definition"))
     connection, key = make_connection(topic, name, "ros1", definition, "msg"), _number(fields, b"conn")
-    if reading.connections.get(key) != connection:  # Callers use id() of a connection as a key, so an equal one stays.
+    # Callers use id() of a connection as a key, so a repeated connection must not replace the first.
+    if reading.connections.get(key) != connection:
         reading.connections[key] = connection
 
 

@@ -26,7 +26,7 @@ _FORMATS = {
 _METADATA = "metadata.yaml"
 _MAX_METADATA = 16 << 20  # The size limit of metadata.yaml, bytes. The limit bounds memory.
 _MAX_FILE = 256 << 30  # The size limit of an unpacked file, bytes. The limit bounds disk use.
-_MAX_RATIO = 1000  # The largest ratio of unpacked to packed size. 1 GiB is always allowed. No recording compresses further.
+_MAX_RATIO = 1000  # The largest ratio of unpacked to packed size. 1 GiB is always allowed. No recording has a larger ratio.
 _SPLIT = re.compile(r"(.*?)[-_]?(\d+)?((?:\.bag|\.mcap|\.db3|\.active|\.zstd)+)")
 
 

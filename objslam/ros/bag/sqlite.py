@@ -90,7 +90,7 @@ def _rows(
 ) -> Iterator[tuple[int, int, Any, Any]]:
     """Yield the rows of the topics in rowid order: rowid, topic id, time of recording (ns) and message.
 
-    A cut-off file is read page by page. So is the rest of a file after a failure of the database.
+    A cut-off file is read page by page. After a failure of the database, the rest of the file is read page by page too.
     """
     marks = ", ".join("?" * len(topics))
     last = -1

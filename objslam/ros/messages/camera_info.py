@@ -26,10 +26,11 @@ _HINT = "--camera-info FILE can give the calibration"
 def camera_of(info: Any, name: str, topic: str, rectified: bool) -> tuple[Camera, Floats]:
     """Return the camera of a sensor_msgs/CameraInfo (ROS 1 or 2), and its pose frame_T_camera (4, 4) in the header frame.
 
-    If `rectified`, the left 3x3 part of P is the camera matrix, or K if both P and D are zero, and there is no distortion.
-    If not, K and D apply, and R is the rotation of frame_T_camera, because the header frame belongs to the rectified camera
-    (as in image_geometry). The camera is for the image after binning and region of interest. name: of the camera. topic: of
-    the message, for errors. Raises LogError if the camera is not calibrated or its distortion is invalid.
+    If `rectified`, there is no distortion. The camera matrix is the left 3x3 part of P, or K if both P and D are zero. If
+    not, K and D apply. R is then the rotation of frame_T_camera, because the header frame belongs to the rectified camera
+    (as in image_geometry). The camera is for the image after binning and region of interest. name: the name of the camera.
+    topic: the topic of the message, for errors. Raises LogError if the camera is not calibrated or its distortion is
+    invalid.
     """
     values = _values(info, "P")[[0, 1, 2, 4, 5, 6, 8, 9, 10]] if rectified else _values(info, "K")
     if rectified and not values.any() and not _values(info, "D").any():  # P is unset. Without distortion, K is right.

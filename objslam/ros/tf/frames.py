@@ -10,7 +10,9 @@ from objslam.core.arrays import Floats
 from objslam.ros.bag.records import frame_name
 
 MAX_TRANSFORMS = 10_000  # The limit of transforms per message and of frames. The limit bounds memory.
-MAX_GAP = 10.0  # The longest interpolated gap between two transforms, s. tf2 has the same default buffer length.
+MAX_GAP = 10.0
+"""The longest interpolated gap between two transforms, s. tf2 has the same default buffer length. A larger value bridges
+longer gaps, with less exact poses."""
 _STILL = 1e-9  # A pose is static if no element of its matrix changes by more. A larger value takes slow motion for rest.
 BASES = ("base_footprint", "base_link")  # The base frames of a robot (REP 105) without namespaces, by priority.
 _WORLDS = {"map", "world"}

@@ -30,7 +30,8 @@ class TfRows:
     refused: Counter[str] = field(default_factory=Counter)
 
     def add(self, transform: Any, logged: int, static: bool) -> None:
-        """Add a geometry_msgs/TransformStamped. Invalid ones are counted in `refused`. logged: the time of recording, ns."""
+        """Add a geometry_msgs/TransformStamped. An invalid transform is counted in `refused`. logged: the time of recording,
+        ns."""
         try:
             parent, child = link(transform)
         except ValueError as error:

@@ -1,10 +1,10 @@
 """The bytes of a journal file: a header, then records, each with a checksum of its own.
 
-New journals have format 2. Its header is `OBJSLAM2`, 8 bytes that identify the journal, the number of this segment from 1
-on, and a CRC-32 of the bytes before it. A record is a mark, the length of its content, a CRC-32 of length and content, and
-the content. The mark lets a reader find the next record behind a damaged one. Format 1 is only read, and appended to. Its
-header is `OBJSLAM1`. Its records have no mark, and their CRC-32 is that of the content alone. All numbers are little endian
-and have 4 bytes.
+New journals have format 2. Its header has four parts: `OBJSLAM2`, 8 bytes that identify the journal, the number of this
+segment from 1 on, and a CRC-32 of these three parts. A record is a mark, the length of its content, a CRC-32 of length and
+content, and the content. The mark lets a reader find the next record behind a damaged one. Format 1 is only read, and
+appended to. Its header is `OBJSLAM1`. Its records have no mark, and their CRC-32 is that of the content alone. All numbers
+are little endian and have 4 bytes.
 """
 
 import struct

@@ -1,7 +1,8 @@
 """The segments of a journal. A long journal is cut into files, and all but the last are compressed with zstd.
 
-The last segment has the name of the journal. The earlier ones are beside it as journal-IDENTITY.NUMBER.objslam.zst, where
-IDENTITY is in the header of the last one. So a renamed journal keeps its earlier segments, which keep their names.
+The last segment has the name of the journal. The earlier segments are beside it as journal-IDENTITY.NUMBER.objslam.zst.
+IDENTITY is in the header of the last segment. So a journal that is renamed keeps its earlier segments, whose names do not
+change.
 """
 
 import fcntl
@@ -62,7 +63,8 @@ def is_journal(path: Path) -> bool:
 
 
 def holds_messages(file: Path, header: Header | None) -> bool:
-    """Return whether a journal has messages. header: of its last segment, which is `file`, None if it is damaged."""
+    """Return whether a journal has messages. header: the header of its last segment, which is `file`, None if the header is
+    damaged."""
     return header is not None and (header.number > 1 or file.stat().st_size > header.size)
 
 

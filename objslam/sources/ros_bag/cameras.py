@@ -40,13 +40,18 @@ def find_cameras(
 ) -> tuple[CameraTopics, ...]:
     """Find the cameras of a recording and their topics.
 
-    With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the camera's
-    name as a part. A single calibration without such topics takes all topics. One of several calibrations without such
-    topics is left out with a warning. Without calibrations, each frame_id of detections is a camera. Without detections too,
-    each frame_id that colour images share with a CameraInfo is a camera, and so is a single topic of colour images. The
-    other topics of a camera have its frame_id. In a recording without detections and images, each frame_id of a CameraInfo
-    is a camera, and so is each calibration. If several topics fit a role, the one with the most similar name is taken
-    with a warning. rectified: whether boxes and images are rectified. None lets the topic names decide.
+    The recording decides what counts as a camera:
+
+    - With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the
+      camera's name as a part. A single calibration without such topics takes all topics. One of several calibrations without
+      such topics is left out with a warning.
+    - Otherwise, each frame_id of detections is a camera.
+    - Without detections, each frame_id that colour images share with a CameraInfo is a camera. A single topic of colour
+      images is a camera too.
+    - Without detections and images, each frame_id of a CameraInfo is a camera, and each calibration.
+
+    The other topics of a camera have its frame_id. If several topics fit a role, the topic with the most similar name is
+    taken with a warning. rectified: whether boxes and images are rectified. None lets the topic names decide.
     """
     detections, images = pool.fitting("detections"), pool.fitting("image")
     seeds = detections or images or pool.fitting("camera_info")
@@ -125,9 +130,9 @@ def _gather(
 ) -> CameraTopics:
     """Find all topics of a camera. seeds: the topics of detections or images that define the camera.
 
-    Its other images are those with the frame_id `frame`. If this is the only camera (`alone`), images with another frame_id
-    belong to it too, if the user chose them or the camera has no frame_id. Its CameraInfo has the same frame_id. Without
-    such a CameraInfo, one with a similar name is taken, or any if no name is similar.
+    Its other images are those with the frame_id `frame`. The only camera (`alone`) also gets images with another frame_id,
+    if the user chose these images or if the camera has no frame_id. Its CameraInfo has the same frame_id. Without such a
+    CameraInfo, one with a similar name is taken, or any if no name is similar.
     """
 
     def mine(role: str) -> list[Topic]:

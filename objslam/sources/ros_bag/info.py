@@ -20,9 +20,9 @@ from objslam.sources.summary import FIND_BOXES, Timing, off_path, timing
 class TopicInfo:
     """One topic of a bag.
 
-    messages: the number of messages. timing: of the messages by their header stamps, or by the times of recording for tf and
-    for types that objslam does not use. role: the role in a run, "" for none. frame: the most frequent frame_id. detail: a
-    short description of the messages. refused: the reasons why messages are unusable, with counts.
+    messages: the number of messages. timing: the timing of the messages by their header stamps, or by the times of recording
+    for tf and for types that objslam does not use. role: the role in a run, "" for none. frame: the most frequent frame_id.
+    detail: a short description of the messages. refused: the reasons why messages are unusable, with counts.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Upright cuboids by seven parameters.
 
-The parameters are the centre x, y, z (m), the mean p of the logarithms of the horizontal half axes, half their difference q,
-the yaw (rad), and the logarithm k of the half axis upwards. q may be negative.
+The parameters are the centre x, y, z (m), p, q, the yaw (rad), and k. p is the mean of the logarithms of the two horizontal
+half axes, and q is half their difference, which may be negative. k is the logarithm of the half axis upwards.
 """
 
 from __future__ import annotations

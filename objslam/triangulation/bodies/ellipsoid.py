@@ -20,8 +20,8 @@ _LEAST = 1e-9
 def section(values: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
     """Return the quadratic form v^T M v (...,) of vectors v = (x, y, z), and its derivatives (..., 4) by p, q, s and k.
 
-    values: (..., 7) parameters. M is the matrix of squared half axes, so the square root of the form with a unit vector is
-    the distance of a tangent plane from the centre.
+    values: (..., 7) parameters. M is the matrix of squared half axes. If v is the unit normal of a tangent plane, the square
+    root of the form is the distance of this plane from the centre.
     """
     p, q, s, k = np.moveaxis(values[..., 3:], -1, 0)
     aspect2 = q * q + s * s

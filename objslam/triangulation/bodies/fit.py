@@ -15,17 +15,18 @@ from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 _ITERATIONS = 40
 """The most steps of a fit. Ten are usual. More steps are slower."""
 STILL = 1e-9
-"""The least decrease of the cost for which the fit of a body goes on. The cost is half the sum of squared deviations. The
-decrease is that of the linear model of a step. A larger value ends sooner."""
+"""The fit of a body goes on if a step decreases the cost by at least this. The cost is half the sum of squared deviations.
+The decrease is that of the linear model of a step. A larger value ends sooner."""
 _UPHILL = 1e-3
-"""The share by which a step may raise the cost. The derivatives leave out that the distance to a body changes, so steps near
-the optimum may raise the cost slightly. A larger share accepts worse steps."""
+"""A step may raise the cost by this share. The derivatives leave out that the distance to a body changes, so steps near the
+optimum may raise the cost slightly. A larger share accepts worse steps."""
 _DAMPING = (1e-3, 1e-9, 1e6)
 """The first, least and most damping of a step, as a share of the curvature. More damping makes shorter steps."""
 _LONGEST = 0.7
 """The longest step of a logarithm or an angle (rad). A longer step may leave the region in which the linear model holds."""
 _REMAIN = 0.7
-"""If a smaller share of the bodies than this is unfinished, only they get more steps. A larger share copies more often."""
+"""If less than this share of the bodies is unfinished, only these bodies get more steps. A larger share copies their data
+more often."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,8 @@ def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Fl
 
 
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:
-    """Return half the weighted sum of squares (N,) of each body, with its prior. The weights are fixed, also robust ones.
+    """Return half the weighted sum of squares (N,) of each body, with its prior. All weights are fixed, the robust weights
+    too.
 
     A bound that a step crosses counts at once, so that no step jumps back and forth across it.
     """

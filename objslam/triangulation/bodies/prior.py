@@ -20,14 +20,16 @@ _ASPECT = 0.35
 """The standard deviation of the two aspect parameters q and s. The median ratio of the horizontal half axes is then 2.3. A
 larger value allows longer objects."""
 _DOT = 1e-4
-"""The half axes (m) of an ellipsoid that represents a point."""
+"""The half axes (m) of an ellipsoid that represents a point, far below the size of any object."""
 _LIKE = 2.0
 """With this many bodies of a label, the spread of their sizes weighs as much as _SIZE and _ASPECT. A larger number trusts
 the label less."""
 _LEAST = 0.1
-"""The least standard deviation of the logarithm of a half axis, given the label. A smaller value trusts the label more."""
+"""The least standard deviation of the logarithm of a half axis, in the prior of a label. A smaller value trusts the label
+more."""
 _TIE = 1e-3
-"""The standard deviation, practically 0, of the logarithms by which the half axes of a sphere differ."""
+"""The standard deviation, practically 0, of the logarithms by which the half axes of a sphere differ. A larger value allows
+flatter spheres."""
 
 
 def weak_prior(points: Floats, half: Floats) -> Prior:
@@ -72,7 +74,7 @@ def known_sizes(
 ) -> Prior:
     """Return the prior with known sizes (length, width, height), m, of labels. names: the label of each body.
 
-    The yaw of a body stays free, because only its aspect is drawn towards the known one, at the yaw that the fit has found.
+    The yaw of a body stays free. Only its aspect is drawn towards the known aspect, at the yaw that the fit has found.
     """
     mean, information = prior.mean.copy(), prior.information.copy()
     for body, name in enumerate(names):

@@ -1,9 +1,9 @@
 """The residuals of boxes against bodies, and their derivatives.
 
-A plane with the outward unit normal n through the camera m touches the body with the centre c and the support h(n) if
-n . (c - m) + h(n) = 0. An ellipsoid with the matrix M has h = sqrt(n^T M n), so this is the equation of its dual quadric
-(Hartley and Zisserman 2004, section 8.3). If the left side is not 0, it is the length, m, by which the body reaches beyond
-the plane. Divided by the distance of the touched point, it is an angle.
+Let a plane go through the camera m, with the outward unit normal n. Let a body have the centre c and the support h(n). The
+plane touches the body if n . (c - m) + h(n) = 0. For an ellipsoid with the matrix M, h = sqrt(n^T M n), and this is the
+equation of its dual quadric (Hartley and Zisserman 2004, section 8.3). If the left side is not 0, it is the length, m, by
+which the body reaches beyond the plane. Divided by the distance of the touched point, it is an angle.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def nominal_noise(edges: BoxEdges) -> Floats:
 
 
 def at_edges(edges: BoxEdges, noise: Floats) -> Floats:
-    """Return the noise (B, 5) of the residuals, given that of shift, size and range (B, 5).
+    """Return the noise (B, 5) of the residuals, given the noise (B, 5) of shift, size and range.
 
     If an edge of an axis is a bound, the residuals of this axis are its two edges. An edge has the noise of shift and size
     together.
@@ -98,8 +98,8 @@ def at_edges(edges: BoxEdges, noise: Floats) -> Floats:
 def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
     """Return derivatives (B, 5, ...) by shift, size and range, from derivatives by the residuals.
 
-    If an edge of an axis is a bound, the residuals of this axis are its two edges. A shift moves both with opposite signs, a
-    size with the same sign.
+    If an edge of an axis is a bound, the residuals of this axis are its two edges. A shift changes the residuals of the two
+    edges with opposite signs, a size with the same sign.
     """
     row, axis = _axes_with_bound(edges)
     low, high = rows[row, axis], rows[row, axis + 2]

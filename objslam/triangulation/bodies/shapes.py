@@ -26,9 +26,9 @@ class Kind:
     the centre, their derivatives (B, 4, 4) by the last four parameters, and the points (B, 4, 3), m, that they touch,
     relative to the centre.
     ranges: takes parameters (B, 7), origins (B, 3), m, and directions (B, 3) of rays. Returns the distances (B,), m, to the
-    surface, their derivatives (B, 7), and which rays (B,) hit it. The others take parameters (N, 7). half_axes: returns the
-    half axes (N, 3), m, the long horizontal one first. heading: the yaw (N,), rad, of the long axis. axes_jacobian: the
-    derivatives (N, 7, 7) of centre, half axes and yaw by the parameters.
+    surface, their derivatives (B, 7), and which rays (B,) hit it. The other functions take parameters (N, 7). half_axes:
+    returns the half axes (N, 3), m, the long horizontal one first. heading: the yaw (N,), rad, of the long axis.
+    axes_jacobian: the derivatives (N, 7, 7) of centre, half axes and yaw by the parameters.
     """
 
     support: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]

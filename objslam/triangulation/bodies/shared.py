@@ -1,6 +1,6 @@
 """Errors that the boxes of a body share. A side is a direction from which an object is seen. All boxes from one side err
-alike, because the outline is no ellipse and detectors err systematically. Averaging does not help, so they count as few
-(Kish 1965).
+alike, because the outline is no ellipse and detectors err systematically. Averaging does not help, so these boxes count as
+few (Kish 1965).
 """
 
 from __future__ import annotations
@@ -182,8 +182,8 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
 def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> Floats:
     """Return the covariances (N, 7, 7) of the parameters of bodies, with the errors that their boxes share.
 
-    An estimate that weighs residuals with W has the covariance A^-1 (J^T W V W J + P) A^-1, where V is the true covariance
-    of the residuals, P the information of the prior, and A = J^T W J + P.
+    An estimate that weighs residuals with W has the covariance A^-1 (J^T W V W J + P) A^-1, where A = J^T W J + P. V is the
+    true covariance of the residuals, and P is the information of the prior.
     """
     count = len(fit.values)
     pulled = on_shift_and_size(edges, fit.found.by * fit.weight[..., None])

@@ -34,8 +34,8 @@ _POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
 _ROUNDS = 2
 """How often the noise is estimated from the residuals of the last fit. More rounds are slower and change little."""
 _PER_SIDE = 3
-"""The number of boxes from each side by which shape and noise are found. Boxes from one side repeat one error, so more are
-slower and hardly help. The last fit uses all boxes."""
+"""Shape and noise are found from this number of boxes from each side. Boxes from one side repeat one error, so more boxes
+are slower and hardly help. The last fit uses all boxes."""
 _RARE = 20.0
 """The prior odds against a sphere, because few things are balls. With larger odds, fewer bodies are spheres."""
 _STEPS = 12
@@ -197,7 +197,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
 
 
 def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> Bodies:
-    """Return the bodies of `edges`. Fit those that also have edges in `others` once more, to all edges."""
+    """Return the bodies of `edges`. Bodies that also have edges in `others` are fitted once more, to all edges."""
     mine = np.unique(others.body)
     at = np.flatnonzero(np.isin(edges.body, mine))
     both = edges.take(at).joined(others)
@@ -248,7 +248,8 @@ def _weights(edges: BoxEdges, sides: Sides, now: _State) -> Weights:
 
 
 def _to_centre(edges: BoxEdges, centre: Floats, gap: Floats) -> Floats:
-    """Return unit directions (B, 3) to the centres (N, 3), m, of bodies, minus those to the centres of predicted boxes.
+    """Return unit directions (B, 3) to the centres (N, 3), m, of bodies, minus the unit directions to the centres of
+    predicted boxes.
 
     gap: (B, 2) px, by how much the predicted box lies to the right of the detected one, and below it.
     """
@@ -287,7 +288,7 @@ def _cuboid_starts(rounds: Floats) -> tuple[Floats, Floats]:
 
 
 def _best_cuboids(edges: BoxEdges, starts: tuple[Floats, ...], prior: Prior, weights: Weights) -> tuple[Fit, Prior]:
-    """Fit cuboids from each of the starts (N, 7). Return those with the most evidence, and their priors."""
+    """Fit cuboids from each of the starts (N, 7). Return the cuboids with the most evidence, and their priors."""
     best: tuple[Fit, Prior, Floats] | None = None
     for start in starts:
         own = cuboid_prior(prior, start)

@@ -1,4 +1,4 @@
-"""Find that the boxes of a log agree with its poses no better than they would with a wrong mount."""
+"""Detect boxes that agree with the poses only by chance, as they would with a wrong mount of the camera."""
 
 import numpy as np
 
@@ -12,10 +12,10 @@ _BAD_SCORE = 0.4
 """Boxes may disagree with the poses if their score is below this. Clean logs have at least 0.56, recorded or simulated. Logs
 with a camera that is turned in any way have at most 0.3. A larger score accuses more logs."""
 _TIMES = 2.0
-"""Boxes agree by chance if their score is below this multiple of that of chance (`trials.chance`). Clean logs have at least
-2.9 times as much, logs with turned cameras at most 1.9. A larger value accuses more logs."""
+"""Boxes agree only by chance if their score is below this multiple of the score by chance (`trials.chance`). Clean logs have
+at least 2.9 times the score by chance, logs with turned cameras at most 1.9 times. A larger value accuses more logs."""
 _DISTANT = 0.9
-"""If at least this share of the boxes fits a point or a direction, the boxes are not said to disagree. The share is at least
+"""If at least this share of the boxes fits a point or a direction, the boxes agree with the poses. The share is at least
 0.94 in logs without parallax, and at most 0.8 with turned cameras. A larger share accuses more logs."""
 _CONE = np.radians(4.0)
 """The angle (rad) within which rays have one direction. Rays that differ by less give no point. A larger angle accuses fewer
@@ -29,8 +29,9 @@ _TRIED = 64  # The most directions that are tried for a distant thing. A larger 
 def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | None:
     """Return a finding if the boxes agree with the poses only by chance, although they would show parallax.
 
-    found: after the usual errors of the cameras are corrected, as far as the boxes show them. Turned mounts show what chance
-    does in this log. Things that are too far for parallax give no point, but each has one direction.
+    found: the agreement after a correction of the usual errors of the cameras, from `without_usual_errors`. trials: those
+    with turned mounts show the score by chance in this log. Things that are too far for parallax give no point, but each has
+    one direction.
     """
     by_chance = chance(trials)
     if by_chance is None or found.score >= min(_BAD_SCORE, _TIMES * by_chance):

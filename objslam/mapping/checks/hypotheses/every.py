@@ -14,13 +14,15 @@ from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_camera
 from objslam.mapping.checks.hypotheses.mounts import mounts, w_last
 
 _SIZES = (0.25, 1 / 3, 0.5, 2 / 3, 1.5, 2.0, 3.0, 4.0)
-"""The tried sizes of the images in which the boxes were found, as multiples of the image size in the calibration."""
+"""The tried sizes of the images in which the boxes were found, as multiples of the image size in the calibration. More sizes
+take longer."""
 _SQUARES = (320, 416, 512, 640)
-"""The sides (px) of square images that detectors often use."""
+"""The sides (px) of square images that detectors often use. More sides take longer."""
 _CLIPPED, _AT_EDGE = 0.05, 1.0
-"""Boxes are px of the calibration's images if at least this share of them ends within this distance (px) of the right or
-the lower edge, and hardly any beyond. A detector clips boxes there. In another unit, boxes end there by chance only. With a
-larger share, more wrong sizes are tried. With a larger distance, fewer are tried."""
+"""A detector clips boxes at the right and the lower edge of the image. So boxes are in px of the calibration's images if at
+least the share `_CLIPPED` of them ends within `_AT_EDGE` (px) of an edge, and hardly any box ends beyond it. In another
+unit, boxes end there by chance only. With a larger share, more wrong sizes are tried. With a larger distance, fewer are
+tried."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 """The tried clock offsets (s). `small_errors` finds smaller offsets."""
 
@@ -62,7 +64,7 @@ def _paths(log: Log) -> Iterator[Hypothesis]:
 def _clipped_edges(log: Log) -> set[int]:
     """Return the widths and heights (px) of the cameras' images at whose right or lower edges boxes end.
 
-    Only boxes in px of these images end there, or of others that are as wide or as high.
+    Boxes end there only if they are in px of these images, or of images with the same width or height.
     """
     found: set[int] = set()
     for one in log.cameras:

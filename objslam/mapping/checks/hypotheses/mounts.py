@@ -84,7 +84,7 @@ def _turns() -> Iterator[Hypothesis]:
 
 
 def _right_angles() -> Iterator[Floats]:
-    """Yield all rotations (3, 3) by right angles but the identity. Those about the vertical axis come first."""
+    """Yield all rotations (3, 3) by right angles except the identity. Rotations about the vertical axis come first."""
     found = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         matrix = np.eye(3)[list(order)] * np.array(signs)[:, None]
@@ -130,9 +130,9 @@ def _turned_in_base(pose: Floats, turn: Floats) -> Floats:
 
 
 def _mirrored(pose: Floats, axis: int) -> Floats:
-    """Return a mount that looks where its mirror image looks. axis: of base, across which it is mirrored, 1 for y, 2 for z.
+    """Return a mount that looks where its mirror image looks. axis: the axis of base that is reversed, 1 for y, 2 for z.
 
-    A mirrored frame is left-handed, so the camera's x axis (across y) or y axis (across z) keeps its sense.
+    A mirrored frame would be left-handed. So one axis of the camera is reversed too: x with y of base, y with z of base.
     """
     base, camera = np.eye(3), np.eye(3)
     base[axis, axis] = camera[axis - 1, axis - 1] = -1.0

@@ -17,37 +17,41 @@ from objslam.mapping.progress import Progress
 _TIMES, _MORE = 1.2, 0.06
 """A hypothesis must raise the score by this factor and by this difference. Larger values name fewer causes."""
 _CROWD = 1.4
-"""The crowd (`Part.crowd`) above which rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9."""
+"""In a larger crowd (`Part.crowd`) than this, rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9. With a
+larger value, fewer logs need the larger limits below."""
 _CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
-"""`_TIMES` and `_MORE` in a crowd."""
+"""`_TIMES` and `_MORE` in a crowd. Larger values name fewer causes."""
 _MORE_BOXES = 25
 """The least number of additional boxes that must fit. A larger number needs longer logs."""
 _CROOKED, _STRAIGHT = 0.62, 0.85
-"""Below the first straightness, the axes of a path may be wrong. Corrected axes must reach the second one. In real logs,
-hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59."""
+"""Below the first straightness, the axes of a path may be wrong. Corrected axes must reach the second straightness. In real
+logs, hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59. A larger first value suspects more
+paths. A larger second value accepts fewer corrections."""
 _NOT_WORSE = 0.8
-"""A hypothesis about the axes of a path must keep this share of the score. Boxes of sparse logs show little about axes."""
+"""A hypothesis about the axes of a path must keep this share of the score. Boxes of sparse logs show little about axes. A
+larger share accepts fewer corrections."""
 _EQUAL = 0.95
 """Another hypothesis is as good as the best if it has this share of the best score. A larger share names fewer
 alternatives."""
 _HALF = 0.5
-"""A hypothesis about a log with a localisation must let at least this share of the boxes fit. One that explains fewer fits
-by chance: a right one lets 0.9 of the boxes fit. A larger share names fewer causes."""
+"""A hypothesis about a log with a localisation must let at least this share of the boxes fit. A hypothesis that explains
+fewer boxes fits by chance: the right hypothesis lets 0.9 of the boxes fit. A larger share names fewer causes."""
 _RIVAL = 0.02
 """A mount explains the boxes as well as an unusual error if its score is at most this much smaller. Two fits of one log with
 different random pairs differ by as much. A larger value names more mounts."""
 
 _BOTH_WAYS = 0.8
-"""Two shifts of a clock contradict each other if one is earlier, one is later, and the worse has at least this share of the
-score of the better. A clock has one error. In simulated logs with a wrong clock, no shift the other way has more than 0.61
-of the best score. A smaller share names fewer clocks."""
+"""An earlier and a later clock contradict each other if the worse of the two has at least this share of the score of the
+better. A clock has one error. In simulated logs with a wrong clock, no shift the other way has more than 0.61 of the best
+score. A smaller share names fewer clocks."""
 _CHANCE = 90.0
-"""The percentage of all turned mounts that have at most the score of chance. A larger percentage takes more for chance."""
+"""The percentage of all turned mounts that have at most the score of chance. With a larger percentage, more agreement counts
+as chance."""
 _BEYOND, _FAR_BETTER = 1.3, 1.5
-"""A mount is clear if its score is at least the first multiple of chance, and the second of the score of the log as it is.
-In logs of five kinds of simulated robots and three real ones, with odometry alone and a turned camera, the right turn has
-1.2 to 3.7 times the score of chance, mostly more than 1.4. No mount has more than 1.34 times the score of a clean log.
-Larger multiples keep fewer findings that no solve supports."""
+"""A mount is clear if its score is at least `_BEYOND` times the score by chance, and at least `_FAR_BETTER` times the score
+of the unchanged log. Logs of five kinds of simulated robots and of three real robots were tried, with odometry alone and a
+turned camera. The right turn has 1.2 to 3.7 times the score of chance, mostly more than 1.4. No mount has more than 1.34
+times the score of a clean log. Larger multiples keep fewer findings that no solve supports."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +87,8 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
 
 
 def _unchanged(before: Agreement | None, log: Log) -> Trial:
-    """Return the trial of the unchanged log. Boxes that are seen from one direction count as fitting: a hypothesis that
-    makes their rays cross explains no more of them."""
+    """Return the trial of the unchanged log. Boxes that are seen from one direction count as fitting. So a hypothesis that
+    makes their rays cross gains no boxes."""
     if before is None:
         return Trial(None, 0.0, 0.0, _straight(log))
     narrow = float(before.narrow.sum() / before.boxes)
@@ -95,9 +99,10 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log.
 
     corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
-    better than this: a mount with another order of its quaternion may look like one that is tilted a little. unusual: those
-    of the errors, in words, that are too large for a usual mount, "" if there are none. If there are such errors, a mount
-    that explains the boxes as well is the more probable cause. It is named, but the run corrects it.
+    better than this: a mount with another order of its quaternion may look like a mount that is tilted a little. unusual:
+    the errors, in words, that are too large for a usual mount, "" if there are none. If there are such errors, a wrong mount
+    that explains the boxes equally well is the more probable cause. The finding names this mount. It does not spoil the map,
+    because the run corrects the error.
     """
     first, rest = trials[0], trials[1:]
 
@@ -123,7 +128,7 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
         return None
     clocks = _both_ways(good)
     if clocks:
-        # What fits hardly better than two contradictory clocks fits by chance, as they do.
+        # A hypothesis that fits hardly better than two contradictory clocks fits by chance, like these clocks.
         good = [trial for trial in good if trial not in clocks and _EQUAL * trial.score > clocks[0].score]
     if not good:
         return _of_another_drive(first, clocks[0])
@@ -163,14 +168,15 @@ def _of_another_drive(first: Trial, best: Trial) -> Finding:
 
 
 def chance(trials: Sequence[Trial]) -> float | None:
-    """Return the score that boxes reach by chance in this log: that of the best tenth of all turned mounts, of which at most
-    one is right. None if no mounts were tried."""
+    """Return the score that boxes reach by chance in this log: the score of the best tenth of all turned mounts. At most one
+    of these mounts is right. None if no mounts were tried."""
     turned = [trial.score for trial in trials if trial.hypothesis is not None and trial.hypothesis.of_mount]
     return float(np.percentile(turned, _CHANCE)) if turned else None
 
 
 def clear(trials: Sequence[Trial], name: str) -> bool:
-    """Return whether a mount, by the name of its hypothesis, is far better than the log as it is, and than chance."""
+    """Return whether a mount, by the name of its hypothesis, is far better than the unchanged log, and far better than
+    chance."""
     by_chance = chance(trials)
     scores = [t.score for t in trials if t.hypothesis is not None and t.hypothesis.of_mount and t.hypothesis.name == name]
     return by_chance is not None and max(scores, default=0.0) >= max(_BEYOND * by_chance, _FAR_BETTER * trials[0].score)

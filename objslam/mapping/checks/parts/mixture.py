@@ -15,7 +15,8 @@ _LEAST = 0.2
 """The least share of bad and of good frames. A larger value needs more frames of the other recording."""
 _DISPERSION = 1.6
 """The least variance of the frames' shares of fitting rays, as a multiple of the variance by random false boxes. Clean logs
-have 0.8 to 1.0. Logs with half of the boxes from another recording have 2.1 to 2.6."""
+have 0.8 to 1.0. Logs with half of the boxes from another recording have 2.1 to 2.6. A larger value finds fewer mixed
+logs."""
 
 
 def check_mixture(found: Agreement, part: Part) -> Finding | None:

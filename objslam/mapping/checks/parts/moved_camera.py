@@ -1,8 +1,8 @@
 """Detect that somebody turned a camera on the robot in the middle of a log.
 
 All other errors of a camera are the same in both halves: its clock, its place, its lens, and the rotation that it had at
-first. They are estimated together with the turn. Otherwise they look like one: a late clock moves all rays to one side while
-the robot turns left, and to the other side while it turns right.
+first. They are estimated together with the turn. Otherwise they look like a turn: a late clock moves all rays to one side
+while the robot turns left, and to the other side while it turns right.
 """
 
 from dataclasses import replace
@@ -24,8 +24,8 @@ _LATER = ", second half"  # What the name of a camera of the second half ends wi
 _TURN = 0.2
 """The prior standard deviation (rad) of a turn. With a larger value, larger turns are found."""
 _SAME = 1e-3
-"""The prior standard deviation of the change of all other errors, as a share of their own. The graph divides by
-it, so it is not 0. A larger value lets the other errors change too."""
+"""The prior standard deviation of the change of all other errors, as a share of the prior standard deviation of the errors.
+The graph divides by it, so it is not 0. A larger value lets the other errors change too."""
 _MOVED = 0.05
 """If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
 less often."""
@@ -33,8 +33,9 @@ _SIGMAS = 5.0
 """The least difference of a camera's rotation between the halves, in standard deviations. A larger number warns less
 often."""
 _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
-"""The least difference, as a multiple of `_MOVED` and in standard deviations, for another round. At first, only the
-rays fit that show a small difference. Larger values take less time, and find fewer turns."""
+"""The least difference for which another round of the estimation follows: as a multiple of `_MOVED`, and in standard
+deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer
+turns."""
 _MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
 """`_MOVED` for poses by odometry, and the least growth of the score (`Agreement.score`) by a turn. Drift looks like a
 rotation, and is not in the standard deviations. Larger values warn less often."""
@@ -111,7 +112,8 @@ def _pairs(names: tuple[str, ...]) -> list[tuple[int, int]]:
 
 
 def _turns(found: Calibration, least: float, sigmas: float) -> dict[str, float]:
-    """Return the turns (rad) between the halves that are larger than `least` and than a number of standard deviations."""
+    """Return the turns (rad) between the halves that are larger than `least`, and larger than a number of standard
+    deviations."""
     turns = {}
     for i, j in _pairs(found.names):
         change, of = float(found.values[j] - found.values[i]), found.covariance
