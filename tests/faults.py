@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from waiting import LIMIT
+
 from objslam.errors import ObjslamError
 
 SPACE = frozenset({"write", "open", "mkdir", "link"})
@@ -126,6 +128,7 @@ def _run_command(words: Sequence[str], fault: Fault | None, counter: mmap.mmap, 
 
         console_of.cache_clear()
         sys.argv = ["objslam", *words]
+        signal.alarm(round(LIMIT))  # A command that never ends is killed.
         before()
         _count_accepted(counter)
         arm(fault, counter)

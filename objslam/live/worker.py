@@ -12,6 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Generic, Protocol, TypeVar
 
+from objslam.io.threads import start_thread
+
 Answer_co = TypeVar("Answer_co", covariant=True)
 Answer = TypeVar("Answer")
 
@@ -46,8 +48,9 @@ class Worker(Generic[Answer]):
         if self._process is None or self._process.poll() is not None:
             self._process = _start()
         self._waiting = [pickle.dumps(request)]
-        self._thread = threading.Thread(target=self._run, name="objslam worker", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._run, name="objslam worker", daemon=True)
+        start_thread(thread)
+        self._thread = thread
 
     @property
     def busy(self) -> bool:
@@ -82,7 +85,7 @@ class Worker(Generic[Answer]):
             return
         limit = threading.Timer(_PATIENT, process.kill)
         limit.daemon = True
-        limit.start()
+        start_thread(limit)
         with suppress(OSError):  # The process has ended.
             _write(process.stdin, self._waiting.pop())
             answer = _read(process.stdout)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from objslam.cli.console import report, say
 from objslam.cli.live_command.status import status_line, times
 from objslam.errors import ObjslamError, OutputError, one_line
+from objslam.io.threads import start_thread
 
 if TYPE_CHECKING:
     from objslam.core.result import RunResult
@@ -81,7 +82,7 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float, 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
     ledgers, shown = (feed.adapter.ledger, session.counters.ledger), [0, 0]
     with _ends_by_signal(stop), status_line(quiet) as show:
-        bringing.start()
+        start_thread(bringing)
         due = time.monotonic() + interval
         try:
             while bringing.is_alive() and not stop.is_set() and session.failure is None:
