@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from objslam.cli.console import report, say
 from objslam.cli.live_command.status import status_line, times
-from objslam.errors import ObjslamError, OutputError, one_line
+from objslam.errors import ObjslamError, OutputError, is_out_of_memory, one_line
 from objslam.io.threads import start_thread
 
 if TYPE_CHECKING:
@@ -164,8 +164,9 @@ def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
     from objslam.sources.journal.segments import NAME
 
     internal = "" if isinstance(failure, ObjslamError) else f"internal error, {type(failure).__name__}: "
+    cause = "out of memory" if is_out_of_memory(failure) else f"{internal}{one_line(failure)}"
     more = f"; `objslam run {out}` maps all received messages" if (out / NAME).is_file() else ""
-    return ObjslamError(f"the session ended early: {internal}{one_line(failure)}", hint=map_ + more)
+    return ObjslamError(f"the session ended early: {cause}", hint=map_ + more)
 
 
 @contextmanager
