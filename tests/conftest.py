@@ -19,8 +19,10 @@ settings.register_profile(
 )
 settings.load_profile("objslam")
 
-# The plugin that runs tests in several processes sets a width of 80 columns, which commands obey even in a pipe.
+# The plugin that runs tests in several processes sets a width of 80 columns, which commands obey even in a pipe. So does
+# readline, which pytest imports: Python does not see that, but the processes that it starts do.
 os.environ.pop("COLUMNS", None)
+os.unsetenv("COLUMNS")
 
 # A suite in the background of a shell has SIGINT ignored. Commands that its tests start and interrupt would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -24,6 +24,7 @@ from objslam.core.types import Log
 from objslam.output.export.formats import FORMATS
 from objslam.results.files import SUMMARY
 from objslam.sources.journal.reader import messages
+from objslam.sources.journal.records import encode
 from objslam.sources.journal.segments import NAME, is_journal
 from objslam.sources.log_folder import write_log_folder
 
@@ -108,7 +109,7 @@ class Case:
     def judge_next(self, folder: Path, *, resume: bool = False) -> None:
         """The next start on what a fault left works, and nothing of the fault is left after it. resume: as live does."""
         whole = self.judge(folder) == "new"
-        resume &= self.live and any(messages_in(folder / "out" / NAME))
+        resume &= self.live and bool(journaled(folder / "out" / NAME))
         done = command([*self.words_for(folder), *["--resume"] * resume], stdin=self.stdin)
         refused = whole and done.code == 1 and "there is a log already" in done.err
         assert done.code == 0 or refused, f"the next start: {done.code} {done.err}"
@@ -126,9 +127,9 @@ class Case:
                 list(messages(folder / name, Ledger()))
 
 
-def messages_in(file: Path) -> list[object]:
-    """The messages of a journal; none where there is no journal."""
-    return list(messages(file, Ledger())) if is_journal(file) else []
+def journaled(file: Path) -> list[bytes]:
+    """The messages of a journal, as they were written; none where there is no journal."""
+    return [encode(message) for message in messages(file, Ledger())] if is_journal(file) else []
 
 
 def _is_journal(name: str) -> bool:
@@ -175,11 +176,16 @@ def check(case: Case, folder: Path, fault: Fault, number: int) -> str:
     state = case.judge(folder)
     if done.code == 0:
         assert state == "new", f"exit code 0, but the result is {state}"
+    kept = journaled(folder / "out" / NAME)
+    if case.live and not fault.error:  # After an error, the session goes on without the journal.
+        assert len(kept) >= done.accepted, f"{done.accepted} messages were accepted, the journal has {len(kept)}"
     if fault.error == errno.ENOSPC and fault.lasting:  # After other errors, the disk may also have refused to delete.
         left = [p.name for p in folder.rglob(".*")]
         assert not left or state == "none", f"left by an error: {left}"
     if number % _NEXT_EVERY == 0:
         case.judge_next(folder, resume=number % (2 * _NEXT_EVERY) == 0)
+        journals = [file for file in (folder / "out").glob("journal*") if is_journal(file)]
+        assert not kept or kept in [journaled(file)[: len(kept)] for file in journals], "the next start lost messages"
     return state
 
 

@@ -20,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from waiting import LIMIT
+
 from objslam.errors import ObjslamError
 
 SPACE = frozenset({"write", "open", "mkdir", "link"})
@@ -54,10 +56,14 @@ class Fault:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a child ended. code: the exit code, negative for a signal. steps: how many of its calls changed the disk."""
+    """How a child ended. code: the exit code, negative for a signal. steps: how many of its calls changed the disk.
+
+    accepted: how many messages the sessions of the child said to have accepted, notes too.
+    """
 
     code: int
     steps: int
+    accepted: int = 0
     out: str = ""
     err: str = ""
 
@@ -94,7 +100,7 @@ def command(
     words: Sequence[str], fault: Fault | None = None, stdin: bytes = b"", before: Callable[[], Any] = int
 ) -> Outcome:
     """Run an objslam command in a forked process of its own group, with a fault or without. before: called in it first."""
-    counter = mmap.mmap(-1, 8)
+    counter = mmap.mmap(-1, 16)
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err, tempfile.TemporaryFile() as given:
         given.write(stdin)
         given.seek(0)
@@ -108,7 +114,8 @@ def command(
             _run_command(words, fault, counter, before)
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         texts = [os.pread(stream.fileno(), 1 << 20, 0).decode(errors="replace") for stream in (out, err)]
-    return Outcome(code, int.from_bytes(counter[:8], "little"), *texts)
+    steps, accepted = (int.from_bytes(counter[at : at + 8], "little") for at in (0, 8))
+    return Outcome(code, steps, accepted, *texts)
 
 
 def _run_command(words: Sequence[str], fault: Fault | None, counter: mmap.mmap, before: Callable[[], Any]) -> None:
@@ -121,7 +128,9 @@ def _run_command(words: Sequence[str], fault: Fault | None, counter: mmap.mmap, 
 
         console_of.cache_clear()
         sys.argv = ["objslam", *words]
+        signal.alarm(round(LIMIT))  # A command that never ends is killed.
         before()
+        _count_accepted(counter)
         arm(fault, counter)
         main()
     except SystemExit as exit_:
@@ -132,10 +141,24 @@ def _run_command(words: Sequence[str], fault: Fault | None, counter: mmap.mmap, 
         os._exit(code if isinstance(code, int) else 71)
 
 
+def _count_accepted(counter: mmap.mmap) -> None:
+    """From now on, count the messages that sessions of this process accept, in bytes 8 to 16."""
+    from objslam.live.session.session import Session
+
+    enqueue = Session._enqueue
+
+    def counted(self: Session, *message: Any) -> bool:
+        accepted = enqueue(self, *message)
+        counter[8:] = (int.from_bytes(counter[8:], "little") + accepted).to_bytes(8, "little")
+        return accepted
+
+    Session._enqueue = counted  # type: ignore[method-assign]
+
+
 def arm(fault: Fault | None, counter: mmap.mmap | None = None) -> None:
     """From now on, count the calls of this process that change the disk, and let the fault strike. There is no way back.
 
-    counter: 8 bytes that hold the count, for the parent process.
+    counter: its first 8 bytes hold the count, for the parent process.
     """
     steps = 0
 

@@ -20,8 +20,8 @@ from objslam.detection.detector import Boxes, Detector
 from objslam.errors import LogError
 from objslam.frontend.box_depths import depths_at_boxes
 from objslam.io.images import decode_colour
-from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
+from objslam.io.threads import ahead
 
 _AHEAD = 8
 """The number of images, in addition to a batch, that are decoded before the network needs them. A larger number needs more

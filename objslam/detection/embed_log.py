@@ -15,7 +15,7 @@ from objslam.detection.detect_log import Progress, load_frame
 from objslam.detection.encoder import Encoder
 from objslam.errors import LogError
 from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps
-from objslam.io.prefetch import ahead
+from objslam.io.threads import ahead
 
 _AHEAD = 8  # The number of images that are decoded before the network needs them. A larger number needs more memory.
 

@@ -19,7 +19,7 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
         if data.startswith(magic):
             try:
                 return read(data)
-            except (struct.error, IndexError, ValueError) as error:
+            except (struct.error, IndexError, ValueError, OverflowError) as error:  # BigTIFF offsets have 64 bits.
                 raise ValueError("the header of an image is damaged or cut off") from error
     return None
 

@@ -12,6 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Generic, Protocol, TypeVar
 
+from objslam.io.threads import start_thread
+
 Answer_co = TypeVar("Answer_co", covariant=True)
 Answer = TypeVar("Answer")
 
@@ -38,33 +40,36 @@ class Worker(Generic[Answer]):
     def __init__(self) -> None:
         self._answer: Answer | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._thread: threading.Thread | None = None
+        self._asked = False
+        self._thread: threading.Thread | None = None  # Waits for the answer. None if it could not start.
         self._waiting: list[bytes] = []  # The request until it is sent, because it may be large.
 
     def ask(self, request: Request[Answer]) -> None:
         """Send a request. The process must not have an earlier request whose `result` was not taken."""
-        self._answer = None
+        self._answer, self._asked = None, True
         if self._process is None or self._process.poll() is not None:
             self._process = _start()
         self._waiting = [pickle.dumps(request)]
-        self._thread = threading.Thread(target=self._run, name="objslam worker", daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._run, name="objslam worker", daemon=True)
+        with suppress(OSError, RuntimeError):  # There is no memory for a thread. Then `result` returns None.
+            start_thread(thread)
+            self._thread = thread
 
     @property
     def busy(self) -> bool:
         """Whether there is a request whose `result` was not taken."""
-        return self._thread is not None
+        return self._asked
 
     @property
     def done(self) -> bool:
-        """Whether a request has ended, so that `result` returns at once."""
-        return self._thread is not None and not self._thread.is_alive()
+        """Whether there is a request, and `result` returns at once."""
+        return self._asked and (self._thread is None or not self._thread.is_alive())
 
     def result(self) -> Answer | None:
         """Wait for the answer to the request, and return it. None if the process failed."""
         if self._thread is not None:
             self._thread.join()
-        self._thread = None
+        self._thread, self._asked = None, False
         return self._answer
 
     def close(self) -> None:
@@ -76,6 +81,7 @@ class Worker(Generic[Answer]):
         if self._process is not None:
             _reap(self._process)
         self._thread = self._process = None
+        self._asked = False
 
     def _run(self) -> None:
         process = self._process
@@ -83,8 +89,8 @@ class Worker(Generic[Answer]):
             return
         limit = threading.Timer(_PATIENT, process.kill)
         limit.daemon = True
-        limit.start()
-        with suppress(OSError):  # The process has ended.
+        with suppress(OSError, RuntimeError):  # The process has ended, or there is no memory for a thread.
+            start_thread(limit)
             _write(process.stdin, self._waiting.pop())
             answer = _read(process.stdout)
             if answer is not None:

@@ -24,8 +24,8 @@ from objslam.core.types import Log, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.box_depths import MAX_IMAGE_LAG, nearest_stamps, read_depth
 from objslam.io.images import decode_colour
-from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
+from objslam.io.threads import ahead
 from objslam.mapping.progress import Progress
 
 _BLOCK = 6

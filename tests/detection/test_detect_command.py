@@ -62,9 +62,15 @@ def test_json_has_every_box(files: tuple[Path, Path]) -> None:
         np.testing.assert_allclose(found[label], box, atol=2)
 
 
-@pytest.mark.parametrize(("model", "photo", "word"), [("none.onnx", "photo.png", "none.onnx"), ("m", "no.txt", "no image")])
+@pytest.mark.parametrize(
+    ("model", "photo", "word"),
+    [("none.onnx", "photo.png", "none.onnx"), ("m", "no.txt", "no image"), ("m", "cut.bmp", "no image")],
+)
 def test_what_is_wrong_is_one_line(files: tuple[Path, Path], tmp_path: Path, model: str, photo: str, word: str) -> None:
+    """Also where OpenCV would print lines of its own."""
     (tmp_path / "no.txt").write_text("text")
+    whole = cv2.imencode(".bmp", np.zeros((24, 32, 3), dtype=np.uint8))[1].tobytes()
+    (tmp_path / "cut.bmp").write_bytes(whole[:200])
     place = files[1].parent if photo == "photo.png" else tmp_path
     done = detect(tmp_path / model, place / photo)
     assert done.returncode == 1

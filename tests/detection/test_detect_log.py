@@ -24,7 +24,7 @@ from objslam.detection import default_cache, detect_log, load_detector
 from objslam.detection.detector import Detector
 from objslam.errors import DetectorError, LogError
 from objslam.io.detections_jsonl import read_detections, write_detections
-from objslam.io.prefetch import ahead
+from objslam.io.threads import ahead
 
 WIDTH, HEIGHT, FRAMES = 320, 240, 7
 

@@ -30,8 +30,10 @@ CORPUS = Path(__file__).parent / "corpus"
 """The inputs that once broke a target, in a folder for each. Every run gives them to the target again."""
 MEMORY = 2 << 30
 """How much one input may raise the most memory of the process, bytes. More means that a parser trusts a size in it."""
-COUNTED = {"inputs": 0}
-"""How many inputs the targets got so far."""
+SECONDS = float(os.environ.get("OBJSLAM_FUZZ_SECONDS", "inf"))
+"""How long one input may take, CPU seconds. tools/fuzz.sh sets it. The suite has no such limit: no test depends on time."""
+COUNTED = {"inputs": 0, "slowest": 0.0}
+"""How many inputs the targets got so far, and the CPU seconds of the slowest one since this was last set to 0."""
 NUMBERS = [b"nan", b"inf", b"-1", b"1e300", b"1e400", b"99999999999999999999", b"0", b"null", b"true", b"[]", b"{}", b'""']
 ODD = [
     None,
@@ -129,10 +131,13 @@ def survives(parse: Callable[[], Any], target: str = "", data: bytes = b"") -> b
     target, data: an input that breaks the parser is written into the folder `corpus` under the name of the target.
     """
     COUNTED["inputs"] += 1
-    before = taken()
+    before, begin = taken(), spent()
     try:
         valid = _ends_well(parse)
+        seconds = spent() - begin
+        COUNTED["slowest"] = max(COUNTED["slowest"], seconds)
         assert taken() - before < MEMORY, f"{(taken() - before) >> 20} MiB for one input"
+        assert seconds < SECONDS, f"{seconds:.1f} CPU seconds for one input"
     except BaseException:
         if target:
             file = CORPUS / target / hashlib.sha256(data).hexdigest()[:16]
@@ -145,6 +150,12 @@ def survives(parse: Callable[[], Any], target: str = "", data: bytes = b"") -> b
 def taken() -> int:
     """The most memory that this process has taken so far, bytes."""
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def spent() -> float:
+    """The CPU seconds that this process has used so far."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
 
 
 def _ends_well(parse: Callable[[], Any]) -> bool:

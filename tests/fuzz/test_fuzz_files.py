@@ -11,7 +11,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mutations import altered, as_json, examples, mutated, survives
+from mutations import altered, as_json, examples, known, mutated, survives
 
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.calibration import Calibration
@@ -154,9 +154,9 @@ def test_mutated_journals(tmp_path):
 def test_mutated_images(ending):
     picture = np.random.default_rng(0).integers(0, 255, (24, 32, 3), dtype=np.uint8)
     good = cv2.imencode(ending, picture)[1].tobytes()
-    for data in chain([good], mutated(good, 60, inputs=2)):
+    for data in chain([good], known("image"), mutated(good, 60, inputs=2)):
         for decode_image in (decode_colour, decode_depth):
-            assert survives(partial(read_image, decode_image, data))
+            assert survives(partial(read_image, decode_image, data), "image", data)
 
 
 def read_image(decode_image, data):

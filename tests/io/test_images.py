@@ -64,7 +64,9 @@ def test_depth_keeps_its_bits(ending):
 
 
 @pytest.mark.parametrize(
-    "data", [b"", b"x", b"\x89PNG\r\n\x1a\n", image_bombs.png(5, 5)[:30], b"\xff\xd8\xff", b"BM", b"RIFF"]
+    "data",
+    [b"", b"x", b"\x89PNG\r\n\x1a\n", image_bombs.png(5, 5)[:30], b"\xff\xd8\xff", b"BM", b"RIFF"]
+    + [struct.pack("<4sHHQ", b"II+\0", 8, 0, offset) for offset in (2**63 - 9, 2**63, 2**64 - 1)],
 )
 def test_what_is_no_image(data):
     assert decode_colour(data) is None

@@ -1,5 +1,6 @@
 """What a session does when something in it breaks: nobody waits for ever, and the map so far is not lost."""
 
+import errno
 import importlib
 import json
 import sys
@@ -17,6 +18,7 @@ from objslam.live.mapper.mapper import Mapper
 from objslam.live.session import session as sessions
 from objslam.live.session.session import Session
 from objslam.live.session.snapshots import Describer
+from objslam.live.worker import Worker
 from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
 from objslam.sources.journal import journal as journals
@@ -194,11 +196,38 @@ def test_the_command_writes_what_was_mapped_and_ends_with_one_line(folder, break
     assert "ended early" in json.loads((out / "summary.json").read_text())["warnings"][-1]
 
 
-def test_the_command_tells_an_error_of_ours_as_it_is(folder, breaks, command, tmp_path):
-    breaks(Mapper, "take", 120, SolveError("no\nway", hint="go\nround"))
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (SolveError("no\nway", hint="go\nround"), "no way (go round)"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), "out of memory"),
+        (MemoryError(), "out of memory"),
+    ],
+)
+def test_the_command_tells_a_cause_that_a_user_can_mend(folder, breaks, command, tmp_path, error, cause):
+    breaks(Mapper, "take", 120, error)
     code, lines = command(folder, tmp_path / "out", "--speed", "0", "--no-journal")
     assert code == 1
-    assert lines[-1] == "objslam: the session ended early: no way (go round) (the map covers the messages until then)"
+    assert lines[-1] == f"objslam: the session ended early: {cause} (the map covers the messages until then)"
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOMEM, "Cannot allocate memory"), RuntimeError("can't start new thread")])
+def test_work_beside_a_session_fails_alone_where_no_thread_starts(monkeypatch, error):
+    def no_thread(thread):
+        raise error
+
+    monkeypatch.setattr("objslam.live.worker.start_thread", no_thread)
+    worker = Worker()
+    for _ in range(2):
+        worker.ask(None)
+        assert worker.busy
+        assert worker.done
+        assert worker.result() is None
+        assert not worker.busy
+        assert not worker.done
+    worker.ask(None)
+    worker.close()
+    assert not worker.busy
 
 
 def test_the_command_leaves_the_last_snapshot_where_no_result_can_be_made(folder, breaks, command, tmp_path, monkeypatch):

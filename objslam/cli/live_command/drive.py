@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 from objslam.cli.console import report, say
 from objslam.cli.live_command.status import status_line, times
-from objslam.errors import ObjslamError, OutputError, one_line
+from objslam.errors import ObjslamError, OutputError, is_out_of_memory, one_line
+from objslam.io.threads import start_thread
 
 if TYPE_CHECKING:
     from objslam.core.result import RunResult
@@ -83,7 +84,7 @@ def drive(session: Session, feed: Feed, latest: LatestObjects, interval: float, 
     bringing = threading.Thread(target=bring, name="objslam adapter", daemon=True)
     ledgers, shown = (feed.adapter.ledger, session.counters.ledger), [0, 0]
     with _ends_by_signal(stop), status_line(quiet) as show:
-        bringing.start()
+        start_thread(bringing)
         due = time.monotonic() + interval
         try:
             while bringing.is_alive() and not stop.is_set() and session.failure is None:
@@ -165,8 +166,9 @@ def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
     from objslam.sources.journal.segments import NAME
 
     internal = "" if isinstance(failure, ObjslamError) else f"internal error, {type(failure).__name__}: "
+    cause = "out of memory" if is_out_of_memory(failure) else f"{internal}{one_line(failure)}"
     more = f"; `objslam run {out}` maps all received messages" if (out / NAME).is_file() else ""
-    return ObjslamError(f"the session ended early: {internal}{one_line(failure)}", hint=map_ + more)
+    return ObjslamError(f"the session ended early: {cause}", hint=map_ + more)
 
 
 @contextmanager

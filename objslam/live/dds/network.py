@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from objslam.errors import ConfigError, ObjslamError
+from objslam.io.threads import start_thread
 
 LOOPBACK, AUTO = "loopback", "auto"
 _URI, _DOMAIN_ID = "CYCLONEDDS_URI", "ROS_DOMAIN_ID"
@@ -97,7 +98,7 @@ def _join(domain: int, interface: str | None) -> Network:
         os.close(writing)
     network = Network(domain, where, participant, (entity,))
     atexit.register(_leave, entity)
-    threading.Thread(target=_listen, args=(reading, network.unread), name="dds-log", daemon=True).start()
+    start_thread(threading.Thread(target=_listen, args=(reading, network.unread), name="dds-log", daemon=True))
     return network
 
 

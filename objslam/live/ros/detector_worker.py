@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from objslam.errors import ObjslamError, first_line
+from objslam.io.threads import start_thread
 from objslam.live.ros.boxes import Boxes, Drop
 from objslam.ros.bag.records import frame_name
 from objslam.ros.messages.decode import DecodeError
@@ -41,7 +42,7 @@ class DetectorWorker:
         """Start the detector's thread. It calls deliver(boxes), warn(message) and drop(reason, place)."""
         self._deliver, self._drop, self._warn = deliver, drop, warn
         self._thread = threading.Thread(target=self._work, name="detector", daemon=True)
-        self._thread.start()
+        start_thread(self._thread)
 
     def offer(self, topic: str, message: Any, stamp: float) -> None:
         """Take an image message without blocking. stamp: s."""

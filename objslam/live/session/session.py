@@ -15,6 +15,7 @@ from objslam.core.result import RunResult
 from objslam.core.snapshot import TOO_SLOW, Snapshot
 from objslam.core.types import Trajectory
 from objslam.errors import OutputError, one_line
+from objslam.io.threads import start_thread
 from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
@@ -93,7 +94,7 @@ class Session(Intake):
         self._guard(self._replay_journal)
         if self.failure is None:
             self._running = True
-            self._thread.start()
+            start_thread(self._thread)
         else:
             self._end()
         return self

@@ -18,6 +18,7 @@ import numpy as np
 from objslam.errors import ConfigError, OutputError
 from objslam.io.atomic_files import disk_errors
 from objslam.io.folders import remove_leftovers, temporary_name
+from objslam.io.threads import start_thread
 from objslam.output.viewer.times import STAMP
 from objslam.results.files import OBJECTS, RECORDING, hint_below
 from objslam.results.read import refuse_site
@@ -244,7 +245,7 @@ def start_listening(port: int, *arguments: str) -> Viewer:
     _wait_for(viewer, port)
     assert viewer.stderr is not None
     # A thread reads the viewer's stderr and ignores it, because the viewer would block at a full pipe.
-    threading.Thread(target=viewer.stderr.read, name="objslam viewer", daemon=True).start()
+    start_thread(threading.Thread(target=viewer.stderr.read, name="objslam viewer", daemon=True))
     return viewer
 
 

@@ -11,8 +11,8 @@ from objslam.core.types import Images, Log
 from objslam.errors import LogError
 from objslam.frontend.box_depths import nearest_stamps
 from objslam.io.images import decode_colour
-from objslam.io.prefetch import ahead
 from objslam.io.text import read_bytes
+from objslam.io.threads import ahead
 from objslam.output.plot.style import evenly
 
 _MAX_LAG = 0.05  # The longest time, s, between a keyframe and its image.

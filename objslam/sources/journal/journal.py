@@ -16,6 +16,7 @@ from pathlib import Path
 
 from objslam.errors import OutputError, one_line
 from objslam.io.folders import remove_leftovers
+from objslam.io.threads import start_thread
 from objslam.sources.journal.aside import refusals, set_aside
 from objslam.sources.journal.record_format import (
     LONGEST,
@@ -86,7 +87,7 @@ class Journal:
         self._header = header
         self._closed = threading.Event()
         self._syncing = threading.Thread(target=self._sync, name="objslam journal", daemon=True)
-        self._syncing.start()
+        start_thread(self._syncing)
 
     def write(self, message: Message) -> None:
         """Append one message, or do nothing if the journal has stopped. Raises OutputError if the message is too long."""

@@ -25,6 +25,7 @@ from objslam.core.geometry import quaternion
 from objslam.core.object_map import ObjectMap
 from objslam.core.snapshot import CameraFrame
 from objslam.core.validity import is_date
+from objslam.io.threads import start_thread
 from objslam.output.viewer.blueprint import blueprint
 from objslam.output.viewer.cameras import camera_path, light_colours, log_pinhole
 from objslam.output.viewer.event_log import map_changes, table
@@ -60,7 +61,7 @@ def main() -> None:
         sys.stdout.flush()
     timer = threading.Timer(_GRACE, lambda: os._exit(1))  # A hanging viewer would block `disconnect` for ever.
     timer.daemon = True
-    timer.start()
+    start_thread(timer)
     recording.disconnect()
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from objslam.errors import ConfigError, OutputError
+from objslam.io.threads import start_thread
 from objslam.output.viewer import application
 from objslam.output.viewer.application import Viewer
 from objslam.output.viewer.live.wire import encode_snapshot
@@ -102,7 +103,7 @@ class LiveView:
             start_new_session=True,  # Ctrl+C ends the session, and the session ends this process.
         )
         self._thread = threading.Thread(target=self._feed, name="objslam live view", daemon=True)
-        self._thread.start()
+        start_thread(self._thread)
 
     def show(self, snapshot: Snapshot) -> bool:
         """Queue a snapshot and return at once. Any thread may call this. Return False if an older snapshot was dropped."""
