@@ -36,6 +36,7 @@ _LIGHT = 0.45  # How much lighter than the outline of the body these outlines ar
 _TAG, _NORMAL = 4.0, 0.3  # The width, px, of the outline of a fiducial, and the length, m, of the line along its normal.
 _USED, _REJECTED = (0.561, 0.749, 0.933), (0.937, 0.561, 0.525)  # Used rays are light blue, and rejected rays are light red.
 _BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # The colours of the path before and after the estimation.
+_TRUE = (0.180, 0.545, 0.341)  # The colour of the true path, as in the viewer.
 _NEUTRAL = (0.333, 0.333, 0.333)  # The legend shows objects in this colour, because each label has its own colour.
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
@@ -58,7 +59,7 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     wider = np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
     low, high = low - wider, high + wider
     below, dots = _objects(result, plane, points)
-    shapes = [*_rays(result, plane), *_paths(result, plane), *below]
+    shapes = [*_rays(result, plane), *_paths(result, truth, plane), *below]
     if len(crosses):
         shapes.append(Marks(crosses, "cross", _BLACK, _BLACK, _CROSS, "ground truth"))
     ok = np.array([o.status == "ok" for o in result.map], dtype=bool)
@@ -120,11 +121,13 @@ def _rays(result: RunResult, plane: list[int]) -> list[Shape]:
     return shapes
 
 
-def _paths(result: RunResult, plane: list[int]) -> list[Shape]:
+def _paths(result: RunResult, truth: Truth | None, plane: list[int]) -> list[Shape]:
     before, after = result.path.poses[:, plane, 3], result.path_after.poses[:, plane, 3]
     moved = not np.array_equal(result.map_T_base, result.keyframes.map_T_base)
     shapes: list[Shape] = [Line(before, _BEFORE, _PATH, "path before", dashed=True)] if moved else []
     shapes.append(Line(after, _AFTER, _PATH, "path after" if moved else "path"))
+    if truth is not None and truth.trajectory is not None:  # Thin, and above, because both should coincide.
+        shapes.append(Line(truth.trajectory.poses[:, plane, 3], _TRUE, _BAND, "true path"))
     if len(after):
         shapes.append(Marks(after[:1], "dot", _WHITE, _AFTER, _START, "start"))
     return shapes

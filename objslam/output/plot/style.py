@@ -142,8 +142,8 @@ def has_corners(body: Body) -> bool:
     The heading is the direction of the length, so it is known only if the length is the longer side for sure.
     """
     length, width, _ = body.size
-    told_apart = bool(length - width > _LONGER * np.hypot(*body.size_sigma[:2]))
-    return body.shape == "cuboid" and body.yaw_sigma < _KNOWN_HEADING and told_apart
+    told_apart = length - width > _LONGER * np.hypot(*body.size_sigma[:2])
+    return bool(body.shape == "cuboid" and body.yaw_sigma < _KNOWN_HEADING and told_apart)
 
 
 def body_outline(o: MapObject, sigmas: float = 0.0) -> Floats | None:
