@@ -1,8 +1,14 @@
 """The list of pinned packages: tools/setup.sh installs what it names, and pip checks the hashes."""
 
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
+import zipfile
 from pathlib import Path
+
+from waiting import LIMIT
 
 ROOT = Path(__file__).parents[1]
 LIST = (ROOT / "tools" / "constraints.txt").read_text(encoding="utf-8")
@@ -62,3 +68,17 @@ def test_an_installed_package_has_every_file():
     files = {file for file in found if file.suffix not in (".py", ".pyc")}
     assert len(files) > 10
     assert files - named == set()
+
+
+def test_mypy_and_editors_see_an_editable_install(tmp_path):
+    """It is a path. An import hook, the default of setuptools for this layout, is seen by Python alone."""
+    for name in ("pyproject.toml", "README.md", "LICENSE", "objslam/__init__.py", "objslam/core/__init__.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    build = "from setuptools.build_meta import build_editable; print(build_editable('.'))"
+    done = subprocess.run(
+        [sys.executable, "-c", build], cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT, check=True
+    )
+    with zipfile.ZipFile(tmp_path / done.stdout.split()[-1]) as wheel:
+        (path,) = (name for name in wheel.namelist() if name.endswith(".pth"))
+        assert Path(wheel.read(path).decode().strip()).samefile(tmp_path)

@@ -136,8 +136,7 @@ install_all() {
     pinned run | install_pinned || return
     if needs_cuda; then pinned cuda | install_pinned || return; fi
     if [ "$want" = dev ]; then { pinned dev; pinned docs; } | install_pinned || return; fi
-    # compat: a path that mypy and editors follow too; the default is an import hook that only Python sees
-    pip_install --no-index --no-deps --no-build-isolation --config-settings editable_mode=compat --editable "$root" &&
+    pip_install --no-index --no-deps --no-build-isolation --editable "$root" &&
         "$venv/bin/python" -m pip check --disable-pip-version-check >&2
 }
 

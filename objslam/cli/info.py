@@ -43,7 +43,9 @@ def info(
     kind = choose(source, options.format)
     if kind.name == "ros":
         bag = describe(source, options)
-        put(dump_json(asdict(bag))) if json else _show_bag(bag)
+        whole = options.begin is None and options.end is None
+        part = None if whole else contents(read(source, Ledger(), options))
+        put(dump_json(asdict(bag) | ({} if part is None else {"part": asdict(part)}))) if json else _show_bag(bag, part)
         return
     ledger = Ledger()
     log = read(source, ledger, options)
@@ -69,7 +71,10 @@ def _show_log(found: Contents, kind: Source) -> None:
     _list("missing for a run", found.missing, "nothing is missing for a run")
 
 
-def _show_bag(bag: BagInfo) -> None:
+def _show_bag(bag: BagInfo, part: Contents | None) -> None:
+    """Show the whole bag, because a table of its topics is for their choice, and then the part that was asked for."""
+    from objslam.sources.summary import in_words
+
     files = f"{len(bag.files)} file{'s' if len(bag.files) > 1 else ''}"
     lost = f" ({bag.lost} lost)" if bag.lost else ""
     say(f"{bag.name}: {bag.format}, {files}, {bag.messages} messages{lost}; {_span(bag.start, bag.end)}")
@@ -88,6 +93,8 @@ def _show_bag(bag: BagInfo) -> None:
     refused = [f"{topic.name}: {reason}" for topic in bag.topics for reason in topic.refused]
     _list("messages that cannot be used", refused)
     _list("damage", bag.damage)
+    for line in in_words(part) if part else ():
+        say(line)
     _list("warnings", [line for line in bag.warnings if not line.startswith("dropped")])
     _list("missing for a run", bag.missing, "nothing is missing for a run")
 

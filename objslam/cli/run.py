@@ -207,13 +207,16 @@ def advice_on_tags(objects: Sequence[MapObject], given: Tags) -> str:
 
 
 def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
-    """Return a table of objects. The `_SPARE` columns that the screen has no room for are left out, so no number is cut."""
+    """Return a table of objects, without empty columns.
+
+    The `_SPARE` columns that the screen has no room for are left out, so that no number is cut.
+    """
     from rich.measure import Measurement
     from rich.table import Table
 
-    names = list(_COLUMNS)
+    names = [name for name, text in _COLUMNS.items() if not objects or any(map(text, objects))]
     for spare in (None, *_SPARE):
-        if spare is not None:
+        if spare in names:
             names.remove(spare)
         table = Table(title="objects")
         for name in names:

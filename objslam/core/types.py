@@ -171,7 +171,8 @@ class Log:
     """The log of a robot, with odometry, localisation or both.
 
     odometry: odom_T_base. localization: map_T_base. path: the file or folder that was read, absolute, None for a log from
-    memory. reading: the data dropped while the log was read, None if they were not counted.
+    memory. reading: the data dropped while the log was read, None if they were not counted. part: the limits of a log that
+    is a part of a longer one: its stamps are from the first to before the second, s. None is no limit.
     """
 
     name: str
@@ -181,6 +182,7 @@ class Log:
     truth: Truth | None = None
     path: Path | None = None
     reading: Ledger | None = None
+    part: tuple[float | None, float | None] = (None, None)
 
     @property
     def robot_path(self) -> Trajectory | None:

@@ -60,6 +60,7 @@ def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
         localization=path(log.localization),
         cameras=tuple(camera(one) for one in log.cameras),
         truth=truth,
+        part=(begin, end),
     )
     if found.robot_path is None and log.robot_path is not None:
         raise _outside("pose", log, log.robot_path.stamps)
@@ -71,6 +72,13 @@ def part_of_log(log: Log, begin: float | None, end: float | None) -> Log:
     if any(len(some) for some in stamps) and not any(len(some) for some in left):
         raise _outside("detection frame", log, np.sort(np.concatenate(stamps)))
     return found
+
+
+def part_in_words(part: tuple[float | None, float | None]) -> str:
+    """Return the limits of a part of a log in words: "from stamp 10.000 to 20.000 s". "" for a whole log."""
+    begin, end = part
+    limits = ([] if begin is None else [f"from stamp {begin:.3f}"]) + ([] if end is None else [f"to stamp {end:.3f}"])
+    return " ".join(limits).replace(" to stamp", " to") + " s" if limits else ""
 
 
 def _outside(what: str, log: Log, stamps: Floats) -> LogError:

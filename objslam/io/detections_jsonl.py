@@ -30,6 +30,9 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
     """
     collector = BoxCollector()
     lines = read_lines(path, ledger)
+    if lines and lines[0][1].strip() == "[":  # Else its last frame, which no comma follows, would be the whole log.
+        hint = "write one frame a line, without brackets around them and commas between them"
+        raise LogError("the file is one JSON list", where=str(path), hint=hint)
     whole, reasons = True, Counter[str]()
     for number, text in lines:
         place = f"{path}:{number}"

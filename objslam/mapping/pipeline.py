@@ -145,6 +145,7 @@ def run(
         residual,
         summary={
             **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
+            "part": dict(zip(("begin", "end"), log.part, strict=True)),
             "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
             **({} if where is None else {"localisation": where.told}),
             **({"map_frame": "map"} if where is not None and where.solution is not None else {}),

@@ -56,11 +56,17 @@ class _SiteSession(_Place):
     common_objects: _Integer = 0
 
 
+class _Part(_Shape):
+    begin: _Number | None = None
+    end: _Number | None = None
+
+
 class Summary(_Shape):
     """The content of summary.json. Each key may be missing, as in the summary of an older run."""
 
     log: str = ""
     log_path: str | None = None
+    part: _Part | None = None
     map_frame: str = ""
     planar: bool = True
     up: Up = "z"

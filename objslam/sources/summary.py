@@ -9,6 +9,7 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import Camera, spoken_name
 from objslam.core.statistics import RAYLEIGH_MEDIAN
 from objslam.core.types import Detections, Images, Log, Trajectory
+from objslam.frontend.log_part import part_in_words
 
 FIND_BOXES = "run a detector on its images (--detector)"  # The advice for a camera with images but without detections.
 
@@ -40,12 +41,13 @@ class Stream:
 
 @dataclass(frozen=True)
 class Contents:
-    """The summary of a log. missing: one line for each thing that a run needs but the log lacks."""
+    """The summary of a log. missing: one line for each thing that a run needs but the log lacks. part: as in `Log`."""
 
     name: str
     streams: tuple[Stream, ...]
     cameras: tuple[Camera, ...]
     missing: tuple[str, ...]
+    part: tuple[float | None, float | None] = (None, None)
 
 
 def timing(stamps: Floats) -> Timing:
@@ -85,7 +87,7 @@ def contents(log: Log) -> Contents:
     if log.truth is not None:
         streams.append(_path("truth", log.truth.trajectory))
     cameras = tuple(camera_log.camera for camera_log in log.cameras)
-    return Contents(log.name, tuple(stream for stream in streams if stream), cameras, tuple(missing))
+    return Contents(log.name, tuple(stream for stream in streams if stream), cameras, tuple(missing), log.part)
 
 
 def in_words(found: Contents) -> list[str]:
@@ -93,6 +95,8 @@ def in_words(found: Contents) -> list[str]:
     by_role = {stream.role: stream for stream in found.streams}
     path = by_role.get("localization") or by_role.get("odometry")
     said = []
+    if part := part_in_words(found.part):
+        said.append(f"This is a part of the recording: {part}.")
     if path is not None:
         source = " and ".join(name for name in ("odometry", "localization") if name in by_role)
         said.append(f"The robot drives {path.detail} in {path.timing.end - path.timing.start:.1f} s, by {source}.")

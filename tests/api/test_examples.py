@@ -1,11 +1,14 @@
-"""The scripts in examples/ run, and print what they promise."""
+"""The scripts and the notebook in examples/ run, and print what they promise."""
 
 from __future__ import annotations
 
+import json
 import runpy
+import shutil
 import sys
 import tomllib
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -98,3 +101,22 @@ def test_shared_errors_go_from_one_run_to_the_next(play: Play, folder: Path) -> 
     said = play("settings_and_calibration", folder / "log", folder / "calibrated")
     assert "odometry.scale: " in said
     assert "ObjectMap of 4 objects (0 unresolved)" in said
+
+
+def test_the_notebook_runs_from_top_to_bottom(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without Jupyter, so a cell must be plain Python."""
+    shutil.copytree(folder / "log", tmp_path / "demo_boxes" / "log")
+    notebook = json.loads((EXAMPLES / "first_map.ipynb").read_text("utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    names: dict[str, Any] = {}
+    with chdir(tmp_path):
+        for cell in cells:
+            exec(compile(cell, "cell", "exec"), names)
+        picture = eval(cells[-1].splitlines()[-1], names)  # A notebook shows the value of the last line.
+    assert min(picture.size) > 300
+    assert (tmp_path / "notebook_map" / "objects.json").is_file()
+    said = capsys.readouterr().out
+    assert "ObjectMap of 4 objects (0 unresolved)" in said
+    assert said.count("m in x, y, z;") == 4
+    assert "nearest to the origin: plant" in said
+    assert not any(cell.get("outputs") for cell in notebook["cells"])  # A stale output would say what is not so.

@@ -53,6 +53,11 @@ def test_a_table_of_80_columns_leaves_out_parallax_and_not_sigma():
     assert "0.500" in shown(80)
 
 
+def test_a_table_has_no_empty_column():
+    assert "size m" not in shown(200)
+    assert "sigma m" in shown(200)
+
+
 class Tty(io.StringIO):
     def isatty(self) -> bool:
         return True

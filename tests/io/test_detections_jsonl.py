@@ -248,7 +248,8 @@ def test_no_usable_frame_is_an_error_that_names_the_file(tmp_path, content):
             "boxes must hold lists",
             "[[x1, y1, x2, y2]]",
         ),
-        ('[\n {"stamp": 1},\n {"stamp": 2}\n]', "not JSON", "one frame a line"),
+        ('[\n {"stamp": 1},\n {"stamp": 2}\n]', "one JSON list", "one frame a line"),
+        ('[\n{"stamp": 1},\n{"stamp": 2, "boxes": [], "labels": [], "scores": []}\n]', "one JSON list", "one frame a line"),
         ('[{"stamp": 1}]', "not a JSON object", "one frame a line"),
     ],
 )

@@ -11,6 +11,7 @@ from small_log import small_log
 import objslam
 from objslam.config import Odometry
 from objslam.frontend.bearings import CUT_OFF
+from objslam.frontend.log_part import part_of_log
 from objslam.mapping.checks.assessment import Evidence, assess
 from objslam.simulation import DepthNoise, PoseNoise
 
@@ -74,6 +75,26 @@ def test_a_map_in_the_frame_of_the_odometry_says_so() -> None:
     found = assess(replace(GOOD, odometry_frame=True))
     assert found.level == "good"
     assert "frame of the odometry" in found.reasons[-1]
+
+
+@pytest.mark.parametrize(
+    ("part", "limits"),
+    [((10.0, None), "from stamp 10.000 s"), ((None, 20.5), "to stamp 20.500 s"), ((10.0, 20.5), "10.000 to 20")],
+)
+def test_a_map_of_a_part_says_which(part: tuple[float | None, float | None], limits: str) -> None:
+    found = assess(replace(GOOD, part=part))
+    assert found.level == "good"
+    assert "The map is of a part of the recording: " in found.reasons[-1]
+    assert limits in found.reasons[-1]
+
+
+def test_a_summary_has_the_part_that_was_used() -> None:
+    log = small_log()
+    middle = float(np.median(log.robot_path.stamps))
+    assert log.part == (None, None)
+    result = objslam.run(part_of_log(log, None, middle), **QUIET)
+    assert result.summary["part"] == {"begin": None, "end": middle}
+    assert f"a part of the recording: to stamp {middle:.3f} s." in result.summary["assessment"]["reasons"][-1]
 
 
 def test_a_scale_that_the_log_does_not_tell_is_no_flaw_but_said() -> None:

@@ -206,7 +206,8 @@ class DdsAdapter:
     def _say_what_is_missing(self, age: float) -> None:
         now = time.monotonic()
         if age > _LONELY and not self._readers:
-            hint = f"; --interface {AUTO} searches the network" if self.network.where == LOOPBACK else ""
+            more = f"; --interface {AUTO} searches the network; docs/live.md has a CYCLONEDDS_URI for ROS nodes on loopback"
+            hint = more if self.network.where == LOOPBACK else ""
             where = f"{self.network.where}, domain {self.network.domain}{hint}"
             self.ledger.warn(f"no publisher of odometry, tf or detections on {where}")
         for reader in self._readers.values():

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from objslam.core.snapshot import RARE_POSES, TOO_SLOW
 from objslam.frontend.bearings import CUT_OFF
+from objslam.frontend.log_part import part_in_words
 
 Level = Literal["good", "check", "bad"]
 
@@ -49,7 +50,8 @@ class Evidence:
     frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
     journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
     whether they name one object or several. odometry: the largest factor on a noise of the odometry that the log shows.
-    scale: the standard deviation of the scale of the odometry, as a share. None if the log tells the scale.
+    scale: the standard deviation of the scale of the odometry, as a share. None if the log tells the scale. part: the limits
+    of a log that is a part of a recording, as in `Log`.
     """
 
     resolved: int
@@ -70,6 +72,7 @@ class Evidence:
     doubted: tuple[str, ...] = ()
     odometry: float = 1.0
     scale: float | None = None
+    part: tuple[float | None, float | None] = (None, None)
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         doubted=tuple(summary["doubted_labels"]),
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
         scale=_untold_scale(summary),
+        part=(summary["part"]["begin"], summary["part"]["end"]) if "part" in summary else (None, None),
     )
 
 
@@ -125,13 +129,15 @@ def assess(e: Evidence) -> Assessment:
     bad, check = _bad(e), _check(e)
     level: Level = "bad" if bad else "check" if check else "good"
     good = f"{_objects(e.resolved)}, whose boxes agree to within the expected noise."
-    about = [] if bad else _frame_and_scale(e)
+    about = [] if bad else _about(e)
     return Assessment(level, (*(bad or check or [good]), *about))
 
 
-def _frame_and_scale(e: Evidence) -> list[str]:
-    """Return what holds for every map by odometry. It is no reason for a lower level."""
+def _about(e: Evidence) -> list[str]:
+    """Return what a reader must know of the map: the part of the recording, the frame, the scale. It lowers no level."""
     found = []
+    if part := part_in_words(e.part):
+        found.append(f"The map is of a part of the recording: {part}.")
     if e.odometry_frame:
         found.append("The map lies in the frame of the odometry, which begins where the robot began.")
     if e.scale is not None:

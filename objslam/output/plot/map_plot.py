@@ -12,7 +12,7 @@ from objslam.core.result import RunResult
 from objslam.core.types import Truth
 from objslam.frontend.up import from_above, up_axis
 from objslam.mapping.checks.assessment import HEADLINES
-from objslam.output.plot.figure import Area, Figure, Label, Line, Marks, Segments, Shape
+from objslam.output.plot.figure import Area, Colour, Figure, Label, Line, Marks, Segments, Shape
 from objslam.output.plot.labels import make_labels, shortened
 from objslam.output.plot.page import render
 from objslam.output.plot.style import body_outline, captions, frame_objects, label_colours, ray_ends, ray_kinds, sample
@@ -26,12 +26,17 @@ _CROSS = 17.0  # The cross of a true object has this width and height, px.
 _DOT, _START = 11.0, 15.0  # The dot of an object, and the circle at the start of the path, have these diameters, px.
 _ELLIPSE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map, and its least width, px. Its least height is 300 px.
+_GROWTH = 0.1
+"""Ellipses widen the shown area by at most this share of its longer side, on each side. They end at the edge then. A larger
+share shows more of large ellipses, and shrinks the rest of the map."""
 _EDGE = 0.985  # The triangle of a far object is at this share of the way from the centre of the picture to the edge.
 _TRIANGLE = 18.0  # The triangle of a far object has this length, px.
-_PATH = 2.0  # The width, px, of a path.
+_PATH, _BAND = 2.0, 1.0  # The widths, px, of a path, and of the outlines of a body that is 2 sigma smaller or larger.
+_LIGHT = 0.45  # How much lighter than the outline of the body these outlines are, from 0 to 1. At 1, they are white.
 _TAG, _NORMAL = 4.0, 0.3  # The width, px, of the outline of a fiducial, and the length, m, of the line along its normal.
 _USED, _REJECTED = (0.561, 0.749, 0.933), (0.937, 0.561, 0.525)  # Used rays are light blue, and rejected rays are light red.
 _BEFORE, _AFTER = (0.541, 0.541, 0.541), (0.188, 0.204, 0.231)  # The colours of the path before and after the estimation.
+_TRUE = (0.180, 0.545, 0.341)  # The colour of the true path, as in the viewer.
 _NEUTRAL = (0.333, 0.333, 0.333)  # The legend shows objects in this colour, because each label has its own colour.
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
@@ -54,7 +59,7 @@ def map_figure(result: RunResult, truth: Truth | None = None) -> Figure:
     wider = np.maximum(np.array([_SHORT_SIDE, _SHORT_SIDE / 2]) / scale - (high - low), 0.0) / 2
     low, high = low - wider, high + wider
     below, dots = _objects(result, plane, points)
-    shapes = [*_rays(result, plane), *_paths(result, plane), *below]
+    shapes = [*_rays(result, plane), *_paths(result, truth, plane), *below]
     if len(crosses):
         shapes.append(Marks(crosses, "cross", _BLACK, _BLACK, _CROSS, "ground truth"))
     ok = np.array([o.status == "ok" for o in result.map], dtype=bool)
@@ -96,7 +101,7 @@ def _frame(result: RunResult, plane: list[int], points: Floats, crosses: Floats)
     corners = np.concatenate([points[drawn] - half[drawn], points[drawn] + half[drawn]])
     # A path with much drift, or a huge ellipse, must not shrink the rest of the map.
     before = np.clip(result.path.poses[:, plane, 3], low - 0.15 * side, high + 0.15 * side)
-    both = np.concatenate([before, np.clip(corners, low - side, high + side), [low, high]])
+    both = np.concatenate([before, np.clip(corners, low - _GROWTH * side, high + _GROWTH * side), [low, high]])
     return shown[: len(points)], both.min(axis=0), both.max(axis=0)
 
 
@@ -116,11 +121,13 @@ def _rays(result: RunResult, plane: list[int]) -> list[Shape]:
     return shapes
 
 
-def _paths(result: RunResult, plane: list[int]) -> list[Shape]:
+def _paths(result: RunResult, truth: Truth | None, plane: list[int]) -> list[Shape]:
     before, after = result.path.poses[:, plane, 3], result.path_after.poses[:, plane, 3]
     moved = not np.array_equal(result.map_T_base, result.keyframes.map_T_base)
     shapes: list[Shape] = [Line(before, _BEFORE, _PATH, "path before", dashed=True)] if moved else []
     shapes.append(Line(after, _AFTER, _PATH, "path after" if moved else "path"))
+    if truth is not None and truth.trajectory is not None:  # Thin, and above, because both should coincide.
+        shapes.append(Line(truth.trajectory.poses[:, plane, 3], _TRUE, _BAND, "true path"))
     if len(after):
         shapes.append(Marks(after[:1], "dot", _WHITE, _AFTER, _START, "start"))
     return shapes
@@ -144,11 +151,19 @@ def _objects(result: RunResult, plane: list[int], points: Floats) -> tuple[list[
             below.append(Area(rim, colour, 0.18))
         outline = body_outline(o) if plane == [0, 1] else None  # A body stands along z.
         if outline is not None:
+            band = [rim for sigmas in (-2.0, 2.0) if (rim := body_outline(o, sigmas)) is not None]
+            below += [Line(rim, _lighter(colour), _BAND) for rim in band]
             below.append(Line(outline, colour, _PATH))
         if o.tag is not None:
             below.append(Line(o.tag.outline(o.position)[:, plane], colour, _TAG))
             below.append(Line(np.stack([o.position, o.position + _NORMAL * o.tag.rotation[:, 2]])[:, plane], colour, _PATH))
     return below, dots
+
+
+def _lighter(colour: Colour) -> Colour:
+    """Return a colour between this one and white."""
+    r, g, b = (_LIGHT + (1 - _LIGHT) * part for part in colour)
+    return r, g, b
 
 
 def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
@@ -159,6 +174,7 @@ def _legend(result: RunResult) -> tuple[Line | Marks, ...]:
         entries.append(Marks(nowhere, "dot", _NEUTRAL, _WHITE, _DOT, "objects, 2 sigma"))
     if any(o.body is not None for o in result.map):
         entries.append(Line(nowhere, _NEUTRAL, _PATH, "their bodies"))
+        entries.append(Line(nowhere, _lighter(_NEUTRAL), _BAND, "2 sigma of their sizes"))
     if any(o.tag is not None for o in result.map):
         entries.append(Line(nowhere, _NEUTRAL, _TAG, "fiducials and their normals"))
     if resolved < len(result.map):

@@ -4,10 +4,12 @@ import colorsys
 from collections import Counter
 from collections.abc import Sequence
 from typing import Literal
+from zlib import crc32
 
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.bodies.body import Body
 from objslam.core.bodies.upright_box import footprint
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
@@ -18,6 +20,10 @@ RayKind = Literal["used", "rejected", "unexplained"]
 
 REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value. A larger value rejects more.
 _USUAL_REACH = 2.0  # Rays are drawn with this length, m, if no ray has an object.
+_HUES = 12
+"""Labels get this many hues before the first one lies between two others. With more, hues are harder to tell apart. With
+fewer, a label more often has another colour in a map with other labels. It is even, so that the luminances alternate."""
+_NEXT = 5  # A label whose hue is taken tries the hue this many further on. It has no divisor in common with `_HUES`.
 _SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
 """Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
@@ -26,11 +32,17 @@ _CORE, _AROUND = 0.1, 1.5
 """They limit the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects on
 each side. A picture shows objects up to `_AROUND` times the box's diagonal away from the box. A larger share hides more far
 objects. A larger multiple hides fewer."""
+_KNOWN_HEADING, _LONGER = np.radians(15), 2.0
+"""A cuboid has corners in a picture if the standard deviation of its yaw, rad, is below the first number, and if its length
+exceeds its width by more than the second number times the standard deviation of their difference. Three sigmas of 15 degrees
+reach the direction in which a square has its sides in place of its corners. Without the second number, a bottle of TUM
+fr3_office was a square. A larger first and a smaller second number draw more round things as turned squares."""
 _OUTLINE_POINTS = 96  # A round body is drawn with this many points, which labels avoid. With fewer, labels get between them.
-_FENCE = (3.0, 0.5, 1.0)
-"""A picture shows an object if its distance from the path is at most the largest of three distances: this multiple of the
-median distance of the objects, this share of the diagonal of the path's bounding box, and this length, m. Larger values show
-more far objects and shrink the rest of the map."""
+_MOST, _FENCE = 0.9, (2.0, 0.15, 1.0)
+"""A picture shows an object if its distance from the path is at most the largest of three distances: a multiple of the
+distance within which the first share of the objects lies, a share of the diagonal of the path's bounding box, and a length,
+m. At 0.15 of the diagonal, a lone object beside a square path adds a fifth to the area. Larger values show more far objects
+and shrink the rest of the map."""
 
 
 def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:
@@ -68,19 +80,40 @@ def label_colours(objects: ObjectMap) -> dict[str, tuple[float, float, float]]:
 
 def colours_of(labels: Sequence[str]) -> dict[str, tuple[float, float, float]]:
     """Return a colour for each label, as `label_colours` does."""
-    names = sorted(set(labels))
-    return {name: _colour(i / len(names), i) for i, name in enumerate(names)}
+    return {name: _colour(slot / _HUES, int(slot)) for name, slot in _slots(labels).items()}
+
+
+def _slots(labels: Sequence[str]) -> dict[str, float]:
+    """Return the place of each label on the circle of hues, from 0 to `_HUES`.
+
+    It depends on the name, so that a label has one colour in all maps. Only if names of a map have the same place, the later
+    in the alphabet takes another one.
+    """
+    slots: dict[str, float] = {}
+    for name in sorted(set(labels)):
+        first, taken = crc32(name.encode()) % _HUES, set(slots.values())
+        turn = 0  # After each turn through all hues, the next one takes the middle between them, then the quarters, ...
+        while all((first + _NEXT * i) % _HUES + _between(turn) in taken for i in range(_HUES)):
+            turn += 1
+        free = ((first + _NEXT * i) % _HUES + _between(turn) for i in range(_HUES))
+        slots[name] = next(slot for slot in free if slot not in taken)
+    return slots
+
+
+def _between(turn: int) -> float:
+    """Return the numbers 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput), which fill the space between two hues evenly."""
+    return sum((turn >> bit & 1) / 2 ** (bit + 1) for bit in range(turn.bit_length()))
 
 
 def object_colours(objects: ObjectMap) -> list[tuple[float, float, float]]:
     """Return a colour for each object. The first object of a label has the label's colour, the others have nearby hues."""
-    names = sorted({o.label for o in objects.objects})
+    slots = _slots([o.label for o in objects.objects])
     shared, earlier = Counter(o.label for o in objects.objects), Counter[str]()
     colours = []
     for o in objects.objects:
-        i, k = names.index(o.label), earlier[o.label]
+        slot, k = slots[o.label], earlier[o.label]
         earlier[o.label] += 1
-        colours.append(_colour((i + 0.8 * k / shared[o.label]) / len(names), i + k))
+        colours.append(_colour((slot + 0.8 * k / shared[o.label]) / _HUES, int(slot) + k))
     return colours
 
 
@@ -104,17 +137,33 @@ def ellipsoid(o: MapObject) -> tuple[Floats, Floats] | None:
     return 2.0 * np.sqrt(np.maximum(values, 0.0)), axes
 
 
-def body_outline(o: MapObject) -> Floats | None:
-    """Return the closed outline (n, 2), m, of an object's body seen from above, along z. None for a point."""
+def has_corners(body: Body) -> bool:
+    """Return whether a picture shows a body with corners: a cuboid whose heading is known. Else it is round.
+
+    The heading is the direction of the length, so it is known only if the length is the longer side for sure.
+    """
+    length, width, _ = body.size
+    told_apart = length - width > _LONGER * np.hypot(*body.size_sigma[:2])
+    return bool(body.shape == "cuboid" and body.yaw_sigma < _KNOWN_HEADING and told_apart)
+
+
+def body_outline(o: MapObject, sigmas: float = 0.0) -> Floats | None:
+    """Return the closed outline (n, 2), m, of an object's body seen from above, along z. None for a point.
+
+    sigmas: the standard deviations that are added to its length and width. None if no length or width is left.
+    """
     body = o.body
     if body is None or o.status != "ok":
         return None
-    if body.shape == "cuboid":
-        corners = footprint((o.position, body.size, body.yaw))
+    size = body.size + sigmas * body.size_sigma
+    if (size[:2] <= 0).any():
+        return None
+    if has_corners(body):
+        corners = footprint((o.position, size, body.yaw))
         return np.concatenate([corners, corners[:1]])
     turn = np.linspace(0, 2 * np.pi, _OUTLINE_POINTS)
     cos, sin = np.cos(body.yaw), np.sin(body.yaw)
-    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * body.size[:2] / 2
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=1) * size[:2] / 2
     return np.asarray(o.position[:2] + rim @ np.array([[cos, sin], [-sin, cos]]))
 
 
@@ -154,7 +203,8 @@ def frame_objects(objects: Floats, path: Floats) -> tuple[Bools, Floats, Floats]
         low = high = np.zeros(path.shape[1])
     diagonal = float(np.linalg.norm(high - low))
     off = np.linalg.norm(np.maximum(np.maximum(low - objects, objects - high), 0.0), axis=1)
-    usual = float(np.sort(off)[(len(off) - 1) // 2]) if len(off) else 0.0
+    known_off = np.sort(off[np.isfinite(off)])
+    usual = float(known_off[int(_MOST * (len(known_off) - 1))]) if len(known_off) else 0.0
     fence = max(_FENCE[0] * usual, (_FENCE[1] if len(path) else _AROUND) * diagonal, _FENCE[2])
     inside = np.isfinite(off) & (off <= fence)
     near = path[((path >= low - fence) & (path <= high + fence)).all(axis=1)]

@@ -152,6 +152,7 @@
         const width = pen.measureText(o.name).width;
         const spots = [[9, 0], [-9 - width, 0], [-width / 2, -15], [-width / 2, 15]];
         const free = spots.map(([dx, dy]) => [p[0] + dx - 2, p[1] + dy - 8, p[0] + dx + width + 2, p[1] + dy + 8])
+          .filter(a => a[0] >= 0 && a[2] <= frame.w)
           .find(a => !taken.some(b => a[0] < b[2] && a[2] > b[0] && a[1] < b[3] && a[3] > b[1]));
         if (!free && first({o})) continue;
         const at = free ?? [p[0] + 7, p[1] - 8, p[0] + 11 + width, p[1] + 8];

@@ -10,7 +10,16 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory, Truth, Up
 from objslam.frontend.up import from_above, up_vector
 from objslam.io.rays_parquet import RaysTable
-from objslam.output.plot.style import REJECTED_BELOW, captions, ellipsoid, evenly, frame_objects, label_colours, sample
+from objslam.output.plot.style import (
+    REJECTED_BELOW,
+    captions,
+    ellipsoid,
+    evenly,
+    frame_objects,
+    has_corners,
+    label_colours,
+    sample,
+)
 
 _MAX_USED, _MAX_REJECTED = 1500, 300
 """The most used and the most rejected rays in the view. More make the page larger and the view slower, and hide objects."""
@@ -50,7 +59,7 @@ def scene_data(
                 "at": positions[i].round(3).tolist(),
                 "axes": _half_axes(objects, i, turn),
                 "body": _body(objects, i, turn),
-                "cuboid": getattr(objects[i].body, "shape", "point") == "cuboid",
+                "cuboid": (body := objects[i].body) is not None and has_corners(body),
             }
             for i in shown
         ],

@@ -13,7 +13,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.rotation import quaternion_from_rotation
 from objslam.core.types import Truth
 from objslam.errors import printable
-from objslam.output.plot.style import captions, ellipsoid, object_colours
+from objslam.output.plot.style import captions, ellipsoid, has_corners, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
 
 _MAX_LABELS = 60  # The most objects of a map whose labels show at first. More labels would overlap.
@@ -87,10 +87,10 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
 
 def _log_bodies(log: Any, bodies: list[tuple[Floats, Body, tuple[int, int, int]]]) -> None:
-    """Log bodies as filled ellipsoids and cuboids. The 2-sigma ellipsoids are lines, so the two look different."""
+    """Log bodies as filled ellipsoids, and as cuboids if the heading is known. The 2-sigma ellipsoids are lines."""
     for name, kind, some in (
-        ("/bodies", rr.Ellipsoids3D, [one for one in bodies if one[1].shape != "cuboid"]),
-        ("/cuboids", rr.Boxes3D, [one for one in bodies if one[1].shape == "cuboid"]),
+        ("/bodies", rr.Ellipsoids3D, [one for one in bodies if not has_corners(one[1])]),
+        ("/cuboids", rr.Boxes3D, [one for one in bodies if has_corners(one[1])]),
     ):
         turns = lift_se2(np.array([[0.0, 0.0, body.yaw] for _, body, _ in some]).reshape(-1, 3))[:, :3, :3]
         shapes = kind(

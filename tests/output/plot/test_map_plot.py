@@ -57,6 +57,13 @@ def test_the_room() -> None:
     assert ((figure.low < positions[:, :2]) & (positions[:, :2] < figure.high)).all()
 
 
+def test_a_true_path_is_drawn_in_the_plane_of_the_map() -> None:
+    result, truth = synthetic_result(*clusters(), keyframes=30)
+    assert truth.trajectory is not None
+    np.testing.assert_array_equal(lines(map_figure(result, truth))["true path"], truth.trajectory.poses[:, :2, 3])
+    assert "true path" not in lines(map_figure(result, dataclasses.replace(truth, trajectory=None)))
+
+
 def test_the_picture_shows_each_object_in_its_place_and_colour(tmp_path: Path) -> None:
     positions, labels = clusters()
     result, truth = synthetic_result(positions, labels, keyframes=30)

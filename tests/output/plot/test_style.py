@@ -10,8 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic_result import clusters, synthetic_result
 
+from objslam.core.bodies.body import Body, Shape
 from objslam.core.object_map import MapObject, ObjectMap
-from objslam.output.plot.style import captions, ellipsoid, frame_objects, label_colours, ray_ends, ray_kinds, sample
+from objslam.output.plot.style import (
+    body_outline,
+    captions,
+    colours_of,
+    ellipsoid,
+    frame_objects,
+    has_corners,
+    label_colours,
+    ray_ends,
+    ray_kinds,
+    sample,
+)
 
 ROOM = np.random.default_rng(0).uniform([0, 0], [10, 15], size=(500, 2))
 
@@ -95,6 +107,40 @@ def test_colours_differ_and_can_be_read_on_white(count: int) -> None:
         linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in rgb]
         luminance = float(np.dot(linear, [0.2126, 0.7152, 0.0722]))
         assert 1.05 / (luminance + 0.05) >= 4.4
+
+
+def test_one_object_beside_the_path_adds_at_most_a_fifth_to_the_area() -> None:
+    square = np.random.default_rng(1).uniform(0, 10, size=(2000, 2))
+    areas = []
+    for away in np.arange(0.0, 12.0, 0.25):
+        inside, low, high = frame_objects(np.array([[5.0, 5.0], [4.0, 6.0], [10.0 + away, 5.0]]), square)
+        areas.append(float(np.prod(high - low)))
+    assert not inside[2]
+    assert max(areas) <= 1.22 * areas[0]
+
+
+def test_a_label_has_one_colour_in_all_maps() -> None:
+    few, many = (colours_of(labels) for labels in (["cup", "plant"], ["book", "chair", "cup", "plant", "tv"]))
+    assert few == {name: many[name] for name in few}
+
+
+@pytest.mark.parametrize(
+    ("shape", "length", "sigma", "corners"),
+    [("cuboid", 0.6, 5, True), ("cuboid", 0.6, 30, False), ("cuboid", 0.35, 5, False), ("ellipsoid", 0.6, 5, False)],
+)
+def test_a_body_has_corners_if_its_heading_is_known(shape: Shape, length: float, sigma: float, corners: bool) -> None:
+    body = Body(shape, np.array([length, 0.3, 1.0]), 0.4, np.array([0.05, 0.02, 0.1]), np.radians(sigma))
+    thing = dataclasses.replace(_object(0, "post"), body=body)
+    outline, wider = body_outline(thing), body_outline(thing, 2.0)
+    assert outline is not None
+    assert wider is not None
+    axes = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])  # along its length, and across
+    seen, seen_wider = ((rim - thing.position[:2]) @ axes for rim in (outline, wider))
+    np.testing.assert_allclose(np.abs(seen).max(axis=0), [length / 2, 0.15], rtol=1e-3)
+    np.testing.assert_allclose(np.abs(seen_wider).max(axis=0), [length / 2 + 0.05, 0.17], rtol=1e-3)
+    assert (np.linalg.norm(seen, axis=1).max() > np.hypot(length / 2, 0.15) - 1e-6) == corners
+    assert has_corners(body) is corners  # bool, because JSON takes no numpy.bool
+    assert body_outline(thing, -13.0) is None  # nothing is left of its length
 
 
 def test_rays_end_as_far_out_as_their_object() -> None:

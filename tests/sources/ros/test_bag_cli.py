@@ -1,5 +1,6 @@
 """Bags on the command line: info, convert and run, and the options that choose."""
 
+import json
 import sys
 
 import cv2
@@ -64,6 +65,17 @@ def test_info_says_what_a_run_would_use(objslam, bag):
     assert "base_footprint -> base_link -> front_link -> front_optical_frame" in out
     assert "several fit odometry: /odom is taken, not /wheels/far/odom (--topic odometry=... chooses)" in out
     assert "nothing is missing for a run" in out
+
+
+def test_info_describes_the_part_that_is_asked_for(objslam, bag, log):
+    begin, end = np.quantile(log.odometry.stamps, [0.25, 0.75])
+    frames = log.cameras[0].detections.frame_stamps
+    code, out, err = objslam("info", bag, "--begin", begin, "--end", end)
+    assert (code, err) == (0, "")
+    assert f"This is a part of the recording: from stamp {begin:.3f} to {end:.3f} s." in out
+    assert f" in {((frames >= begin) & (frames < end)).sum()} frames." in out
+    part = json.loads(objslam("info", bag, "--begin", begin, "--json")[1])["part"]
+    assert part["part"] == [begin, None]
 
 
 def test_info_takes_the_same_choices_as_a_run(objslam, bag):
