@@ -281,6 +281,12 @@ def test_a_run_imports_what_it_uses(log_folder, tmp_path):
     assert not lean & {"torch", "open3d", "onnxruntime", "rerun", "matplotlib", "scipy.spatial"}
 
 
+def test_the_fixed_mode_loads_nothing_of_the_joint_mode(log_folder, tmp_path):
+    loaded = imported_by("run", str(log_folder), "-o", str(tmp_path / "out"), "--mode", "fixed", *LEAN, depth=3)
+    assert "objslam.mapping.alternation" in loaded
+    assert not loaded & {"objslam.mapping.joint_solve", "objslam.mapping.reconstruction"}
+
+
 def test_a_command_does_not_load_the_others():
     loaded = imported_by("--debug", "config", "dump", depth=3)
     assert "objslam.cli.config" in loaded
