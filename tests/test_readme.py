@@ -25,7 +25,7 @@ from waiting import LIMIT
 
 import objslam
 from objslam import ObjectMap
-from objslam.cli import app
+from objslam.cli.commands import build_app
 from objslam.config import Settings, load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -200,7 +200,7 @@ def test_the_demo_is_as_good_as_the_table_says(played: Path) -> None:
 @pytest.mark.parametrize("arguments", commands(), ids=" ".join)
 def test_every_command_has_the_options_that_are_shown(arguments: list[str]) -> None:
     """Parses each command line, down to its last option, without running it."""
-    command: Any = typer.main.get_command(app)
+    command: Any = typer.main.get_command(build_app())
     context = command.make_context("objslam", ["config"], resilient_parsing=True)
     arguments = [argument for argument in arguments if argument not in ("--debug", "--help", "...")]
     while hasattr(command, "resolve_command") and arguments and arguments[0] != "COMMAND":

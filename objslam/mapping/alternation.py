@@ -11,11 +11,8 @@ from objslam.core.trace import Trace
 from objslam.core.types import Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.bodies.centre_bearings import solve_to_centres, to_centres
 from objslam.mapping.checks.unexplained import warn_of_unexplained
 from objslam.mapping.fixed.fixed_poses import FixedPoses, associate_fixed, calibrate_fixed
-from objslam.mapping.joint_alternation import JointState
-from objslam.mapping.joint_solve import solve_joint
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, seen_something, without_errors
 
@@ -57,7 +54,11 @@ def solve(
         keyframes, rays_of_keyframes = at.seen, at.rays_seen
     elif not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
-    else:
+    else:  # The fixed mode does without these modules, and the many below them.
+        from objslam.mapping.bodies.centre_bearings import solve_to_centres, to_centres
+        from objslam.mapping.joint_alternation import JointState
+        from objslam.mapping.joint_solve import solve_joint
+
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
         state = solve_joint(begin, start)
         assert state.association is not None

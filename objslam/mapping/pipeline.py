@@ -33,7 +33,6 @@ from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.lasting_errors import with_lasting_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
-from objslam.mapping.reconstruction import reconstruct
 from objslam.mapping.refuted import without_refuted
 from objslam.mapping.solution import seen_something
 from objslam.mapping.uncorrected import uncorrected_residual
@@ -128,6 +127,8 @@ def run(
     residual_before = None if errors is None else uncorrected_residual(errors, solution, path_after)
     surface, before = None, None
     if settings.reconstruction.use and any(c.depth is not None for c in log.cameras):
+        from objslam.mapping.reconstruction import reconstruct  # Few logs have depth images.
+
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:

@@ -245,14 +245,14 @@ def test_no_arguments_show_help_and_the_version_is_told(objslam):
     assert module.stdout == version.out
 
 
-def imported_by(*arguments: str) -> set[str]:
+def imported_by(*arguments: str, depth: int = 2) -> set[str]:
     """The packages that a command imports, and their parts such as scipy.spatial, in a process of its own."""
     code = (
         "import sys\n"
         "from objslam.cli import main\n"
         f"sys.argv = ['objslam', *{arguments!r}]\n"
         "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0, end.code\n"
-        "print('modules:', *sorted(name for name in sys.modules if name.count('.') < 2))\n"
+        f"print('modules:', *sorted(name for name in sys.modules if name.count('.') < {depth}))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(done.stdout.splitlines()[-1].split()[1:])
@@ -279,6 +279,19 @@ def test_a_run_imports_what_it_uses(log_folder, tmp_path):
     lean = imported_by("run", str(log_folder), "-o", str(tmp_path / "lean"), *LEAN)
     assert {"gtsam", "cv2"} <= lean
     assert not lean & {"torch", "open3d", "onnxruntime", "rerun", "matplotlib", "scipy.spatial"}
+
+
+def test_the_fixed_mode_loads_nothing_of_the_joint_mode(log_folder, tmp_path):
+    loaded = imported_by("run", str(log_folder), "-o", str(tmp_path / "out"), "--mode", "fixed", *LEAN, depth=3)
+    assert "objslam.mapping.alternation" in loaded
+    assert not loaded & {"objslam.mapping.joint_solve", "objslam.mapping.reconstruction"}
+
+
+def test_a_command_does_not_load_the_others():
+    loaded = imported_by("--debug", "config", "dump", depth=3)
+    assert "objslam.cli.config" in loaded
+    assert not loaded & {"objslam.cli.run", "objslam.cli.journal", "objslam.live"}
+    assert {"objslam.cli.run", "objslam.cli.journal"} <= imported_by("--help", depth=3)
 
 
 def test_no_object_is_searched_at_the_exit():

@@ -38,13 +38,13 @@ def bearings(
     unit, away = gtsam.Unit3, np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
     cameras = iter(() if offset is None else _poses(offset[away], directions[away]))
 
-    def make(k: int, j: int, direction: Floats, model: gtsam.noiseModel.Base, aside: bool) -> gtsam.NonlinearFactor:
+    def make(k: int, j: int, direction: list[float], model: gtsam.noiseModel.Base, aside: bool) -> gtsam.NonlinearFactor:
         if not aside:
-            return gtsam.BearingFactor3D(X0 + k, L0 + j, unit(direction), model)
+            return gtsam.BearingFactor3D(X0 + k, L0 + j, unit(*direction), model)  # An array takes half as long again.
         at = next(cameras)
         return gtsam.GenericProjectionFactorCal3Fisheye(_CENTRE, model, X0 + k, L0 + j, _EQUIDISTANT, False, False, at)
 
-    columns = (keyframe.tolist(), landmark.tolist(), directions, noise, away.tolist())
+    columns = (keyframe.tolist(), landmark.tolist(), directions.tolist(), noise, away.tolist())
     return [make(*row) for row in zip(*columns, strict=True)]
 
 

@@ -7,11 +7,16 @@ from importlib.util import LazyLoader, find_spec, module_from_spec
 _NEEDED = ("gtsam", "scipy.linalg", "scipy.sparse")
 """The libraries of every solve. Together, they take longer to load than a small solve takes."""
 
+_UNUSED = ("numpy.f2py", "numpy.testing")
+"""Modules that no solve uses. scipy copies all names of numpy, which loads them: a compiler of Fortran, 0.06 s, and
+unittest, 0.02 s."""
+
 
 def load_libraries() -> None:
     """Load GTSAM and the parts of scipy that a solve needs."""
     import_module("numpy")
-    _import_later("numpy.f2py")  # scipy copies all names of numpy, which loads this compiler of Fortran: 0.06 s.
+    for module in _UNUSED:
+        _import_later(module)
     for library in _NEEDED:
         import_module(library)
 

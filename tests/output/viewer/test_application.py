@@ -17,7 +17,7 @@ from synthetic_result import clusters, synthetic_result
 from typer.testing import CliRunner
 from waiting import LIMIT, wait_for
 
-from objslam.cli import app
+from objslam.cli.commands import build_app
 from objslam.errors import OutputError
 from objslam.output.viewer import application
 from objslam.output.viewer.recording import write_recording
@@ -157,7 +157,7 @@ def test_no_screen_is_one_line(out: Path) -> None:
     ],
 )
 def test_wrong_use_is_said(out: Path, arguments: list[str], code: int, said: str) -> None:
-    result = CliRunner().invoke(app, ["view", *(a.format(out=out) for a in arguments)])
+    result = CliRunner().invoke(build_app(), ["view", *(a.format(out=out) for a in arguments)])
     assert said in str(result.exception)
     assert getattr(result.exception, "exit_code", None) == code
 
