@@ -19,8 +19,10 @@ settings.register_profile(
 )
 settings.load_profile("objslam")
 
-# The plugin that runs tests in several processes sets a width of 80 columns, which commands obey even in a pipe.
-os.environ.pop("COLUMNS", None)
+# The plugin that runs tests in several processes sets a width of 80 columns, which commands obey even in a pipe. So does
+# GNU readline, which pytest imports, but only for new processes: Python does not see it, and removes only what it sees.
+os.environ["COLUMNS"] = ""
+del os.environ["COLUMNS"]
 
 # A suite in the background of a shell has SIGINT ignored. Commands that its tests start and interrupt would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

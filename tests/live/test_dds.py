@@ -77,6 +77,15 @@ def stamps(rows):
     return [round(row[0], 6) for row in rows]
 
 
+def test_no_two_tests_are_in_one_domain(domain):
+    another = own_domain()
+    script = (
+        f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from domains import own_domain; print(own_domain())"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=LIMIT, check=True)
+    assert len({domain, another, int(done.stdout)}) == 3
+
+
 def test_all_of_a_robot_arrives(domain):
     with listening(domain) as (sink, adapter):
         said = sent(start(Drive(domain, seconds=2.0, bad=2)))
