@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from quick import HELD, NOTHING_DRAWN
 from scipy.spatial.transform import Rotation
 from small_log import THINGS, small_log
 from waiting import LIMIT
 
 import objslam
+from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import COLUMNS
 from objslam.core.types import Log
@@ -24,7 +26,7 @@ from objslam.errors import ConfigError, LogError, ObjslamError, OutputError
 from objslam.mapping import pipeline
 from objslam.sources.log_folder import write_log_folder
 
-QUICK = {"output": {"recording": False, "picture": False}, "calibration": {"use": False}}
+QUICK = load_settings(None, (*HELD, *NOTHING_DRAWN))
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +64,7 @@ def test_every_public_name_is_there_and_no_other() -> None:
 
 def test_a_run_of_arrays_is_the_run_of_the_command(log: Log, result: objslam.Result) -> None:
     assert errors_of(result) < 0.03
-    known = pipeline.run(log, objslam.Settings(calibration={"use": False}), Ledger())
+    known = pipeline.run(log, load_settings(None, HELD), Ledger())
     np.testing.assert_array_equal(result.objects.positions, [o.position for o in known.map.objects])
     np.testing.assert_array_equal(result.objects.covariances, [o.covariance for o in known.map.objects])
 

@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 import yaml
 from commands import Call, call
+from processes import running
+from quick import HELD, NOTHING_DRAWN, QUICK, options
 from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
@@ -32,7 +34,7 @@ from objslam.simulation.trajectory import START
 from objslam.simulation.wrong_inputs import MISTAKES
 from objslam.sources.log_folder import write_log_folder
 
-LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
+LEAN = options(*NOTHING_DRAWN)
 MODES = ("fixed", "joint")
 SCRIPT = Path(sysconfig.get_path("scripts")) / "objslam"
 
@@ -46,9 +48,9 @@ def log_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole_result(log_folder, tmp_path_factory):
-    """What `run` writes with default settings."""
+    """What `run` writes."""
     out = tmp_path_factory.mktemp("results") / "out"
-    assert call("run", log_folder, "-o", out, *LEAN).code == 0
+    assert call("run", log_folder, "-o", out, *QUICK).code == 0
     return out
 
 
@@ -144,7 +146,9 @@ def test_settings_come_from_file_then_set_then_mode(objslam, log_folder, tmp_pat
     config.write_text(
         "mode: joint\nrays: {pixel_sigma: 2.5}\njoint: {loss: cauchy}\noutput: {recording: false, picture: false}\n"
     )
-    assert objslam("run", log_folder, "-o", tmp_path / "out", "--config", config, "--set", "joint.loss=gnc").code == 0
+    assert (
+        objslam("run", log_folder, "-o", tmp_path / "out", "--config", config, *options("joint.loss=gnc", *HELD)).code == 0
+    )
     told = yaml.safe_load((tmp_path / "out" / "config.yaml").read_text())
     assert (told["mode"], told["rays"]["pixel_sigma"], told["joint"]["loss"]) == ("joint", 2.5, "gnc")
     # what a run wrote is what another can be run with
@@ -158,7 +162,7 @@ def test_a_converted_log_gives_the_same_map(objslam, log_folder, tmp_path):
     assert converted.code == 0
     assert "wrote" in converted.out
     for log, out in ((log_folder, "a"), (tmp_path / "copy", "b")):
-        assert objslam("run", log, "-o", tmp_path / out, *LEAN).code == 0
+        assert objslam("run", log, "-o", tmp_path / out, *QUICK).code == 0
     a, b = (load_map(tmp_path / out).objects for out in "ab")
     assert [(o.label, o.rays, o.status) for o in a] == [(o.label, o.rays, o.status) for o in b]
     for mine, its in zip(a, b, strict=True):  # rotations are quaternions on disk, which round differently once more
@@ -241,7 +245,9 @@ def test_no_arguments_show_help_and_the_version_is_told(objslam):
     version = objslam("--version")
     assert (version.code, version.out) == (0, f"objslam {__version__}\n")
     assert in_process_of_its_own("--version").out == version.out
-    module = subprocess.run([sys.executable, "-m", "objslam", "--version"], capture_output=True, text=True, check=True)
+    module = subprocess.run(
+        [sys.executable, "-m", "objslam", "--version"], capture_output=True, text=True, timeout=LIMIT, check=True
+    )
     assert module.stdout == version.out
 
 
@@ -254,7 +260,7 @@ def imported_by(*arguments: str, depth: int = 2) -> set[str]:
         "try:\n    main()\nexcept SystemExit as end:\n    assert end.code == 0, end.code\n"
         f"print('modules:', *sorted(name for name in sys.modules if name.count('.') < {depth}))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT, check=True)
     return set(done.stdout.splitlines()[-1].split()[1:])
 
 
@@ -304,7 +310,7 @@ from objslam.cli import main
 sys.argv = ["objslam", "--version"]
 main()
 """
-    told = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout
+    told = subprocess.run([sys.executable, "-c", script], timeout=LIMIT, check=True, capture_output=True, text=True).stdout
     assert int(told.split("searched")[1]) < 1000
 
 
@@ -583,7 +589,7 @@ def test_rays_that_place_nothing_place_nothing(objslam, variant, tmp_path, mode,
 
 
 def test_options_of_another_source_are_named(objslam, log_folder, tmp_path):
-    run = objslam("run", log_folder, "-o", tmp_path, "--robot", 3, "--anonymous", *LEAN)
+    run = objslam("run", log_folder, "-o", tmp_path, "--robot", 3, "--anonymous", *QUICK)
     assert run.code == 0
     run.says_somewhere("--robot has no meaning", "--anonymous has no meaning")
 
@@ -634,16 +640,16 @@ def test_a_log_is_never_taken_for_the_place_of_its_result(objslam, variant, monk
 
 def test_what_went_with_the_older_result_is_told(objslam, variant, tmp_path):
     out = tmp_path / "out"
-    assert "removed" not in objslam("run", variant, "-o", out, *LEAN).out
+    assert "removed" not in objslam("run", variant, "-o", out, *QUICK).out
     assert objslam("export", out, "--to", "csv").code == 0
     assert objslam("eval", out).code == 0
-    told = objslam("run", variant, "-o", out, *LEAN).out
+    told = objslam("run", variant, "-o", out, *QUICK).out
     assert f"removed the older result from {out}: evaluation.json, objects.csv" in told
 
 
 def test_truth_that_is_missing_in_eval(objslam, variant, tmp_path):
     shutil.rmtree(variant / "groundtruth")
-    assert objslam("run", variant, "-o", tmp_path / "out", *LEAN).code == 0
+    assert objslam("run", variant, "-o", tmp_path / "out", *QUICK).code == 0
     failed = objslam("eval", tmp_path / "out")
     assert failed.code == 1
     failed.says(str(tmp_path / "out"), "no ground truth", "--truth")
@@ -735,10 +741,10 @@ def test_an_interrupt_ends_a_run_without_a_traceback(log_folder, tmp_path):
     """In the middle of the work, however fast that is."""
     out = tmp_path / "out"
     command = [sys.executable, "-c", ENDLESS, "run", str(log_folder), "-o", str(out), *LEAN]
-    run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert run.stdout.readline() == "begun\n"
-    run.send_signal(signal.SIGINT)
-    _, err = run.communicate(timeout=LIMIT)
+    with running(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout.readline() == "begun\n"
+        run.send_signal(signal.SIGINT)
+        _, err = run.communicate(timeout=LIMIT)
     assert run.returncode == 130
     assert "Traceback" not in err
     assert not (out / "summary.json").exists()
@@ -749,10 +755,10 @@ def test_a_run_that_is_ended_from_outside_leaves_nothing_half(log_folder, tmp_pa
     out = tmp_path / "out"
     command = [sys.executable, "-c", ENDLESS, "run", str(log_folder), "-o", str(out), *LEAN]
     heard = partial(signal.signal, number, signal.SIG_DFL)  # Under nohup, the suite and its children ignore SIGHUP.
-    run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heard)
-    assert run.stdout.readline() == "begun\n"
-    run.send_signal(number)
-    _, err = run.communicate(timeout=LIMIT)
+    with running(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heard) as run:
+        assert run.stdout.readline() == "begun\n"
+        run.send_signal(number)
+        _, err = run.communicate(timeout=LIMIT)
     assert run.returncode in (-number, 128 + number)
     assert len(err.splitlines()) <= 1
     assert "Traceback" not in err
@@ -764,7 +770,7 @@ def test_a_reader_that_leaves_early_is_no_traceback(log_folder, tmp_path, comman
     """The pipe is closed before the first line, so the command cannot write at all."""
     read_end, write_end = os.pipe()
     os.close(read_end)
-    more = ("-o", str(tmp_path / "out"), *LEAN) if command.startswith("run") else ()
+    more = ("-o", str(tmp_path / "out"), *QUICK) if command.startswith("run") else ()
     words = [SCRIPT, *command.split()[:1], str(log_folder), *command.split()[1:], *more]
     done = subprocess.run(words, stdout=write_end, stderr=subprocess.PIPE, text=True, timeout=LIMIT, check=False)
     os.close(write_end)
@@ -777,7 +783,9 @@ def test_a_reader_that_leaves_early_is_no_traceback(log_folder, tmp_path, comman
 
 
 def test_a_closed_pipe_is_no_traceback():
-    run = subprocess.run(f"'{SCRIPT}' config dump | head -n 1", shell=True, capture_output=True, text=True, check=False)
+    run = subprocess.run(
+        f"'{SCRIPT}' config dump | head -n 1", shell=True, capture_output=True, text=True, timeout=LIMIT, check=False
+    )
     assert run.stdout.startswith("mode:")
     assert "Traceback" not in run.stderr
 
@@ -785,22 +793,21 @@ def test_a_closed_pipe_is_no_traceback():
 def test_a_killed_run_leaves_no_half_result(log_folder, tmp_path, objslam):
     """Killed at random moments, most of them while it writes: no summary.json, or a whole result, the old or the new one."""
     out, rng = tmp_path / "out", random.Random(0)
-    assert objslam("run", log_folder, "-o", out, "--set", "output.recording=false").code == 0
+    held = options(*HELD)
+    assert objslam("run", log_folder, "-o", out, *held, "--set", "output.recording=false").code == 0
     before = (out / "objects.json").read_bytes()
     killed = attempt = 0
     while killed < 5:  # a run may be done before
-        command = [SCRIPT, "run", str(log_folder), "-o", str(out), "--set", f"seed={attempt + 1}", "--mode", "joint"]
-        run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        command = [SCRIPT, "run", str(log_folder), "-o", str(out), *held, "--set", f"seed={attempt + 1}", "--mode", "joint"]
         staged = out / ".objslam-staging"
-        if attempt:
-            writing = [staged / "objects.json", staged / "map.png"]
-            wait_for(lambda run=run, writing=writing: run.poll() is not None or any(f.exists() for f in writing), 0.001)
-        pause(rng.uniform(0, 0.6 if attempt % 2 else 0.1))
-        attempt += 1
-        assert attempt < 100
-        killed += run.poll() is None
-        run.kill()
-        run.wait()
+        with running(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as run:
+            if attempt:
+                writing = [staged / "objects.json", staged / "map.png"]
+                wait_for(lambda run=run, writing=writing: run.poll() is not None or any(f.exists() for f in writing), 0.001)
+            pause(rng.uniform(0, 0.6 if attempt % 2 else 0.1))
+            attempt += 1
+            assert attempt < 100
+            killed += run.poll() is None
         if (out / "summary.json").exists():
             found = load_map(out)
             assert summary(out)["counts"]["objects"] == len(found) == 4
@@ -808,7 +815,8 @@ def test_a_killed_run_leaves_no_half_result(log_folder, tmp_path, objslam):
             told = yaml.safe_load((out / "config.yaml").read_text())
             assert summary(out)["mode"] == told["mode"]
             assert (told["mode"] == "fixed") == ((out / "objects.json").read_bytes() == before)
-    assert objslam("run", log_folder, "-o", out, "--set", "output.recording=false").code == 0  # and the next run is whole
+    # And the next run is whole.
+    assert objslam("run", log_folder, "-o", out, *held, "--set", "output.recording=false").code == 0
     assert (out / "objects.json").read_bytes() == before
     assert not (out / ".objslam-staging").exists()
 
@@ -819,7 +827,7 @@ def test_a_camera_without_a_picture_of_its_own_is_left_to_others(objslam, tmp_pa
     (camera_log,) = log.cameras
     blind = replace(camera_log, camera=replace(camera_log.camera, name="right"), detections=None)
     write_log_folder(replace(log, cameras=(camera_log, blind)), tmp_path / "log")
-    assert objslam("run", tmp_path / "log", "-o", tmp_path / "out", *LEAN).code == 0
+    assert objslam("run", tmp_path / "log", "-o", tmp_path / "out", *QUICK).code == 0
     assert len(load_map(tmp_path / "out").resolved()) == 4
 
 

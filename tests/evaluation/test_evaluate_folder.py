@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick import HELD, NOTHING_DRAWN
 from rich.console import Console
 from scenes import show
 from scipy.spatial.transform import Rotation
@@ -88,6 +89,6 @@ def test_a_run_says_in_which_frame_its_map_is(tmp_path: Path, poses: str, tilted
     angles = 0.01 * tilted * np.sin(log.odometry.stamps)
     rocking = make_pose(Rotation.from_euler("y", angles[:, None]).as_matrix(), np.zeros((1, 3)))
     log = dataclasses.replace(log, odometry=Trajectory(log.odometry.stamps, log.odometry.poses @ rocking))
-    quick = load_settings(None, (f"poses.use={poses}", "output.recording=false", "output.picture=false"))
+    quick = load_settings(None, (f"poses.use={poses}", *HELD, *NOTHING_DRAWN))
     write_result(pipeline.run(log, quick, Ledger()), tmp_path, log.truth)
     assert choose_alignment(tmp_path)[0] == kind

@@ -14,22 +14,25 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from fleet.fleet_logs import LAYOUT, write_logs
+from processes import running
+from quick import ROUGH, options
 from waiting import wait_for
 
 import objslam
+from objslam.config import load_settings
 from objslam.fleet.page import duration
 from objslam.fleet.record import Record, parse_seen
 from objslam.fleet.stores.open_store import open_store
 from objslam.fleet.stores.store import StoreError
 
 COUNT = 4
-COMMAND = ("--layout", LAYOUT, "--set", "output.picture=false")
+COMMAND = ("--layout", LAYOUT, *options("output.picture=false", *ROUGH))
 
 
 def start(*arguments):
     """Start the command as a process of its own."""
     command = [sys.executable, "-m", "objslam", "fleet", *map(str, arguments), *COMMAND, "-j", "2"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return running(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def call(*arguments):
@@ -69,7 +72,7 @@ def test_every_log_is_mapped_as_by_hand_and_each_site_has_a_map(fleet, logs):
     assert (said["logs"], said["new"], said["failures"]) == (COUNT, COUNT, [])
     assert [(one["site"], one["sessions"], one["islands"]) for one in said["sites"]] == [("site_0", 2, 1), ("site_1", 2, 1)]
     for one in records(out):
-        hand = objslam.run(objslam.read(one.source), {"output.recording": False})
+        hand = objslam.run(objslam.read(one.source), load_settings(None, ("output.recording=false", *ROUGH)))
         np.testing.assert_array_equal(
             objslam.Result.load(out / "results" / one.key).objects.positions, hand.objects.positions
         )
@@ -142,15 +145,13 @@ def test_bad_logs_are_named_and_the_rest_goes_on(logs, tmp_path):
 
 def test_a_store_that_throws_a_killed_worker_and_a_killed_driver(fleet, logs, tmp_path):
     out, where = tmp_path / "out", (f"flaky://{logs}", "-o", f"flaky://{tmp_path / 'out'}", "--price", "0.05")
-    driver = start(*where)
-    wait_for(lambda: list(out.glob("seen/*.done")))
-    threads = Path(f"/proc/{driver.pid}/task").glob("*/children")
-    workers = [int(pid) for children in threads for pid in children.read_text().split()]
-    assert workers
-    os.kill(workers[0], signal.SIGKILL)
-    wait_for(lambda: len(list(out.glob("seen/*.done"))) >= 2)
-    driver.kill()
-    driver.communicate()
+    with start(*where) as driver:
+        wait_for(lambda: list(out.glob("seen/*.done")))
+        threads = Path(f"/proc/{driver.pid}/task").glob("*/children")
+        workers = [int(pid) for children in threads for pid in children.read_text().split()]
+        assert workers
+        os.kill(workers[0], signal.SIGKILL)
+        wait_for(lambda: len(list(out.glob("seen/*.done"))) >= 2)
     kept = {file: file.stat().st_mtime_ns for file in (out / "records").glob("*.json")}
     code, said, warned = call(*where)
     assert (code, said["logs"]) == (0, COUNT), warned

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 from detection.tiny_models import COLOURS, scene, tiny_model
 from fleet.fleet_logs import write_logs
+from quick import HELD, NOTHING_DRAWN
 
 import objslam
-from objslam.config import Settings
-from objslam.config.settings import change_settings
+from objslam.config import Settings, load_settings
 from objslam.core.types import Images
 from objslam.fleet.driver import run_fleet
 from objslam.fleet.engines.local_engine import local_engine
@@ -45,7 +45,7 @@ def test_a_fleet_finds_the_boxes_as_a_run_does(tmp_path):
     for path in write_logs(tmp_path / "simulated", range(2), sites=1):
         with_images(tmp_path, path)
     model = tiny_model(tmp_path / "m.onnx", "yolov8", size=(640, 640), batch=None, metadata={"names": list(COLOURS)})
-    settings = change_settings(Settings(), {"output": {"recording": False, "picture": False}})
+    settings = load_settings(None, (*HELD, *NOTHING_DRAWN))
     job = make_job(str(tmp_path / "out"), settings, SourceOptions(), model, report=False)
     logs = find_logs([str(tmp_path / "logs")], Layout("{log}", "none"))
     found = run_fleet(job, logs, local_engine(1, Limits()))

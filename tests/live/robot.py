@@ -9,6 +9,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -100,9 +102,22 @@ def start(drive: Drive) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, str(Path(__file__)), text], env=env, stdout=subprocess.PIPE, text=True)
 
 
+@contextmanager
+def robot_process(drive: Drive) -> Iterator[subprocess.Popen]:
+    """A robot that drives in a process of its own, and is killed at the end."""
+    with start(drive) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 def sent(process: subprocess.Popen) -> dict:
     """What a robot sent, when it is done."""
-    out, _ = process.communicate(timeout=LIMIT)
+    try:
+        out, _ = process.communicate(timeout=LIMIT)
+    finally:
+        process.kill()
     assert process.returncode == 0
     return json.loads(out)
 

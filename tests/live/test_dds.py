@@ -14,7 +14,21 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from robot import BASE_T_CAMERA, LOOPBACK, MAP_T_ODOM, Drive, Recorder, messages, pose_at, sent, start, time_of_day
+from domains import own_domain
+from processes import running
+from robot import (
+    BASE_T_CAMERA,
+    LOOPBACK,
+    MAP_T_ODOM,
+    Drive,
+    Recorder,
+    messages,
+    pose_at,
+    robot_process,
+    sent,
+    start,
+    time_of_day,
+)
 from waiting import LIMIT, wait_for
 
 pytest.importorskip("cyclonedds")
@@ -33,14 +47,13 @@ from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import TopicChoice
 from objslam.sources.ros_bag.options import RosOptions
 
-_DOMAINS = itertools.count(20 + os.getpid() % 60)
-
 
 @pytest.fixture
 def domain(monkeypatch):
-    """A domain that nobody else is in."""
+    """A domain that nobody else is in. Boxes wait for their camera, however slow the machine is."""
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    return next(_DOMAINS)
+    monkeypatch.setattr("objslam.live.ros.camera_registry.PATIENCE", LIMIT)
+    return own_domain()
 
 
 @contextmanager
@@ -64,10 +77,18 @@ def stamps(rows):
     return [round(row[0], 6) for row in rows]
 
 
+def test_no_two_tests_are_in_one_domain(domain):
+    another = own_domain()
+    script = (
+        f"import sys; sys.path.append({str(Path(__file__).parent)!r}); from domains import own_domain; print(own_domain())"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=LIMIT, check=True)
+    assert len({domain, another, int(done.stdout)}) == 3
+
+
 def test_all_of_a_robot_arrives(domain):
     with listening(domain) as (sink, adapter):
-        robot = start(Drive(domain, seconds=2.0, bad=2))
-        said = sent(robot)
+        said = sent(start(Drive(domain, seconds=2.0, bad=2)))
         wait_for(lambda: [len(sink.odometry), len(sink.detections)] == [len(said[kind]) for kind in said])
     assert stamps(sink.odometry) == [round(stamp, 6) for stamp in said["odometry"]]
     assert stamps(sink.detections) == [round(stamp, 6) for stamp in said["detections"]]
@@ -90,11 +111,8 @@ def test_all_of_a_robot_arrives(domain):
 
 def test_what_arrives_of_a_robot_that_sends_once_is_what_it_sent(domain):
     """Best effort: a busy machine may lose some of it."""
-    with listening(domain) as (sink, _):
-        robot = start(Drive(domain, seconds=3600.0, reliable=False))
+    with listening(domain) as (sink, _), robot_process(Drive(domain, seconds=3600.0, reliable=False)):
         wait_for(lambda: len(sink.odometry) > 100 and len(sink.detections) > 10)
-        robot.kill()
-        robot.communicate()
     found = stamps(sink.odometry), stamps(sink.detections)
     assert all((np.diff(rows) > 0).all() for rows in found)
     turns = np.array([np.arctan2(row[1][1, 0], row[1][0, 0]) for row in sink.odometry])
@@ -106,10 +124,8 @@ def test_what_arrives_of_a_robot_that_sends_once_is_what_it_sent(domain):
 
 def test_a_robot_that_is_killed_and_starts_again_is_heard_again(domain):
     with listening(domain) as (sink, _):
-        robot = start(Drive(domain, seconds=3600.0))
-        wait_for(lambda: len(sink.detections) > 5)
-        robot.kill()
-        robot.communicate()
+        with robot_process(Drive(domain, seconds=3600.0)):
+            wait_for(lambda: len(sink.detections) > 5)
         killed = time_of_day()
         said = sent(start(Drive(domain, seconds=1.0)))
         wait_for(lambda: stamps(sink.odometry)[-1] == round(said["odometry"][-1], 6))
@@ -121,8 +137,8 @@ def test_a_robot_that_is_killed_and_starts_again_is_heard_again(domain):
 def test_reliable_and_best_effort_publishers_of_one_topic_are_each_heard_once(domain):
     with listening(domain, odometry="/odom", detections="none") as (sink, _):
         drives = [Drive(domain, seconds=1.0, reliable=reliable, heard=("odom",)) for reliable in (True, False)]
-        robots = [start(drive) for drive in drives]
-        said = [sent(robot)["odometry"] for robot in robots]
+        with robot_process(drives[0]) as one, robot_process(drives[1]) as other:
+            said = [sent(robot)["odometry"] for robot in (one, other)]
         # Two messages of two robots may bear the same microsecond, so messages are counted, not only looked for.
         surely, perhaps = (Counter(round(stamp, 6) for stamp in stamps) for stamps in said)
         # Best effort may lose some on a busy machine.
@@ -135,8 +151,7 @@ def test_a_payload_that_is_malformed_on_the_wire_is_counted(domain):
 
     network = open_network(domain)
     found = BuiltinDataReader(network.participant, BuiltinTopicDcpsPublication)
-    with listening(domain) as (sink, adapter):
-        robot = start(Drive(domain, seconds=3600.0, reliable=False))
+    with listening(domain) as (sink, adapter), robot_process(Drive(domain, seconds=3600.0, reliable=False)):
         wait_for(lambda: len(sink.odometry) > 20)
         (writer,) = [sample.key.bytes for sample in found.take(100) if sample.topic_name == "rt/odom"]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
@@ -148,8 +163,6 @@ def test_a_payload_that_is_malformed_on_the_wire_is_counted(domain):
         wait_for(lambda: adapter.ledger.dropped.get(reason, 0) >= 2)
         count = len(sink.detections)
         wait_for(lambda: len(sink.detections) > count)
-        robot.kill()
-        robot.communicate()
     assert adapter.ledger.examples[reason][0] == "/odom"
 
 
@@ -163,8 +176,10 @@ def test_an_older_layout_of_vision_msgs_is_read(domain):
     newer, older = layouts_of("vision_msgs/msg/Detection2DArray")
     assert newer.__idl__.get_type_id() == messages()["Detection2DArray"].__idl__.get_type_id()
     maker = Maker("2")
-    with listening(domain, odometry="/odom", detections="/old") as (sink, _):
-        robot = start(Drive(domain, seconds=1.0, heard=("odom", "tf", "info")))
+    with (
+        listening(domain, odometry="/odom", detections="/old") as (sink, _),
+        robot_process(Drive(domain, seconds=1.0, heard=("odom", "tf", "info"))) as robot,
+    ):
         participant = DomainParticipant(domain)
         writer = DataWriter(participant, Topic(participant, "rt/old", older))
         wait_for(lambda: len(sink.odometry) > 10 and writer.get_matched_subscriptions())
@@ -180,7 +195,7 @@ def test_an_older_layout_of_vision_msgs_is_read(domain):
 
 def test_the_library_writes_nothing_to_the_terminal():
     """A session in a process of its own receives a malformed payload."""
-    domain = next(_DOMAINS)
+    domain = own_domain()
     listener = """
 import sys, time
 from objslam.live.dds.network import open_network
@@ -194,11 +209,14 @@ while network.unread["rt/odom"] < 20:
 """
     env = {name: value for name, value in os.environ.items() if name != "CYCLONEDDS_URI"}
     command = [sys.executable, "-c", listener, str(domain)]
-    process = subprocess.Popen(command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     network, numbers = open_network(domain), itertools.count(10)
     writer = DataWriter(network.participant, Topic(network.participant, "rt/odom", layouts_of("nav_msgs/msg/Odometry")[0]))
-    wait_for(writer.get_matched_subscriptions)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with (
+        running(command, env=env, text=True, **pipes) as process,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire,
+    ):
+        wait_for(writer.get_matched_subscriptions)
 
         def ended():
             packet = rtps_data(writer.get_guid().bytes, next(numbers), b"\0\1\0\0garbage!")
@@ -207,8 +225,8 @@ while network.unread["rt/odom"] < 20:
             return process.poll() is not None
 
         wait_for(ended)
-    assert process.communicate() == ("", "")
-    assert process.returncode == 0
+        assert process.communicate() == ("", "")
+        assert process.returncode == 0
 
 
 def test_a_type_that_nobody_knows_is_left_out_with_a_warning():

@@ -8,7 +8,6 @@ from driving import feed
 from test_mixed_paths import ORDERS, heard
 from test_mixed_paths import drive as hear
 from test_session import make_log
-from waiting import LIMIT
 
 from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
@@ -33,15 +32,6 @@ QUIET = Odometry(x_per_m=0.005, yaw_per_m=0.005, yaw_per_rad=0.01)
 def settings_of(*more):
     noise = ("odometry.x_per_m=0.005", "odometry.yaw_per_m=0.005", "odometry.yaw_per_rad=0.01")
     return load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "output.recording=false", *noise, *more))
-
-
-@pytest.fixture(autouse=True, scope="module")
-def patience():
-    """Snapshots are whole, and are waited for, however slow the machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("objslam.live.session.session._PATIENCE", LIMIT)
-        patch.setattr("objslam.live.session.snapshots._BUDGET", LIMIT)
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """objslam live as a user runs it: replayed, killed, resumed, interrupted."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -9,6 +8,8 @@ import sys
 import numpy as np
 import pytest
 import yaml
+from processes import running
+from quick import HELD, NOTHING_DRAWN, options
 from small_log import small_log
 from waiting import LIMIT, wait_for
 
@@ -25,7 +26,7 @@ from objslam.sources import read
 from objslam.sources.journal.reader import messages
 from objslam.sources.log_folder import write_log_folder
 
-QUIET = ["--set", "output.recording=false", "--set", "output.picture=false", "--set", "rays.pixel_sigma=2"]
+QUIET = options(*HELD, *NOTHING_DRAWN, "rays.pixel_sigma=2")
 
 
 @pytest.fixture(scope="module")
@@ -66,11 +67,9 @@ def test_killed_resumed_and_mapped_from_the_journal(objslam, log, tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
     done = objslam(*words(log, whole, "--speed", "0"))
     assert done.code == 0, done.err
-    process = subprocess.Popen(command(log, out, "--speed", "5", "--interval", "0.2"), stderr=subprocess.DEVNULL)
     file = out / "journal.objslam"
-    wait_for(lambda: file.exists() and file.stat().st_size > 30_000 and (out / "objects.json").exists())
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    with running(command(log, out, "--speed", "5", "--interval", "0.2"), stderr=subprocess.DEVNULL):
+        wait_for(lambda: file.exists() and file.stat().st_size > 30_000 and (out / "objects.json").exists())
     accepted = sum(1 for _ in messages(out, Ledger()))
     json.loads((out / "objects.json").read_text())  # whole, whenever it was killed
 
@@ -103,11 +102,11 @@ def test_a_session_in_the_map_of_another_day(objslam, log, tmp_path, objects, co
 
 def test_ctrl_c_ends_with_a_whole_result(log, tmp_path):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    process = subprocess.Popen(command(log, tmp_path / "out", "--speed", "5", "--no-journal"), **pipes)
     objects = tmp_path / "out" / "objects.json"
-    wait_for(lambda: objects.exists() and len(read_objects(objects)) > 0)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=LIMIT)
+    with running(command(log, tmp_path / "out", "--speed", "5", "--no-journal"), **pipes) as process:
+        wait_for(lambda: objects.exists() and len(read_objects(objects)) > 0)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=LIMIT)
     assert process.returncode == 0, err
     assert "Traceback" not in err
     assert "wrote" in out
@@ -122,12 +121,11 @@ def test_a_session_does_not_stand_beside_an_older_result(objslam, short, tmp_pat
     older = {f.name for f in out.iterdir()}
     (out / "mine.txt").touch()
     before = (out / "objects.json").stat().st_mtime_ns
-    process = subprocess.Popen(
-        command(short, out, "--speed", "0.5", "--interval", "0.1", "--no-journal"), stderr=subprocess.PIPE
-    )
-    wait_for(lambda: not (out / "summary.json").exists() and (out / "objects.json").stat().st_mtime_ns > before)
-    os.kill(process.pid, signal.SIGKILL)
-    _, told = process.communicate()
+    slow = command(short, out, "--speed", "0.5", "--interval", "0.1", "--no-journal")
+    with running(slow, stderr=subprocess.PIPE) as process:
+        wait_for(lambda: not (out / "summary.json").exists() and (out / "objects.json").stat().st_mtime_ns > before)
+        process.kill()
+        _, told = process.communicate(timeout=LIMIT)
     whole = {f.name for f in out.iterdir() if not f.name.startswith(".")}  # it may have been about to write another one
     assert whole == {"objects.json", "mine.txt"}
     assert all(name in told.decode() for name in older - {"objects.json"})
@@ -214,9 +212,8 @@ def test_a_start_killed_before_its_first_message_costs_no_journal(log, tmp_path,
     out = tmp_path / "out"
     kept = journal_in(out)
     file = out / "journal.objslam"
-    with subprocess.Popen(command("stdin", out), stdin=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+    with running(command("stdin", out), stdin=subprocess.PIPE, stderr=subprocess.DEVNULL):
         wait_for(lambda: (out / "journal.1.objslam").exists() and file.exists() and file.stat().st_size == 24)
-        process.kill()
     done = subprocess.run(command("stdin", out, *more), input="", capture_output=True, text=True, timeout=LIMIT)
     assert done.returncode == 1
     assert "the last session was killed before its first message" in done.stderr
@@ -228,7 +225,7 @@ def test_a_session_starts_from_a_calibration(objslam, log, tmp_path):
     found = Calibration(("odometry.scale", "front.yaw"), np.array([0.01, 0.02]), np.diag([1e-4, 4e-6]), np.full(2, 0.03))
     file = tmp_path / "robot.yaml"
     file.write_text(dump_calibration(found))
-    more = ("--speed", "0", "--no-journal", "--calibration", str(file))
+    more = ("--speed", "0", "--no-journal", "--calibration", str(file), "--set", "calibration.use=auto")
     done = objslam(*words(log, tmp_path / "out", *more))
     assert done.code == 0, done.err
     parameters = json.loads((tmp_path / "out" / "summary.json").read_text())["calibration"]["parameters"]
@@ -272,7 +269,7 @@ def test_what_a_source_cannot_be_and_what_an_option_cannot_do(objslam, log, tmp_
 
 def test_a_closed_standard_input_is_said(tmp_path):
     command = f"{sys.executable} -m objslam live stdin -o {tmp_path / 'out'} <&-"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=LIMIT, check=False)
     assert done.returncode == 1
     assert "standard input is closed" in done.stderr
     assert "internal error" not in done.stderr

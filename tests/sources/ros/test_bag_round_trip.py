@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from bag_writer import write_bag
 from drive_bag import rows_of, simulated
+from quick import HELD
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -66,7 +67,7 @@ def test_the_same_map_as_from_the_folder(tmp_path, makers, log, kind):
     maker = makers[vision]
     write_log_folder(log, tmp_path / "log")
     path = write_bag(tmp_path / "drive", storage, maker, rows_of(log, maker))
-    settings = load_settings(None, ("mode=fixed", "association.method=by_label", "triangulation.device=cpu"))
+    settings = load_settings(None, ("mode=fixed", "association.method=by_label", "triangulation.device=cpu", *HELD))
     maps = [
         pipeline.run(source, settings, Ledger()).map.objects
         for source in (read_log_folder(tmp_path / "log", Ledger()), read(path, Ledger()))
