@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 from commands import Call, call
+from quick import NOTHING_DRAWN, QUICK, options
 from small_log import small_log
 
 from objslam.sources.log_folder import write_log_folder
 
 Objslam = Callable[..., Call]
-LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
+LEAN = options(*NOTHING_DRAWN)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def run(log: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Call, Path
 
 
 def test_a_run_in_json_is_its_files(objslam: Objslam, log: Path, tmp_path: Path) -> None:
-    done = objslam("run", log, "-o", tmp_path / "out", "--json", *LEAN)
+    done = objslam("run", log, "-o", tmp_path / "out", "--json", *QUICK)
     assert done.code == 0, done.err
     told = json.loads(done.out)
     assert told["objects"] == json.loads((tmp_path / "out" / "objects.json").read_text())["objects"]
@@ -43,7 +44,7 @@ def test_a_run_in_json_is_its_files(objslam: Objslam, log: Path, tmp_path: Path)
 
 
 def test_a_quiet_run_prints_warnings_only(objslam: Objslam, log: Path, tmp_path: Path) -> None:
-    done = objslam("run", log, "-o", tmp_path / "out", "--quiet", *LEAN, "--set", "rays.border=100")
+    done = objslam("run", log, "-o", tmp_path / "out", "--quiet", *QUICK, "--set", "rays.border=100")
     assert (done.code, done.out) == (0, "")
     assert "warning: dropped" in done.err
     assert "camera left, stamp 1700000" in done.err
@@ -92,7 +93,7 @@ def test_images_behind_a_link_are_told_to_who_runs_a_detector(objslam: Objslam, 
 
 
 def test_a_quiet_session_prints_warnings_only(objslam: Objslam, log: Path, tmp_path: Path) -> None:
-    done = objslam("live", log, "-o", tmp_path / "out", "--speed", "0", "--quiet", *LEAN, "--set", "rays.border=100")
+    done = objslam("live", log, "-o", tmp_path / "out", "--speed", "0", "--quiet", *QUICK, "--set", "rays.border=100")
     assert (done.code, done.out) == (0, "")
     assert all(line.startswith("warning: ") for line in done.err.splitlines())
     assert "warning: dropped" in done.err

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from quick import QUICK
 
 from objslam import MapObject, ObjectMap
 from objslam.cli import main
@@ -56,7 +57,6 @@ def test_a_run_says_by_its_exit_code_whether_it_was_found_in_a_map(tmp_path, mon
     write_log_folder(replace(first, truth=None), tmp_path / "first")
     write_log_folder(moved_log(second, lift_se2(np.array([3.0, -2.0, 1.0]))), tmp_path / "second")
     write_log_folder(simulate(preset("demo", frames=200), 5), tmp_path / "elsewhere")  # Objects of the same labels.
-    quick = ["--set", "output.recording=false", "--set", "output.picture=false"]
 
     def objslam(*arguments):
         monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
@@ -64,12 +64,12 @@ def test_a_run_says_by_its_exit_code_whether_it_was_found_in_a_map(tmp_path, mon
             main()
         return ended.value.code, capsys.readouterr().out
 
-    assert objslam("run", tmp_path / "first", "-o", tmp_path / "map", *quick)[0] == 0
-    assert objslam("run", tmp_path / "elsewhere", "-o", tmp_path / "other", *quick)[0] == 0
+    assert objslam("run", tmp_path / "first", "-o", tmp_path / "map", *QUICK)[0] == 0
+    assert objslam("run", tmp_path / "elsewhere", "-o", tmp_path / "other", *QUICK)[0] == 0
     for known, code, words in ((tmp_path / "map", 0, "localised in"), (tmp_path / "other", 3, "not localised in")):
         before = (known / "objects.json").read_bytes()
         out = tmp_path / f"out{code}"
-        ended, said = objslam("run", tmp_path / "second", "-o", out, "--map", known, *quick)
+        ended, said = objslam("run", tmp_path / "second", "-o", out, "--map", known, *QUICK)
         assert ended == code
         told = json.loads((out / "summary.json").read_text())["localisation"]
         assert told["localised"] == (code == 0)

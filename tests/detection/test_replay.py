@@ -7,6 +7,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from quick import QUICK
 from tiny_models import COLOURS, scene, tiny_model
 from waiting import LIMIT
 
@@ -47,9 +48,8 @@ def recording(tmp_path):
 
 
 def live(recording, out, *more):
-    quiet = ("--set", "output.recording=false", "--set", "output.picture=false")
     return subprocess.run(
-        [sys.executable, "-m", "objslam", "live", str(recording), "-o", str(out), "--speed", "0", *quiet, *more],
+        [sys.executable, "-m", "objslam", "live", str(recording), "-o", str(out), "--speed", "0", *QUICK, *more],
         env={**os.environ, "XDG_CACHE_HOME": str(out.parent / "cache")},
         capture_output=True,
         text=True,

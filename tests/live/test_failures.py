@@ -9,6 +9,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from quick import HELD, NOTHING_DRAWN, options
+from waiting import LIMIT
 
 from objslam.cli import main
 from objslam.config import Odometry, load_settings
@@ -24,10 +26,9 @@ from objslam.simulation import preset, simulate
 from objslam.sources.journal import journal as journals
 from objslam.sources.log_folder import write_log_folder
 
-SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2"))
-QUIET = ["--set", "output.recording=false", "--set", "output.picture=false", "--set", "rays.pixel_sigma=2"]
+SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", *HELD))
+QUIET = options(*NOTHING_DRAWN, "rays.pixel_sigma=2")
 live_command = importlib.import_module("objslam.cli.live_command.command")
-PATIENCE = 60  # s until a wait counts as one for ever
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def ends(work):
     """Whether work comes to an end."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
-    thread.join(PATIENCE)
+    thread.join(LIMIT)
     return not thread.is_alive()
 
 
@@ -96,13 +97,13 @@ def test_what_waited_when_a_session_broke_is_counted(log, monkeypatch):
 
     def feed(self, message):
         begun.set()
-        assert go.wait(PATIENCE)
+        assert go.wait(LIMIT)
         raise RuntimeError("it broke")
 
     monkeypatch.setattr(Mapper, "feed", feed)
     session = Session(SETTINGS).start()
     assert session.push_camera(log.cameras[0].camera)
-    assert begun.wait(PATIENCE)
+    assert begun.wait(LIMIT)
     for i in range(5):
         assert session.push_odometry(float(i), np.eye(4))
     go.set()
@@ -259,7 +260,7 @@ def test_a_view_that_breaks_costs_no_map(folder, command, tmp_path, monkeypatch,
         def run(stop):
             source.run(stop)
             driven.set()
-            seen.wait(PATIENCE)
+            seen.wait(LIMIT)
 
         return make(SimpleNamespace(ledger=source.ledger, run=run), views=(view,))
 

@@ -3,6 +3,8 @@
 import threading
 
 import numpy as np
+from quick import HELD
+from waiting import LIMIT
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -14,8 +16,7 @@ from objslam.sources.journal import journal as journals
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import MountMessage
 
-SETTINGS = load_settings(None, ("mode=joint",))
-PATIENCE = 60  # s until a wait counts as one for ever
+SETTINGS = load_settings(None, ("mode=joint", *HELD))
 
 
 def journalled(file):
@@ -47,7 +48,7 @@ def test_what_comes_after_a_session_broke_is_not_journalled(tmp_path, monkeypatc
     monkeypatch.setattr(Mapper, "feed", feed)
     session = Session(SETTINGS, tmp_path / "journal.objslam").start()
     assert session.push_camera(make_camera("front"))
-    assert not session.wait(PATIENCE)
+    assert not session.wait(LIMIT)
     assert not session.push_odometry(0.0, np.eye(4))
     session.abort()
     assert not journalled(tmp_path / "journal.objslam")
@@ -72,7 +73,7 @@ def test_what_is_accepted_is_what_is_journalled_whoever_pushes(tmp_path, monkeyp
     threads = [threading.Thread(target=push, args=(number,), daemon=True) for number in range(4)]
     for thread in threads:
         thread.start()
-    assert enough.wait(PATIENCE)
+    assert enough.wait(LIMIT)
     session.abort()
     stopped.set()
     for thread in threads:

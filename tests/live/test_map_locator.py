@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from driving import feed
+from quick import HELD
 from waiting import LIMIT
 
 from objslam.config import Odometry, load_settings
@@ -19,13 +20,6 @@ from objslam.simulation import PoseNoise, preset, simulate
 
 UNKNOWN = lift_se2(np.array([3.0, -7.0, 2.0]))
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "output.recording=false"))
-
-
-@pytest.fixture(autouse=True)
-def patience(monkeypatch):
-    """Snapshots are whole, and are waited for, however slow the machine is."""
-    monkeypatch.setattr("objslam.live.session.session._PATIENCE", LIMIT)
-    monkeypatch.setattr("objslam.live.session.snapshots._BUDGET", LIMIT)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +48,8 @@ def another_day(first, localization=None):
     return moved_log(simulate(preset("demo", **changes, localization=localization), 102), UNKNOWN)
 
 
-def drive(log, known, **more):
-    return feed(Session(SETTINGS, patient=True, known=known, **more).start(), log)
+def drive(log, known, settings=SETTINGS):
+    return feed(Session(settings, patient=True, known=known).start(), log)
 
 
 def errors(found, log):
@@ -138,10 +132,11 @@ def test_a_killed_session_is_found_again_in_the_same_place(first, known, tmp_pat
 
 
 def test_another_place_leaves_the_session_in_its_own_frame(first):
-    settings = load_settings(None, ("mode=fixed", "output.recording=false"))
+    settings = load_settings(None, ("mode=fixed", *HELD))
     other = PriorMap("elsewhere", run(simulate(preset("demo", frames=200, classes=6, false=0.0), 5), settings, Ledger()).map)
     log = another_day(first)
-    session, alone = drive(log, other), drive(log, None)
+    held = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", *HELD))
+    session, alone = drive(log, other, held), drive(log, None, held)
     snapshot, without = session.snapshot(), alone.snapshot()
     assert snapshot.in_map.objects == 0
     assert snapshot.in_map.line.startswith("not localised in elsewhere yet")

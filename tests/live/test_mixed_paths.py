@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from quick import HELD, NOTHING_DRAWN, options
 from scipy.spatial.transform import Rotation
 from test_session import errors, make_log
 from waiting import LIMIT
@@ -18,7 +19,7 @@ from objslam.live.session.session import Session
 from objslam.results.read import load_map
 from objslam.simulation import PoseNoise
 
-SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "calibration.use=false"))
+SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", *HELD))
 """Shared errors are held, because the bounds below are for paths. test_live_calibration.py estimates them on such paths."""
 WHOLE, NEVER = ((0, 999),), ()
 FRAMES = (lift_se2(np.array([3.0, -2.0, 0.8])), lift_se2(np.array([-1.0, 4.0, -2.0])))
@@ -272,10 +273,9 @@ def test_the_command_ends_with_a_result_and_resumes(exact, tmp_path):
     }
     text = [json.dumps(one) for one in (camera, *sink.lines)]
     out, half = tmp_path / "out", len(text) // 2
-    held = ("rays.pixel_sigma=2", "calibration.use=false")  # as SETTINGS
-    quiet = ("output.recording=false", "output.picture=false", *held, "live.max_lag=1000")
+    quiet = (*NOTHING_DRAWN, *HELD, "rays.pixel_sigma=2", "live.max_lag=1000")
     command = [sys.executable, "-m", "objslam", "live", "stdin", "-o", str(out)]
-    command += [word for setting in quiet for word in ("--set", setting)]
+    command += options(*quiet)
     for more, part in (((), text[:half]), (("--resume",), text[half:])):
         done = subprocess.run([*command, *more], input="\n".join(part) + "\n", capture_output=True, text=True, timeout=LIMIT)
         assert done.returncode == 0, done.stderr

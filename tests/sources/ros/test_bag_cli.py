@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from bag_writer import write_bag
 from drive_bag import nanoseconds, rows_of, simulated
+from quick import QUICK
 
 from objslam.cli import main
 from objslam.core.diagnostics import Ledger
@@ -15,8 +16,6 @@ from objslam.core.geometry import lift_se2
 from objslam.io.camera_yaml import write_camera
 from objslam.results.read import load_map
 from objslam.sources.log_folder import read_log_folder
-
-LEAN = ("--set", "output.recording=false", "--set", "output.picture=false")
 
 
 @pytest.fixture
@@ -115,7 +114,7 @@ def test_a_calibration_file_and_a_base_frame_are_used(objslam, rows, makers, log
 def test_a_bag_runs_as_its_folder_does(objslam, bag, tmp_path):
     assert objslam("convert", bag, tmp_path / "log")[0] == 0
     for source, out in ((bag, "from_bag"), (tmp_path / "log", "from_folder")):
-        code, _, err = objslam("run", source, "-o", tmp_path / out, *LEAN)
+        code, _, err = objslam("run", source, "-o", tmp_path / out, *QUICK)
         assert code == 0, err
     one, other = (load_map(tmp_path / out).objects for out in ("from_bag", "from_folder"))
     assert len(one) == len(other) >= 3
