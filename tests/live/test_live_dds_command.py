@@ -7,6 +7,8 @@ import subprocess
 import sys
 
 import pytest
+from domains import own_domain
+from processes import running
 from robot import Drive, sent, start
 from typer.testing import CliRunner
 from waiting import LIMIT, wait_for
@@ -28,33 +30,22 @@ def heard(out):
 
 
 def test_a_drive_over_dds_becomes_a_result_folder(tmp_path):
-    domain = 10 + os.getpid() % 9
+    domain, out = own_domain(), tmp_path / "out"
     env = {name: value for name, value in os.environ.items() if name != "CYCLONEDDS_URI"}
-    command = [
-        sys.executable,
-        "-m",
-        "objslam",
-        "live",
-        "dds",
-        "--domain",
-        str(domain),
-        "-o",
-        str(tmp_path / "out"),
-        "--publish",
-    ]
+    command = [sys.executable, "-m", "objslam", "live", "dds", "--domain", str(domain), "-o", str(out), "--publish"]
     command += ["--set", "output.recording=false", "--set", "output.picture=false"]
-    live = subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    said = sent(start(Drive(domain, seconds=2.0, bad=2)))
-    wait_for(lambda: heard(tmp_path / "out") == {kind: len(stamps) for kind, stamps in said.items()})
-    live.send_signal(signal.SIGINT)
-    out, err = live.communicate(timeout=LIMIT)
+    with running(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as live:
+        said = sent(start(Drive(domain, seconds=2.0, bad=2)))
+        wait_for(lambda: heard(out) == {kind: len(stamps) for kind, stamps in said.items()})
+        live.send_signal(signal.SIGINT)
+        printed, err = live.communicate(timeout=LIMIT)
     assert live.returncode == 0, err
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = json.loads((out / "summary.json").read_text())
     assert summary["live"]["odometry"] == len(said["odometry"])
     assert summary["live"]["frames"] == len(said["detections"])
     assert summary["live"]["localization"] == 1
     assert summary["dropped"]["message that cannot be decoded"] == 2
-    assert "wrote" in out
+    assert "wrote" in printed
 
 
 @pytest.mark.parametrize(
