@@ -8,7 +8,7 @@ import pytest
 import yaml
 from typer.main import get_command
 
-from objslam.cli import app
+from objslam.cli.commands import build_app
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "fleet"
 FILES = sorted(FOLDER.iterdir())
@@ -16,7 +16,7 @@ FILES = sorted(FOLDER.iterdir())
 
 def options():
     """The options of `objslam fleet`."""
-    return {flag for one in get_command(app).commands["fleet"].params for flag in one.opts}
+    return {flag for one in get_command(build_app()).commands["fleet"].params for flag in one.opts}
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)

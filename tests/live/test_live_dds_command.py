@@ -15,7 +15,7 @@ from waiting import LIMIT, wait_for
 
 pytest.importorskip("cyclonedds")
 
-from objslam.cli import app
+from objslam.cli.commands import build_app
 from objslam.core.diagnostics import Ledger
 from objslam.errors import ObjslamError
 from objslam.sources.journal.reader import messages
@@ -59,7 +59,7 @@ def test_a_drive_over_dds_becomes_a_result_folder(tmp_path):
 )
 def test_a_source_that_cannot_be_is_one_error_and_hinders_no_second_try(tmp_path, options, code, words):
     for _ in range(2):
-        error = CliRunner().invoke(app, ["live", *options, "-o", str(tmp_path / "out")]).exception
+        error = CliRunner().invoke(build_app(), ["live", *options, "-o", str(tmp_path / "out")]).exception
         assert isinstance(error, ObjslamError)
         assert error.exit_code == code
         assert words in str(error)
