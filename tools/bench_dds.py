@@ -6,7 +6,8 @@ python tools/bench_dds.py --beside none malformed flood-tf ...      # beside pub
 A robot in another process sends 200 odometry messages and 20 Detection2DArray of 5 boxes per second. The delay `accepted`
 begins just before a message is written, and ends when its push is accepted. The bare reader runs at the same time in a third
 process, on the same topics. Its delay ends when it has the bytes, which it does not decode. --beside runs once for each kind
-of hostile publisher (tools/live_parts/hostile.py), and prints a table. MB is what the process of the session grew by.
+of hostile publisher (tools/live_parts/hostile.py), and prints a table. MB is what the process of the session grew by,
+and CPU the share of a core that it took. A process that gets less than it needs, on a busy computer, loses messages.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def main() -> None:
 
 def beside(options: argparse.Namespace) -> None:
     """Run this tool beside each kind of hostile publisher, and print a row of its results for each."""
-    print(f"{'beside':16}{'sent':>8}  topic        lost of      p50 ms  p99 ms   bare: lost  p50 ms  p99 ms      MB")
+    print(f"{'beside':16}{'sent':>8}  topic        lost of      p50 ms  p99 ms   bare: lost  p50 ms  p99 ms      MB  CPU %")
     for number, kind in enumerate(options.beside):
         domain = options.domain + number
         command = [sys.executable, str(Path(hostile.__file__)), kind, str(domain)]
@@ -76,8 +77,9 @@ def beside(options: argparse.Namespace) -> None:
         sent = other.communicate()[0].strip() if other is not None else ""
         for topic, row in found["topics"].items():
             (lost, *own), (bare, *others) = row["accepted"], row["bare reader"]
-            times = f"{own[0]:9.1f}{own[1]:9.1f}{bare:12d}{others[0]:9.1f}{others[1]:9.1f}{found['megabytes']:8.1f}"
-            print(f"{kind:16}{sent:>8}  {topic:11}{lost:6d} of {row['sent']:<5d}{times}", flush=True)
+            times = f"{own[0]:9.1f}{own[1]:9.1f}{bare:12d}{others[0]:9.1f}{others[1]:9.1f}"
+            taken = f"{found['megabytes']:8.1f}{found['cpu']:7.0f}"
+            print(f"{kind:16}{sent:>8}  {topic:11}{lost:6d} of {row['sent']:<5d}{times}{taken}", flush=True)
         for line in found["lines"]:
             print(f"    {line}", flush=True)
 
@@ -94,7 +96,7 @@ def compare(options: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as folder:
         sink, before = Timed(session(Path(folder)) if options.sink == "session" else None), resident()
         adapter = DdsAdapter(open_network(options.domain), RosMessages(sink), TopicChoice())
-        stop = threading.Event()
+        stop, begin = threading.Event(), (time.process_time(), time.monotonic())
         thread = threading.Thread(target=adapter.run, args=(stop,))
         thread.start()
         bare, robot = start(options, "bare"), start(options, "robot")
@@ -103,6 +105,7 @@ def compare(options: argparse.Namespace) -> None:
         stop.set()
         thread.join()
         heard = json.loads(bare.communicate("\n")[0])
+        cpu = 100 * (time.process_time() - begin[0]) / (time.monotonic() - begin[1])
         grown, told = resident() - before, ""
         if sink.session is not None:
             snapshot = sink.session.snapshot()
@@ -112,7 +115,7 @@ def compare(options: argparse.Namespace) -> None:
             sink.session.abort()
     topics = {kind: summary(stamps, sink.times[kind], heard[kind]) for kind, stamps in sent.items()}
     if options.as_json:
-        print(json.dumps({"topics": topics, "megabytes": grown, "lines": [told, *adapter.ledger.lines()]}))
+        print(json.dumps({"topics": topics, "megabytes": grown, "cpu": cpu, "lines": [told, *adapter.ledger.lines()]}))
         return
     print(told)
     for kind, row in topics.items():
