@@ -40,8 +40,9 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
 from objslam.errors import ConfigError, ObjslamError
-from objslam.live.adapters.dds import DdsAdapter, _Publication
+from objslam.live.adapters.dds import DdsAdapter
 from objslam.live.dds.network import open_network
+from objslam.live.dds.publications import Publication
 from objslam.live.dds.types import dds_topic, dds_type, layouts_of, ros_topic, ros_type
 from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import TopicChoice
@@ -231,7 +232,7 @@ while network.unread["rt/odom"] < 20:
 
 def test_a_type_that_nobody_knows_is_left_out_with_a_warning():
     adapter = DdsAdapter(None, RosMessages(Recorder()), TopicChoice())
-    adapter._publications[1] = _Publication("/tags", "my_apriltag/msg/TagArray", (True, False), None)
+    adapter._publications.add(1, Publication("/tags", "my_apriltag/msg/TagArray", (True, False), None))
     assert adapter._open(0.0) == []
     assert adapter.ledger.warnings == [
         "/tags: left out, because its type my_apriltag/msg/TagArray is unknown and DDS sends no definitions"

@@ -19,6 +19,7 @@ from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.live.adapters.dds import DdsAdapter
 from objslam.live.counters import Counters
+from objslam.live.dds.publications import MOST, Publication, Publications
 from objslam.live.dds.types import dds_type
 from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import TopicChoice
@@ -28,8 +29,9 @@ from objslam.live.session.session import Session
 from objslam.ros.bag.records import Connection
 from objslam.ros.message_limits import check_size
 from objslam.ros.messages.decode import DecodeError, make_decoder
-from objslam.ros.messages.topic_types import DETECTIONS, ODOMETRY
+from objslam.ros.messages.topic_types import DETECTIONS, ODOMETRY, TRANSFORMS
 from objslam.simulation import make_camera
+from objslam.sources.ros_bag.options import RosOptions
 
 SETTINGS = load_settings(None, ("mode=joint",))
 S = 10**9
@@ -153,8 +155,46 @@ def test_topics_without_end_cost_a_bounded_memory():
         rounds += 1
     assert rounds >= 30  # Between two of them, messages are taken.
     assert len(adapter._publications) == 1000
-    assert adapter.choice.wanted({p.topic: p.type for p in adapter._publications.values()}, messages, True) == {"/odom"}
-    assert adapter.ledger.dropped == {"publisher beyond the first 1000": 9001}
+    wanted = adapter.choice.wanted({p.topic: p.type for p in adapter._publications}, messages, True)
+    assert {topic for topic in wanted if not topic.startswith("/tags")} == {"/odom"}
+    assert adapter.ledger.dropped == {"publisher beyond the 1000 that are kept": 9001}
+
+
+def test_made_up_topics_do_not_crowd_out_a_robot_that_comes_later():
+    """Of the type that is made up, and of others; and a topic that the user named, whatever its name is."""
+    robot = [
+        ("/odom", ODOMETRY),
+        ("/tf", TRANSFORMS[0]),
+        ("/front/detections", DETECTIONS),
+        ("/a/very/long/name", ODOMETRY),
+    ]
+    odometry = [(f"/made/up{i}", ODOMETRY) for i in range(5_000)]
+    tags = [(f"/made/up{i}", f"apriltag{i}/msg/TagArray") for i in range(5_000)]
+    for made_up, named in ((odometry, False), (odometry, True), (tags, False)):
+        messages = RosMessages(Recorder(), RosOptions(topics=("odometry=/a/very/long/name",) * named))
+        network = SimpleNamespace(participant=SimpleNamespace(guid="this session"))
+        adapter, found = DdsAdapter(network, messages, TopicChoice(messages.chosen)), Discovery(made_up + robot)
+        while found.samples:
+            adapter._look_around(found)
+        assert len(adapter._publications) == 1000
+        wanted = adapter.choice.wanted({p.topic: p.type for p in adapter._publications}, messages, True)
+        real = {topic for topic in wanted if made_up is odometry or not topic.startswith("/made")}
+        assert real == {"/tf", "/front/detections", "/a/very/long/name" if named else "/odom"}
+        assert adapter.ledger.dropped == {"publisher beyond the 1000 that are kept": 4004}
+
+
+def test_publishers_that_are_kept_never_give_way():
+    kept = Publications(lambda: {f"/read{i}" for i in range(MOST)})
+    for i in range(MOST):
+        assert kept.add(i, Publication(f"/read{i}", ODOMETRY, (True, False), None)) is None
+    new = Publication("/a", DETECTIONS, (True, False), None)
+    assert kept.add(MOST, new) is new
+    gone = kept.remove(0)
+    assert gone is not None
+    assert kept.add(MOST, new) is None
+    assert kept.get(MOST) is new
+    assert kept.add(MOST, new) is None  # DDS tells of a publisher again when its QoS changes.
+    assert len(kept) == MOST
 
 
 def test_warnings_without_end_are_counted():

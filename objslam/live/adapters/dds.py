@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from objslam.live.dds.network import AUTO, LOOPBACK, Network, receive_buffer
+from objslam.live.dds.publications import MOST, Kind, Publication, Publications
 from objslam.live.dds.types import dds_topic, layouts_of, ros_topic, ros_type
 from objslam.live.ros.message_handler import RosMessages
 from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
@@ -19,20 +20,7 @@ _TAKE = 50
 """The most messages that are taken from one reader before the next reader's turn. With a larger number, a flood of one topic
 delays the other topics more, and each message costs a little less."""
 _MAX_READERS = 256  # The most open readers. A larger number costs memory.
-_MAX_PUBLICATIONS = 1000
-"""The most publishers of types that objslam reads. With a larger number, many made-up publishers slow down the choice of
-topics more."""
 _MIN_BUFFER = 2 << 20  # The socket buffer, bytes, below which raw images cause a warning. A larger value warns more often.
-_Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether old messages are kept (transient-local).
-
-
-@dataclass
-class _Publication:
-    topic: str
-    type: str
-    kind: _Kind
-    type_id: Any
-    own: bool = False  # Whether this session is the publisher.
 
 
 @dataclass
@@ -42,7 +30,7 @@ class _Reader:
     since: when the reader was made, s, by `time.monotonic`. lost: the number of lost messages that are already counted.
     """
 
-    of: _Publication
+    of: Publication
     entity: Any
     decode: Any
     since: float
@@ -61,13 +49,14 @@ class DdsAdapter:
     network: Network
     messages: RosMessages
     choice: TopicChoice
-    _publications: dict[int, _Publication] = field(default_factory=dict)
-    _readers: dict[tuple[str, _Kind], _Reader] = field(default_factory=dict)
+    _publications: Publications = field(init=False)
+    _readers: dict[tuple[str, Kind], _Reader] = field(default_factory=dict)
     _topics: dict[str, Any] = field(default_factory=dict)
     _unread: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.ledger = self.messages.ledger
+        self._publications = Publications(self._kept)
 
     def run(self, stop: threading.Event) -> None:
         """Push messages until `stop` is set."""
@@ -102,26 +91,29 @@ class DdsAdapter:
             for sample in samples:
                 handle = sample.sample_info.instance_handle
                 if sample.sample_info.instance_state != InstanceState.Alive or not sample.sample_info.valid_data:
-                    self._publications.pop(handle, None)
+                    self._publications.remove(handle)
                     continue
                 topic, type_ = ros_topic(sample.topic_name), ros_type(sample.type_name)
                 if topic is None or type_ is None or not is_read(type_):
                     continue
-                if handle not in self._publications and len(self._publications) >= _MAX_PUBLICATIONS:
-                    self.messages.refuse(f"publisher beyond the first {_MAX_PUBLICATIONS}", topic)
-                    continue
                 own = sample.participant_key == self.network.participant.guid
                 kind = _kind(sample.qos, type_)
-                self._publications[handle] = _Publication(plain(topic), type_, kind, sample.type_id, own)
+                out = self._publications.add(handle, Publication(plain(topic), type_, kind, sample.type_id, own))
+                if out is not None:
+                    self.messages.refuse(f"publisher beyond the {MOST} that are kept", out.topic)
             if len(samples) < _TAKE:
                 return
 
+    def _kept(self) -> set[str]:
+        """Return the topics that are read, and those that the user chose."""
+        return {topic for topic, _ in self._readers}.union(*self.choice.chosen.names.values())
+
     def _open(self, age: float) -> list[_Reader]:
         """Open readers for the wanted topics that have none, and return them. age: the time since the start, s."""
-        offered = {publication.topic: publication.type for publication in self._publications.values()}
+        offered = {publication.topic: publication.type for publication in self._publications}
         wanted = self.choice.wanted(offered, self.messages, settled=age >= HEAD_START)
         opened = []
-        for publication in list(self._publications.values()):
+        for publication in self._publications:
             key = publication.topic, publication.kind
             fits = publication.topic in wanted and publication.type == offered[publication.topic]
             if fits and key not in self._readers and len(self._readers) < _MAX_READERS:
@@ -133,7 +125,7 @@ class DdsAdapter:
         self._readers = dict(sorted(self._readers.items(), key=lambda item: order.get(item[1].of.type, len(order))))
         return opened
 
-    def _make_reader(self, publication: _Publication) -> _Reader | None:
+    def _make_reader(self, publication: Publication) -> _Reader | None:
         from cyclonedds.core import DDSException, Policy, Qos
         from cyclonedds.sub import DataReader
         from cyclonedds.topic import Topic
@@ -185,7 +177,7 @@ class DdsAdapter:
         Two readers may receive one message, because a best-effort reader receives from reliable publishers too. If the
         publisher is unknown, the reader with the strictest QoS pushes the message.
         """
-        if handle not in self._publications:
+        if self._publications.get(handle) is None:
             self._look_around(found)
         publication = self._publications.get(handle)
         if publication is not None:
@@ -212,7 +204,7 @@ class DdsAdapter:
             self.ledger.warn(f"no publisher of odometry, tf or detections on {where}")
         for reader in self._readers.values():
             # The session's own tf is no publisher that a reader could be matched with.
-            others = (p for p in self._publications.values() if not p.own)
+            others = (p for p in self._publications if not p.own)
             present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in others)
             if not reader.warned and present and now - reader.since > _LONELY:
                 reader.warned = True
@@ -222,7 +214,7 @@ class DdsAdapter:
                     )
 
 
-def _kind(qos: Any, type_: str) -> _Kind:
+def _kind(qos: Any, type_: str) -> Kind:
     from cyclonedds.core import Policy
 
     reliable = isinstance(qos[Policy.Reliability], Policy.Reliability.Reliable) if Policy.Reliability in qos else False

@@ -1,0 +1,102 @@
+"""The publishers that the discovery of DDS found, as many as a session keeps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from objslam.ros.messages.topic_types import is_tags
+
+MOST = 1000
+"""The most publishers that are kept. With a larger number, many made-up publishers slow down the choice of topics more."""
+Kind = tuple[bool, bool]
+"""A QoS: whether it is reliable, and whether old messages are kept (transient-local)."""
+
+
+@dataclass
+class Publication:
+    """A publisher. type_id: of its type, None if it declares none. own: whether this session is the publisher."""
+
+    topic: str
+    type: str
+    kind: Kind
+    type_id: Any
+    own: bool = False
+
+
+class Publications:
+    """The publishers by handle, at most `MOST`.
+
+    Beyond that, nobody can crowd out the others. A type with many publishers gives way to a type with fewer. Within a type,
+    a longer name of a topic gives way to a shorter one, because that is how `TopicChoice` chooses. All types of tags count
+    as one, because anybody can make up more of them.
+    """
+
+    def __init__(self, kept: Callable[[], Collection[str]]) -> None:
+        """kept: returns the topics that never give way, such as those that the user chose."""
+        self._kept, self._found = kept, dict[int, Publication]()
+        self._count: Counter[str] = Counter()
+        self._longest: dict[str, int] = {}  # The handle that gives way first, by group. It is searched when it is needed.
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def __iter__(self) -> Iterator[Publication]:
+        return iter(list(self._found.values()))
+
+    def get(self, handle: int) -> Publication | None:
+        """Return the publisher with a handle, None if it is not kept."""
+        return self._found.get(handle)
+
+    def remove(self, handle: int) -> Publication | None:
+        """Forget a publisher, and return it. None if it is not kept."""
+        gone = self._found.pop(handle, None)
+        if gone is not None:
+            self._count[_group(gone)] -= 1
+            if not self._count[_group(gone)]:
+                del self._count[_group(gone)]
+            self._longest.pop(_group(gone), None)
+        return gone
+
+    def add(self, handle: int, new: Publication) -> Publication | None:
+        """Keep a publisher. Returns the publisher that gives way, which may be the new one, or None if there is room."""
+        out = self.remove(handle)
+        if out is None and len(self) >= MOST:
+            worst = self._gives_way(new)
+            if worst is None:
+                return new
+            out = self.remove(worst)
+        else:
+            out = None
+        self._found[handle] = new
+        self._count[_group(new)] += 1
+        longest = self._longest.get(_group(new))
+        if longest is not None and _rank(new) > _rank(self._found[longest]):
+            del self._longest[_group(new)]
+        return out
+
+    def _gives_way(self, new: Publication) -> int | None:
+        """Return the handle of the publisher that gives way to a new one, None if there is none."""
+        kept = self._kept()
+        chosen = new.topic in kept
+        crowd, most = self._count.most_common(1)[0]
+        other = chosen or self._count[_group(new)] + 1 < most
+        group = crowd if other else _group(new)
+        handle = self._longest.get(group)
+        if handle is None or self._found[handle].topic in kept:
+            mine = (h for h, p in self._found.items() if _group(p) == group and p.topic not in kept)
+            handle = max(mine, key=lambda h: _rank(self._found[h]), default=None)
+            if handle is None:
+                return None
+            self._longest[group] = handle
+        return handle if other or _rank(new) < _rank(self._found[handle]) else None
+
+
+def _group(publication: Publication) -> str:
+    return "tags" if is_tags(publication.type) else publication.type
+
+
+def _rank(publication: Publication) -> tuple[int, str]:
+    return len(publication.topic), publication.topic
