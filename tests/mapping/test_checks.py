@@ -151,6 +151,13 @@ def test_stamps_of_another_clock_that_begins_at_zero_have_their_unit_too():
         findings(with_frame_stamps(log, lambda stamps: 1e3 * (stamps - start)), "fixed")
 
 
+def test_frames_with_dates_and_poses_from_zero_have_different_clocks():
+    """Divided by 1e9, a date in s lies in the time of the poses too. But then all frames would come at once."""
+    log = retimed(drive("fixed"), 1.0, 0.0)
+    found = findings(with_frame_stamps(log, lambda stamps: stamps + 1.7e9), "fixed")
+    assert [one.name for one in found if "stamps" in one.name] == ["stamps apart"]
+
+
 def retimed(log: Log, factor: float, begin: float) -> Log:
     """The log with its first pose at the stamp `begin`, s, and all stamps multiplied by `factor`."""
     start = log.robot_path.stamps[0]

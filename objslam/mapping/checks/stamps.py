@@ -20,6 +20,10 @@ _CRAWL = 0.01
 """If a robot is slower than this, m/s, all along its path, its stamps are probably not in s. Even a lawn mower is 30 times
 as fast. A larger value accuses more robots that hardly drive."""
 
+_FASTEST = 1e-4
+"""The least median time (s) between two poses, or between two frames of a camera. Stamps in s, divided as if they were in
+another unit, come closer together. A larger value finds fewer wrong units."""
+
 
 def check_stamps(log: Log) -> Finding | None:
     """Return a finding if the stamps of a log are not in s, or if its frames were taken at other times than its poses."""
@@ -41,7 +45,8 @@ def check_stamps(log: Log) -> Finding | None:
         return None if common is None else Finding("stamps unit", said)
     for factor, unit in _UNITS.items():
         for by, who in ((factor, "frames"), (1 / factor, "poses")):
-            if share(by) > max(_OVERLAP, 2 * here):
+            steps = [np.median(np.diff(s)) for s in (stamps if who == "frames" else [path.stamps]) if len(s) > 1]
+            if share(by) > max(_OVERLAP, 2 * here) and all(step > factor * _FASTEST for step in steps):
                 return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
     length, whole = float(np.ptp(frames)), float(np.ptp(path.stamps))
     for factor, unit in _UNITS.items():
