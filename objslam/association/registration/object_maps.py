@@ -44,6 +44,7 @@ def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, st
     if not len(found.matches):
         return "too little evidence, because no two objects have the same offset in both maps"
     odds = f"{len(found.matches)} objects match, log odds {found.log_odds:.1f}, lead {found.lead:.1f}"
-    return {"accepted": odds, "ambiguous": f"ambiguous, because another place fits as well ({odds})"}.get(
-        found.verdict, f"too little evidence ({odds}, and {MIN_LOG_ODDS:.1f} are needed)"
-    )
+    if found.verdict == "ambiguous":
+        return f"ambiguous, because another place fits as well ({odds})"
+    needed = f"{MIN_LOG_ODDS:.1f} are needed, as five or six objects usually give"
+    return odds if found.accepted else f"too little evidence ({odds}, and {needed})"
