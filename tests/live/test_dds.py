@@ -212,6 +212,32 @@ while network.unread["rt/odom"] < 20:
     assert process.returncode == 0
 
 
+def test_the_log_of_the_library_cannot_hold_up_the_end_of_a_process():
+    """At the exit, a pipe that nobody reads is closed: what is written into it fails, and does not wait."""
+    ending = """
+import atexit, os, sys
+from objslam.live.dds.network import open_network
+
+def fill():  # Called after what open_network registered.
+    pipes = [n for n in map(int, os.listdir("/dev/fd")) if n > 2 and os.path.exists(f"/proc/self/fdinfo/{n}")
+             and os.readlink(f"/proc/self/fd/{n}").startswith("pipe:")
+             and int(open(f"/proc/self/fdinfo/{n}").read().split()[3], 8) & 3]
+    for pipe in pipes:
+        try:
+            for _ in range(100):
+                os.write(pipe, bytes(1 << 16))
+        except BrokenPipeError:
+            print("closed")
+
+atexit.register(fill)
+open_network(int(sys.argv[1]))
+"""
+    env = {name: value for name, value in os.environ.items() if name != "CYCLONEDDS_URI"}
+    command = [sys.executable, "-c", ending, str(next(_DOMAINS))]
+    done = subprocess.run(command, env=env, text=True, capture_output=True, timeout=LIMIT, check=True)
+    assert (done.stdout, done.stderr) == ("closed\n", "")
+
+
 def test_a_type_that_nobody_knows_is_left_out_with_a_warning():
     adapter = DdsAdapter(None, RosMessages(Recorder()), TopicChoice())
     adapter._publications.add(1, Publication("/tags", "my_apriltag/msg/TagArray", (True, False), None))

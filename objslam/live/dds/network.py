@@ -1,5 +1,6 @@
 """Joins DDS domains on a chosen network, and counts the payloads that the DDS library rejects."""
 
+import atexit
 import ctypes
 import ipaddress
 import os
@@ -11,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from objslam.errors import ConfigError, ObjslamError
 from objslam.io.threads import start_thread
@@ -96,7 +97,9 @@ def _join(domain: int, interface: str | None) -> Network:
     finally:
         os.close(writing)
     network = Network(domain, where, participant, (entity,))
-    start_thread(threading.Thread(target=_listen, args=(reading, network.unread), name="dds-log", daemon=True))
+    log = os.fdopen(reading, errors="replace")
+    start_thread(threading.Thread(target=_listen, args=(log, network.unread), name="dds-log", daemon=True))
+    atexit.register(_stop_listening, log)
     return network
 
 
@@ -174,14 +177,26 @@ def _keep_inside(sockets: set[int]) -> None:
                     ) from error
 
 
-def _listen(reading: int, unread: Counter[str]) -> None:
-    """Count the payloads that the library rejects, from its log. reading: the file descriptor of a pipe with this log."""
-    with os.fdopen(reading, errors="replace") as lines:
-        for line in lines:
+def _listen(log: TextIO, unread: Counter[str]) -> None:
+    """Count the payloads that the library rejects, from its log. log: the reading end of a pipe with this log."""
+    with log:
+        for line in log:
             if match := _FAILED.search(line):
                 unread[match[1].rpartition("/")[0]] += 1  # The text is topic/type, and only the topic counts.
             elif _MALFORMED.search(line):
                 unread[""] += 1
+
+
+def _stop_listening(log: TextIO) -> None:
+    """Close the pipe of the log for reading, so that the library cannot wait for a reader of a full pipe.
+
+    At its exit, Python first ends the thread of `_listen`, and then the library. Beside a flood of malformed packets, the
+    library filled the pipe between the two, and the process never ended.
+    """
+    if not log.closed:
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(nothing, log.fileno())  # Atomic, so the thread cannot read from another file with the same descriptor.
+        os.close(nothing)
 
 
 def receive_buffer() -> int | None:
