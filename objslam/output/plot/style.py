@@ -90,13 +90,15 @@ def _slots(labels: Sequence[str]) -> dict[str, float]:
     in the alphabet takes another one.
     """
     slots: dict[str, float] = {}
-    for name in sorted(set(labels)):
-        first, taken = crc32(name.encode()) % _HUES, set(slots.values())
-        turn = 0  # After each turn through all hues, the next one takes the middle between them, then the quarters, ...
-        while all((first + _NEXT * i) % _HUES + _between(turn) in taken for i in range(_HUES)):
-            turn += 1
-        free = ((first + _NEXT * i) % _HUES + _between(turn) for i in range(_HUES))
-        slots[name] = next(slot for slot in free if slot not in taken)
+    taken: set[int] = set()
+    for number, name in enumerate(sorted(set(labels))):
+        if number % _HUES == 0:  # All hues are taken. The next labels lie between them: in the middle, then at the quarters.
+            taken.clear()
+        slot = crc32(name.encode(errors="surrogatepass")) % _HUES
+        while slot in taken:
+            slot = (slot + _NEXT) % _HUES
+        taken.add(slot)
+        slots[name] = slot + _between(number // _HUES)
     return slots
 
 
