@@ -18,7 +18,7 @@ import pytest
 import yaml
 from commands import Call, call
 from processes import running
-from quick import HELD, NOTHING_DRAWN, QUICK, options
+from quick import HELD, NOTHING_DRAWN, QUICK, ROUGH, options
 from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
@@ -837,14 +837,14 @@ def test_calibrate_and_run_with_what_it_found(objslam, tmp_path):
         log = simulate(preset("demo", classes=12, frames=200, localization=None, odometry=Odometry()), seed)
         write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / f"log{seed}")
         drives.append(str(tmp_path / f"log{seed}"))
-    file = tmp_path / "robot.yaml"
-    done = objslam("calibrate", *drives, "-o", str(file), "--set", "association.method=by_label")
+    file, fast = tmp_path / "robot.yaml", options(*ROUGH, *NOTHING_DRAWN, "association.method=by_label")
+    done = objslam("calibrate", *drives, "-o", str(file), *fast)
     assert done.code == 0, done.err
     assert "from 2 logs" in done.out
     found = load_calibration(file)
     clock = found.names.index("front.clock")
     assert abs(found.values[clock] - 0.15) < 4 * found.sigma[clock]
-    done = objslam("run", drives[0], "--mode", "joint", "--calibration", str(file), "-o", str(tmp_path / "out"))
+    done = objslam("run", drives[0], "--mode", "joint", "--calibration", str(file), "-o", str(tmp_path / "out"), *fast)
     assert done.code == 0, done.err
     parameters = json.loads((tmp_path / "out" / "summary.json").read_text())["calibration"]["parameters"]
     assert parameters["front.clock"]["prior_sigma"] == pytest.approx(found.sigma[clock], rel=1e-6)
@@ -942,7 +942,7 @@ def test_calibrate_without_odometry_says_what_it_needs(objslam, tmp_path):
 def test_calibrate_at_known_poses_and_run_with_what_it_found(objslam, tmp_path):
     log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
     write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / "log")
-    file, fast = tmp_path / "robot.yaml", ("--set", "association.method=by_label")
+    file, fast = tmp_path / "robot.yaml", options(*ROUGH, *NOTHING_DRAWN, "association.method=by_label")
     done = objslam("calibrate", str(tmp_path / "log"), "--mode", "fixed", "-o", str(file), *fast)
     assert done.code == 0, done.err
     found = load_calibration(file)
