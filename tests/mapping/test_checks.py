@@ -419,7 +419,9 @@ def test_a_clean_map_is_as_it_is_without_the_checks():
         np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
-@pytest.mark.parametrize("name", ["camera yaw +3 deg", "camera 0.2 m aside", "clock +0.2 s"])
+@pytest.mark.parametrize(
+    "name", ["camera yaw +3 deg", "camera 0.2 m aside", "clock +0.2 s", "focal +10 %", "image centre +20 px"]
+)
 def test_small_errors_widen_the_covariances_to_the_true_errors(name, monkeypatch):
     log = MISTAKES[name](drive("fixed"))
     place = {item.label: item.position for item in log.truth.objects}
