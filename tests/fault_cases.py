@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 
 from faults import Fault, Outcome, command, tree
+from quick import QUICK
 from small_log import small_log
 
 from objslam.core.diagnostics import Ledger
@@ -28,16 +29,6 @@ from objslam.sources.journal.records import encode
 from objslam.sources.journal.segments import NAME, is_journal
 from objslam.sources.log_folder import write_log_folder
 
-LEAN = (
-    "--set",
-    "output.recording=false",
-    "--set",
-    "output.picture=false",
-    "--set",
-    "live.calibrate_from=0",
-    "--set",
-    "calibration.use=false",
-)
 UNEQUAL = (SUMMARY, "report.html")
 """Files that hold times of day or durations, so that two equal runs differ in them."""
 
@@ -251,9 +242,9 @@ def make_cases(place: Path, names: Collection[str] = (), *, frames: int = 20) ->
     made = [small_log(seed, frames=frames) for seed in (0, 1)]
     for log, folder in zip(made, logs, strict=True):
         write_log_folder(log, folder)
-    run = ("run", str(logs[0]), "-o", "{}/out", *LEAN)
-    live = ("live", str(logs[0]), "-o", "{}/out", "--speed", "0", "--interval", "0.1", *LEAN)
-    stdin = ("live", "stdin", "-o", "{}/out", "--interval", "0.1", *LEAN)
+    run = ("run", str(logs[0]), "-o", "{}/out", *QUICK)
+    live = ("live", str(logs[0]), "-o", "{}/out", "--speed", "0", "--interval", "0.1", *QUICK)
+    stdin = ("live", "stdin", "-o", "{}/out", "--interval", "0.1", *QUICK)
     convert = ("convert", str(logs[0]), "{}/log")
 
     @cache

@@ -43,12 +43,12 @@ def test_each_comes_with_the_package_and_is_taken_by_its_name(tmp_path: Path, mo
 
 @pytest.fixture(scope="module")
 def drive() -> Log:
-    return simulate(preset("demo"), 0)
+    return simulate(preset("demo", frames=250), 0)
 
 
 @pytest.fixture(scope="module")
 def drive_with_depth() -> Log:
-    return simulate(preset("demo", depth=DepthNoise()), 0)
+    return simulate(preset("demo", frames=250, depth=DepthNoise()), 0)
 
 
 def settings(name: str, *overrides: str) -> Settings:
@@ -93,7 +93,7 @@ def test_each_says_what_it_is_for_and_how_it_is_run(name: str) -> None:
 @pytest.fixture(scope="module")
 def drive_among_tags() -> Log:
     """Every object has a label of its own."""
-    return simulate(preset("demo", classes=12), 0)
+    return simulate(preset("demo", frames=250, classes=12), 0)
 
 
 @pytest.mark.parametrize("name", NAMES)

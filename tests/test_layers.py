@@ -99,16 +99,21 @@ def upward(edges: Edges) -> list[str]:
     )
 
 
-def test_each_room_imports_only_what_is_below_it() -> None:
-    assert upward(imports_of(PACKAGE)) == []
+@pytest.fixture(scope="module")
+def edges() -> Edges:
+    return imports_of(PACKAGE)
 
 
-def test_no_circle_between_files() -> None:
-    assert circle(imports_of(PACKAGE)) is None
+def test_each_room_imports_only_what_is_below_it(edges: Edges) -> None:
+    assert upward(edges) == []
 
 
-def test_no_circle_between_folders() -> None:
-    folders = between_folders(imports_of(PACKAGE))
+def test_no_circle_between_files(edges: Edges) -> None:
+    assert circle(edges) is None
+
+
+def test_no_circle_between_folders(edges: Edges) -> None:
+    folders = between_folders(edges)
     assert {parent: found for parent, edges in folders.items() if (found := circle(edges))} == {}
 
 

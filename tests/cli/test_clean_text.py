@@ -17,6 +17,7 @@ from pathlib import Path
 import mcap.reader
 import numpy as np
 import pytest
+from quick import QUICK
 from small_log import small_log
 from synthetic_result import synthetic_result
 
@@ -116,9 +117,7 @@ def test_info(objslam: Callable[..., tuple[str, str]], log: Path, command: tuple
 def test_run(objslam: Callable[..., tuple[str, str]], log: Path, tmp_path: Path) -> None:
     folder = tmp_path / "[/red]\x1b[2J=out"
     least = ("--set", "association.min_existence=0", "--set", "association.fuse_labels=false")
-    said, warned = objslam(
-        "run", log, "-o", folder, *least, "--set", "output.recording=false", "--set", "output.picture=false"
-    )
+    said, warned = objslam("run", log, "-o", folder, *least, *QUICK)
     assert r"wrote " in said
     assert r"[/red]\x1b[2J=out" in said
     assert "label that is empty or not printable" in warned
@@ -126,7 +125,6 @@ def test_run(objslam: Callable[..., tuple[str, str]], log: Path, tmp_path: Path)
     objslam("export", folder, "--to", "csv")
 
 
-LESS = ("--set", "output.recording=false", "--set", "output.picture=false")
 COMMANDS = {
     "doctor": ("doctor", "{log}"),
     "explain": ("explain", "{out}"),
@@ -151,7 +149,7 @@ def test_every_other_command(
 
 def test_a_log_is_converted_and_a_journal_read(objslam: Callable[..., tuple[str, str]], log: Path, tmp_path: Path) -> None:
     folder = tmp_path / "[/red]\x1b[2Jlive"
-    objslam("live", log, "--speed", "0", "-o", folder, *LESS)
+    objslam("live", log, "--speed", "0", "-o", folder, *QUICK)
     for words in (("verify", folder), ("repair", folder), ("export", folder, "-o", tmp_path / "\x1b]0;lines")):
         objslam("journal", *words)
     objslam("convert", folder, tmp_path / "[/]\u202eagain")

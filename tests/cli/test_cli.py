@@ -18,7 +18,7 @@ import pytest
 import yaml
 from commands import Call, call
 from processes import running
-from quick import HELD, NOTHING_DRAWN, QUICK, options
+from quick import HELD, NOTHING_DRAWN, QUICK, ROUGH, options
 from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
@@ -35,6 +35,7 @@ from objslam.simulation.wrong_inputs import MISTAKES
 from objslam.sources.log_folder import write_log_folder
 
 LEAN = options(*NOTHING_DRAWN)
+CHECKED = (*LEAN, *options("bodies.use=false", "calibration.use=false"))
 MODES = ("fixed", "joint")
 SCRIPT = Path(sysconfig.get_path("scripts")) / "objslam"
 
@@ -500,7 +501,7 @@ def with_boxes_that_are_none(folder):
 )
 def test_what_is_spoilt_is_counted_and_the_rest_is_mapped(objslam, variant, tmp_path, mode, spoil, words):
     spoil(variant)
-    run = objslam("run", variant, "-o", tmp_path / "out", "--mode", mode, *LEAN)
+    run = objslam("run", variant, "-o", tmp_path / "out", "--mode", mode, *CHECKED)
     assert run.code == 0, run.err
     run.says_somewhere("warning: dropped", *words)
     told = summary(tmp_path / "out")
@@ -520,7 +521,7 @@ def test_a_camera_of_another_size_is_said_and_nothing_is_sure(objslam, variant, 
     run.says_somewhere("warning: dropped", "outside the image", "camera left")
     run.says_somewhere("the input")
     assert not load_map(tmp_path / "out").resolved()
-    objslam("run", variant, "-o", tmp_path / "all", "--mode", mode, "--set", "checks.use=false", *LEAN)
+    objslam("run", variant, "-o", tmp_path / "all", "--mode", mode, *QUICK)
     resolved = load_map(tmp_path / "all").resolved()
     assert len(resolved) >= 3
     assert all(np.linalg.norm(o.position - dict(THINGS)[o.label]) < 0.3 for o in resolved)
@@ -601,18 +602,18 @@ def test_a_file_in_the_way_of_the_output(objslam, log_folder, tmp_path):
     file = tmp_path / "file"
     file.write_text("mine")
     for out in (file, file / "below"):
-        failed = objslam("run", log_folder, "-o", out, *LEAN)
+        failed = objslam("run", log_folder, "-o", out, *QUICK)
         assert failed.code == 1
         failed.says("file")
     assert file.read_text() == "mine"
     (tmp_path / "out" / "objects.json").mkdir(parents=True)
-    failed = objslam("run", log_folder, "-o", tmp_path / "out", *LEAN)
+    failed = objslam("run", log_folder, "-o", tmp_path / "out", *QUICK)
     assert failed.code == 1
     failed.says("objects.json")
 
 
 def test_an_output_on_a_drive_that_is_not_there(objslam, log_folder):
-    failed = objslam("run", log_folder, "-o", "/proc/no_such_drive/out", *LEAN)
+    failed = objslam("run", log_folder, "-o", "/proc/no_such_drive/out", *QUICK)
     assert failed.code == 1
     failed.says("/proc/no_such_drive", "cannot write")
 
@@ -621,7 +622,7 @@ def test_an_output_on_a_drive_that_is_not_there(objslam, log_folder):
 def test_a_folder_that_may_not_be_written(objslam, log_folder, tmp_path):
     tmp_path.chmod(0o500)
     try:
-        failed = objslam("run", log_folder, "-o", tmp_path / "out", *LEAN)
+        failed = objslam("run", log_folder, "-o", tmp_path / "out", *QUICK)
         assert failed.code == 1
         failed.says("Permission denied")
     finally:
@@ -632,7 +633,7 @@ def test_a_log_is_never_taken_for_the_place_of_its_result(objslam, variant, monk
     before = {file: file.read_bytes() for file in variant.rglob("*") if file.is_file()}
     for out in (str(variant), "."):
         monkeypatch.chdir(variant)
-        failed = objslam("run", variant, "-o", out, *LEAN)
+        failed = objslam("run", variant, "-o", out, *QUICK)
         assert failed.code == 1
         failed.says("this is a log", "-o")
         assert {file: file.read_bytes() for file in variant.rglob("*") if file.is_file()} == before
@@ -705,14 +706,14 @@ def test_an_unforeseen_error_asks_for_a_report(objslam, log_folder, tmp_path, mo
         raise ZeroDivisionError("a fault of ours")
 
     monkeypatch.setattr("objslam.mapping.pipeline.run", broken)
-    failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
+    failed = objslam("run", log_folder, "-o", tmp_path, *QUICK)
     assert failed.code == 1
     assert failed.err == (
         "objslam: internal error, ZeroDivisionError: a fault of ours "
         "(please report it with the traceback from objslam --debug)\n"
     )
     monkeypatch.setattr("objslam.mapping.pipeline.run", lambda *_: exhausted())
-    failed = objslam("run", log_folder, "-o", tmp_path, *LEAN)
+    failed = objslam("run", log_folder, "-o", tmp_path, *QUICK)
     assert failed.code == 1
     failed.says("out of memory")
 
@@ -837,14 +838,14 @@ def test_calibrate_and_run_with_what_it_found(objslam, tmp_path):
         log = simulate(preset("demo", classes=12, frames=200, localization=None, odometry=Odometry()), seed)
         write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / f"log{seed}")
         drives.append(str(tmp_path / f"log{seed}"))
-    file = tmp_path / "robot.yaml"
-    done = objslam("calibrate", *drives, "-o", str(file), "--set", "association.method=by_label")
+    file, fast = tmp_path / "robot.yaml", options(*ROUGH, *NOTHING_DRAWN, "association.method=by_label")
+    done = objslam("calibrate", *drives, "-o", str(file), *fast)
     assert done.code == 0, done.err
     assert "from 2 logs" in done.out
     found = load_calibration(file)
     clock = found.names.index("front.clock")
     assert abs(found.values[clock] - 0.15) < 4 * found.sigma[clock]
-    done = objslam("run", drives[0], "--mode", "joint", "--calibration", str(file), "-o", str(tmp_path / "out"))
+    done = objslam("run", drives[0], "--mode", "joint", "--calibration", str(file), "-o", str(tmp_path / "out"), *fast)
     assert done.code == 0, done.err
     parameters = json.loads((tmp_path / "out" / "summary.json").read_text())["calibration"]["parameters"]
     assert parameters["front.clock"]["prior_sigma"] == pytest.approx(found.sigma[clock], rel=1e-6)
@@ -942,7 +943,7 @@ def test_calibrate_without_odometry_says_what_it_needs(objslam, tmp_path):
 def test_calibrate_at_known_poses_and_run_with_what_it_found(objslam, tmp_path):
     log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
     write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / "log")
-    file, fast = tmp_path / "robot.yaml", ("--set", "association.method=by_label")
+    file, fast = tmp_path / "robot.yaml", options(*ROUGH, *NOTHING_DRAWN, "association.method=by_label")
     done = objslam("calibrate", str(tmp_path / "log"), "--mode", "fixed", "-o", str(file), *fast)
     assert done.code == 0, done.err
     found = load_calibration(file)

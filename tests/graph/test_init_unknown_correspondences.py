@@ -18,12 +18,14 @@ from objslam.simulation import preset, simulate
 
 STEP = {"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0}
 STEP |= {"floor_xy": 0.01, "floor_yaw": float(np.radians(0.3))}
+LESS = {stage: {"use": False} for stage in ("checks", "bodies", "calibration")}
+"""Without the stages before and after the loops."""
 
 
 @pytest.mark.parametrize("seed", [0, 3])
 def test_two_laps_from_odometry_alone(seed):
     log = simulate(preset("drift"), seed)
-    settings = Settings.model_validate({"mode": "joint", "rays": {"pixel_sigma": 3.0}, "odometry": STEP})
+    settings = Settings.model_validate({"mode": "joint", "rays": {"pixel_sigma": 3.0}, "odometry": STEP, **LESS})
     result = pipeline.run(log, settings, Ledger())
     found = evaluate(result.map, log.truth, result.path_after, align="se2", radius=0.5)
     dead = evaluate(result.map, log.truth, log.odometry, align="se2", radius=0.5)

@@ -263,7 +263,7 @@ def test_what_is_prepared_for_takes_little(round_trip):
         np.testing.assert_allclose(one.points(landmarks), before, atol=5e-3)
         return result
 
-    for j in range(5):
+    for j in (0, 4):
         assert count(True, long_ago[[j]]) <= len(coming) + 6 < count(False, long_ago[[j]]) / 3
 
 

@@ -19,7 +19,9 @@ from objslam.mapping.pipeline import run
 from objslam.simulation import PoseNoise, preset, simulate
 
 UNKNOWN = lift_se2(np.array([3.0, -7.0, 2.0]))
-SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "output.recording=false"))
+ALL = ("mode=joint", "rays.pixel_sigma=2", "output.recording=false")
+SETTINGS = load_settings(None, (*ALL, *HELD))
+"""For the frame of a session, its ids and its journal."""
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +74,7 @@ def test_a_session_goes_over_into_the_map(first, known, localization):
     """With odometry alone, and with a localisation in a frame of its own."""
     log = another_day(first, localization)
     begin = log.truth.trajectory.poses[0]
-    session, seen, frames = Session(SETTINGS, patient=True, known=known).start(), [], 0
+    session, seen, frames = Session(load_settings(None, ALL), patient=True, known=known).start(), [], 0
     session.push_camera(log.cameras[0].camera)
     for _, frame, one in events(log):
         one(session)
@@ -135,7 +137,7 @@ def test_another_place_leaves_the_session_in_its_own_frame(first):
     settings = load_settings(None, ("mode=fixed", *HELD))
     other = PriorMap("elsewhere", run(simulate(preset("demo", frames=200, classes=6, false=0.0), 5), settings, Ledger()).map)
     log = another_day(first)
-    held = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", *HELD))
+    held = SETTINGS
     session, alone = drive(log, other, held), drive(log, None, held)
     snapshot, without = session.snapshot(), alone.snapshot()
     assert snapshot.in_map.objects == 0

@@ -112,7 +112,7 @@ def test_poses_that_the_settings_leave_unused_are_no_loss(log):
 @pytest.mark.parametrize("share", [0.5, 0.01, 1e-4])
 def test_the_status_is_asked_as_in_the_end(log, share):
     """If an object is too uncertain for its distance at the end, no snapshot called it resolved."""
-    settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", f"triangulation.max_rel_sigma={share}"))
+    settings = load_settings(None, (*DEFAULT, *HELD, f"triangulation.max_rel_sigma={share}"))
     session = drive(log, settings)
     shown = {o.label: o for o in Describer().map(session._mapper.state, whole=True).objects}
     end = {o.label: o for o in session.stop().map.objects}
@@ -183,7 +183,7 @@ def test_a_loop_that_does_not_hold_leaves_all_as_it_was(hall, monkeypatch):
 
 
 def test_a_hall_of_objects_that_look_alike_from_odometry_alone(hall):
-    session = drive(hall, ALL)
+    session = drive(hall)
     snapshot = session.snapshot()
     session.abort()
     found, true = snapshot.map.resolved(), hall.truth.objects
@@ -460,7 +460,7 @@ def test_two_objects_of_a_label_that_no_frame_shows_together_are_two_in_the_end(
     boxes = camera.detections
     _, first = np.unique(np.stack([boxes.frame, boxes.label]), axis=1, return_index=True)
     log = replace(log, cameras=(replace(camera, detections=boxes.take(np.sort(first))),))
-    session = drive(log, ALL)
+    session = drive(log)
     assert session._mapper.state.by_label != early
     found = session.stop().map.resolved()
     assert sorted(o.label for o in found) == sorted(o.label for o in log.truth.objects)

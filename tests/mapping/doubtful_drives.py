@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from quick import NOTHING_DRAWN
 
-from objslam.config import Output, Settings
+from objslam.config import Settings, load_settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import project
 from objslam.core.diagnostics import Ledger
@@ -20,7 +21,9 @@ from objslam.mapping.describe import describe, make_result
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import Solution
 
-LEAN = Settings(output=Output(recording=False, picture=False))
+DEFAULT = load_settings(None, NOTHING_DRAWN)
+LEAN = load_settings(None, (*NOTHING_DRAWN, "checks.use=false", "bodies.use=false"))
+"""Without a look at the input, and without bodies. No doubt comes from these."""
 
 
 def mapped(log: Log, settings: Settings = LEAN) -> RunResult:

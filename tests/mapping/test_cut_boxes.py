@@ -11,7 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.mapping import pipeline
 from objslam.mapping.bodies import cut_boxes, fitting
 
-SETTINGS = load_settings(None, ("mode=fixed", "calibration.use=false", "output.recording=false"))
+SETTINGS = load_settings(None, ("mode=fixed", "calibration.use=false", "checks.use=false", "output.recording=false"))
 
 
 def cut_drive(seed, short=0.05):

@@ -4,6 +4,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+from quick import HELD
 from waiting import LIMIT
 
 from objslam.config import Odometry, load_settings
@@ -37,7 +38,7 @@ def table(objects):
 @pytest.mark.parametrize(("mode", "path"), [("fixed", PoseNoise()), ("joint", None)])
 def test_the_camera_and_the_settings_tell_the_same(mode, path):
     plain, told = logs(localization=path)
-    settings = f"mode={mode}", "fixed.loss=huber", "output.recording=false", "checks.use=false"
+    settings = f"mode={mode}", "fixed.loss=huber", "output.recording=false", *HELD
     by_camera = table(pipeline.run(told, load_settings(None, settings), Ledger()).map)
     by_settings = table(pipeline.run(plain, load_settings(None, (*settings, *IN_SETTINGS)), Ledger()).map)
     usual = table(pipeline.run(plain, load_settings(None, settings), Ledger()).map)
@@ -52,7 +53,7 @@ def test_a_live_session_takes_the_noise_of_the_camera():
     plain, told = logs(localization=None)
 
     def live(log, *more):
-        session = Session(load_settings(None, ("calibration.use=false", *more)), patient=True).start()
+        session = Session(load_settings(None, (*HELD, *more)), patient=True).start()
         session.push_camera(log.cameras[0].camera)
         for _, frame, push in events(log):
             push(session)

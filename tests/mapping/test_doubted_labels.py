@@ -26,6 +26,8 @@ from objslam.simulation import make_camera
 LAMP = ("lamp", 1.2, 3.5, 1.2)
 FIRST, SECOND = ("mug", 4.2, 1.0, 0.7), ("mug", 0.5, 6.0, 0.9)
 ALL_NAMED = ("lamp", "chair", "bin", "box")
+SETTINGS = load_settings(None, ("output.recording=false", "checks.use=false", "bodies.use=false", "calibration.use=false"))
+"""Without what does not decide how many things have a label: the noise does."""
 
 
 def turning_drive(things, turn_error: float = 0.01) -> Log:
@@ -72,7 +74,7 @@ def test_two_things_that_no_frame_shows_together_are_two_objects(second):
     log = turning_drive((FIRST, second, LAMP))
     shown = log.cameras[0].detections
     assert max(Counter(zip(shown.frame.tolist(), shown.label.tolist(), strict=True)).values()) == 1
-    result = pipeline.run(log, load_settings(None, ("output.recording=false",)), Ledger())
+    result = pipeline.run(log, SETTINGS, Ledger())
     assert Counter(o.label for o in result.map.resolved()) == {"mug": 2, "lamp": 1}
     found = evaluate(result.map, log.truth, align="se2", radius=1.0).to_dict()
     assert found["matched"] == 3
@@ -86,7 +88,7 @@ def test_two_things_that_no_frame_shows_together_are_two_objects(second):
 def test_a_label_of_one_thing_stays_one_object_if_the_odometry_turns_wrongly():
     """The lamp is seen before and after the turn, and the odometry turns 30 % too far."""
     log = turning_drive((("mug", 0.5, 4.0, 0.9), LAMP), turn_error=0.3)
-    result = pipeline.run(log, load_settings(None, ("output.recording=false",)), Ledger())
+    result = pipeline.run(log, SETTINGS, Ledger())
     assert Counter(o.label for o in result.map.resolved()) == {"mug": 1, "lamp": 1}
 
 
@@ -121,7 +123,7 @@ def test_a_comparison_that_fails_keeps_the_map_by_labels_and_says_so(monkeypatch
         raise SolveError("the linear system has no single solution")
 
     monkeypatch.setattr(joint_solve, "evidence_against", fail)
-    result = pipeline.run(turning_drive((FIRST, SECOND, LAMP)), load_settings(None, ("output.recording=false",)), Ledger())
+    result = pipeline.run(turning_drive((FIRST, SECOND, LAMP)), SETTINGS, Ledger())
     assert len(result.map) > 0
     assert "mug" in result.summary["doubted_labels"]
 

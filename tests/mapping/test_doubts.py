@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from doubtful_drives import LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled, with_boxes
+from doubtful_drives import DEFAULT, LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled, with_boxes
 
 from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
@@ -39,7 +39,7 @@ def rooms() -> Log:
 
 @pytest.mark.parametrize("drive", ["demo", "rooms"])
 def test_a_clean_drive_has_no_doubts(drive):
-    result = mapped(simulate(preset(drive), 2))
+    result = mapped(simulate(preset(drive), 2), DEFAULT)
     assert result.doubts == ()
     assert set(result.summary["doubts"].values()) == {0}
 

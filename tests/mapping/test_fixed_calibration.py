@@ -33,7 +33,7 @@ def drive(seed: int, wrong: bool) -> tuple[Log, dict[str, float]]:
 
 
 def run(log: Log, *overrides: str, ledger: Ledger | None = None) -> RunResult:
-    settings = load_settings(None, ("mode=fixed", "output.recording=false", *overrides))
+    settings = load_settings(None, ("mode=fixed", "output.recording=false", "checks.use=false", *overrides))
     return pipeline.run(log, settings, ledger or Ledger())
 
 
@@ -58,6 +58,11 @@ def estimated(seed: int, wrong: bool) -> RunResult:
     return run(drive(seed, wrong)[0])
 
 
+@cache
+def held(seed: int, wrong: bool) -> RunResult:
+    return run(drive(seed, wrong)[0], HELD)
+
+
 def test_the_errors_that_were_put_in_are_found():
     for seed in SEEDS:
         found = estimated(seed, True).calibration
@@ -72,11 +77,11 @@ def test_the_objects_are_as_good_as_with_known_errors():
     known, found, left = [], [], []
     inside = []
     for seed in SEEDS:
-        clean, wrong = drive(seed, False)[0], drive(seed, True)[0]
-        known += [d for d, _ in off(clean, run(clean, HELD))]
+        clean = drive(seed, False)[0]
+        known += [d for d, _ in off(clean, held(seed, False))]
         found += [d for d, _ in off(clean, estimated(seed, True))]
         inside += [m < 7.815 for _, m in off(clean, estimated(seed, True))]  # 95 % of chi-squared with 3 degrees of freedom
-        left += [d for d, _ in off(clean, run(wrong, HELD))]
+        left += [d for d, _ in off(clean, held(seed, True))]
     assert rms(found) < 1.3 * rms(known)
     assert rms(found) < 0.2 * rms(left)
     assert np.mean(inside) > 0.9
@@ -86,9 +91,8 @@ def test_without_errors_the_objects_are_not_worse():
     ratios = []
     for seed in SEEDS:
         clean = drive(seed, False)[0]
-        ratios.append(
-            rms([d for d, _ in off(clean, estimated(seed, False))]) / rms([d for d, _ in off(clean, run(clean, HELD))])
-        )
+        found, known = ([d for d, _ in off(clean, made(seed, False))] for made in (estimated, held))
+        ratios.append(rms(found) / rms(known))
     assert np.median(ratios) < 1.05
 
 
@@ -145,7 +149,7 @@ def test_where_no_object_is_placed_the_errors_stay_at_their_prior():
     one = log.cameras[0]
     few = replace(log, cameras=(replace(one, detections=one.detections.take(np.arange(4))),))
     ledger = Ledger()
-    result = run(few, "checks.use=false", ledger=ledger)
+    result = run(few, ledger=ledger)
     assert_allclose(result.calibration.values, 0.0)
     assert any("shared errors could not be estimated" in warning for warning in ledger.warnings)
 

@@ -165,7 +165,8 @@ def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():
     changes = {"objects": 8, "classes": 2, "frames": 150, "frame_rate": 2.0, "pixel_sigma": 3.0, "missed": 0.0, "false": 0.0}
     changes |= {"odometry": default.model_copy(update=noisy), "depth": DepthNoise(), "localization": None}
     log = simulate(preset("demo", **changes), 7)
-    result = run(log, load_settings(None, ("mode=joint", "output.recording=false")), Ledger())
+    told = ("mode=joint", "output.recording=false", "checks.use=false", "bodies.use=false", "calibration.use=false")
+    result = run(log, load_settings(None, told), Ledger())
     score = evaluate(result.map, log.truth, result.path_after, align="se2", radius=1.0).to_dict()
     assert (score["matched"], score["false"]) == (8, 0)
     assert score["ate"] < 0.15

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from quick import HELD
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -31,7 +32,7 @@ def with_lasting(log: Log, factor: float, time: float, seed: int) -> Log:
 
 def squares(log: Log) -> list[float]:
     settings = load_settings(
-        None, ("mode=fixed", "calibration.use=false", "checks.use=false", "rays.box_sigma=0", "output.recording=false")
+        None, ("mode=fixed", *HELD, "noise.localization=true", "rays.box_sigma=0", "output.recording=false")
     )
     result = pipeline.run(log, settings, Ledger())
     place = {item.label: item.position for item in log.truth.objects}

@@ -10,13 +10,15 @@ from objslam.core.diagnostics import Ledger
 from objslam.mapping import pipeline
 from objslam.simulation import PoseNoise, preset, simulate
 
+QUIET = ("calibration.use=false", "checks.use=false", "bodies.use=false", "output.recording=false")
+
 
 def run(seed: int, odometry: Odometry | None, *told: str):
     """The squared Mahalanobis distances (n,) of the objects in the plane, their RMSE (m), and the noise."""
     quiet = {"localization": PoseNoise(xy=0.005, yaw=0.001), "pixel_sigma": 1.0, "false": 0.0}
     log = simulate(preset("demo", odometry=odometry, objects=8, classes=8, frames=200, **quiet), seed)
     log = with_lasting(log, 10.0, 4.0, seed)  # 0.2 m and 0.05 rad.
-    settings = load_settings(None, ("mode=joint", "checks.use=false", "output.recording=false", *told))
+    settings = load_settings(None, ("mode=joint", *QUIET, *told))
     result = pipeline.run(replace(log, name="lasting"), settings, Ledger())
     place = {item.label: item.position for item in log.truth.objects}
     objects = result.map.resolved()
@@ -31,7 +33,7 @@ WHITE = ("noise.localization=false", "localization.xy=0.2", "localization.yaw=0.
 
 
 def test_lasting_errors_are_found_and_the_sigmas_contain_them():
-    """With the default settings, which promise 0.02 m. An honest mean is 2. The objects of a drive share most of their
+    """With the default noise, which promises 0.02 m. An honest mean is 2. The objects of a drive share most of their
     error, and a short drive has few independent errors."""
     first, _, noise = run(0, Odometry())
     assert noise["place_share"] > 0.5

@@ -19,13 +19,14 @@ UNKNOWN = lift_se2(np.array([3.0, -7.0, 2.0]))
 
 def settings(mode="fixed"):
     poses = {"use": "odometry" if mode == "joint" else "localization"}
-    return change_settings(Settings(), {"mode": mode, "poses": poses, "output": {"recording": False, "picture": False}})
+    less = {"checks": {"use": False}, "bodies": {"use": False}, "output": {"recording": False, "picture": False}}
+    return change_settings(Settings(), {"mode": mode, "poses": poses, **less})
 
 
 def another_day(first, seed):
     """Another drive through the room of the first, in the same frame."""
     objects = tuple((o.label, tuple(o.position)) for o in first.truth.objects)
-    return simulate(preset("demo", objects=0, placed=objects, path=(3, 2)), seed)
+    return simulate(preset("demo", objects=0, placed=objects, path=(3, 2), frames=250), seed)
 
 
 @pytest.fixture(scope="module")

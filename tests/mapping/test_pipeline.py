@@ -181,7 +181,7 @@ def test_several_cameras(mode, paths):
     cameras = tuple(make_camera(name, focal=380.0, position=place, yaw=yaw) for name, place, yaw in places)
     changes = {"both": {}, "localization": {"odometry": None}, "odometry": {"localization": None}}[paths]
     log = small_log(cameras=cameras, false=0.0, **changes)
-    result = run(log, mode)
+    result = run(log, mode, *(() if paths == "both" else HELD))
     assert len(set(result.keyframes.camera)) == 3
     if (mode, paths) == ("fixed", "odometry"):  # as far off as the odometry, if not twice there
         assert {o.label for o in result.map.resolved()} == {label for label, _ in THINGS}
@@ -335,7 +335,7 @@ def test_hundreds_of_labels(mode):
     detections = log.cameras[0].detections
     some = detections.take(np.random.default_rng(4).random(len(detections)) < 0.3)
     log = replace(log, cameras=(replace(log.cameras[0], detections=some),))
-    result = run(log, mode)
+    result = run(log, mode, *HELD)
     errors = [np.linalg.norm(o.position - places[int(o.label[-3:])]) for o in result.map.resolved()]
     assert len(result.map.resolved()) >= 145
     assert np.median(errors) < 0.03
@@ -385,9 +385,9 @@ def test_far_from_where_the_map_begins_an_object_is_still_known():
 def test_every_label_is_one_object_where_that_is_said(mode):
     """Two cups: one object of that label, whatever the rays say; by default they are two."""
     log = simulate(pair(1.0, pixel_sigma=1.0), 0)
-    said = pipeline.run(log, load_settings(None, (f"mode={mode}", "association.method=by_label")), Ledger())
+    said = pipeline.run(log, load_settings(None, (f"mode={mode}", "association.method=by_label", *HELD)), Ledger())
     assert [o.label for o in said.map.objects] == ["cup"]
-    found = pipeline.run(log, load_settings(None, (f"mode={mode}",)), Ledger())
+    found = pipeline.run(log, load_settings(None, (f"mode={mode}", *HELD)), Ledger())
     assert [o.label for o in found.map.objects] == ["cup", "cup"]
 
 
@@ -426,5 +426,5 @@ def test_boxes_of_a_mirrored_image_are_said_to_be_wrong_input():
 
     log = simulate(preset("demo", objects=15, classes=5), 0)
     for said, one in ((False, log), (True, replace(log, cameras=tuple(map(mirrored, log.cameras))))):
-        result = run(one, "fixed")
+        result = run(one, "fixed", "bodies.use=false", "calibration.use=false")
         assert any("the input may be wrong" in text for text in result.summary["warnings"]) == said

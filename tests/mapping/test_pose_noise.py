@@ -19,7 +19,7 @@ from objslam.mapping.fixed.pose_noise import noise_in_frames
 from objslam.simulation import PoseNoise, pair, preset, simulate
 
 FIXED = Settings(mode="fixed")
-QUIET = ("output.recording=false", "output.picture=false")
+QUIET = ("output.recording=false", "output.picture=false", "bodies.use=false")
 
 
 def drive(xy: float, yaw: float, seed: int = 0, **changes: object) -> Log:

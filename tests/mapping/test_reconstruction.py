@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import open3d as o3d
 import pytest
+from quick import HELD
 
 from objslam import config
-from objslam.config import Settings
+from objslam.config import Settings, load_settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera, undistort
 from objslam.core.diagnostics import Ledger
@@ -293,7 +294,8 @@ def test_a_run_fuses_at_the_solved_poses(drive: tuple[RenderSettings, Log], tmp_
     log = replace(log, localization=None, odometry=replace(log.odometry, poses=start @ log.odometry.poses))
     chosen = config.Reconstruction(before=True, cloud=True, min_views=2)
     ledger = Ledger()
-    result = pipeline.run(log, Settings(mode="joint", reconstruction=chosen), ledger)
+    held = load_settings(None, ("mode=joint", *HELD))
+    result = pipeline.run(log, held.model_copy(update={"reconstruction": chosen}), ledger)
     assert result.surface is not None
     assert result.surface_before is not None
     after, before = (room_distance(settings, surface) for surface in (result.surface, result.surface_before))
@@ -305,7 +307,7 @@ def test_a_run_fuses_at_the_solved_poses(drive: tuple[RenderSettings, Log], tmp_
         mesh = o3d.io.read_triangle_mesh(tmp_path / "out" / name)
         np.testing.assert_array_equal(np.asarray(mesh.triangles), surface.triangles)
     assert len(o3d.io.read_point_cloud(tmp_path / "out" / "reconstruction_cloud.ply").points) == len(result.surface.vertices)
-    plain = pipeline.run(log, Settings(mode="joint", reconstruction=config.Reconstruction(use=False)), Ledger())
+    plain = pipeline.run(log, held.model_copy(update={"reconstruction": config.Reconstruction(use=False)}), Ledger())
     assert plain.surface is None
     write_result(plain, tmp_path / "out")
     assert not list((tmp_path / "out").glob("*.ply"))

@@ -92,7 +92,7 @@ def test_boxes_that_fit_only_a_path_that_bends_refute_nothing(clean, solved, put
 
 
 def names(log):
-    settings = load_settings(None, ("mode=joint", "output.recording=false"))
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false", "bodies.use=false"))
     result = pipeline.run(log, settings, Ledger())
     return [one["name"] for one in result.summary["wrong_input"]], len(result.map.resolved())
 

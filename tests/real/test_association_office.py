@@ -6,13 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from objslam.config import Settings
+from objslam.config import Output, Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, lift_se2
 from objslam.evaluation.alignment import match_points
 from objslam.mapping.localization import PriorMap, moved_log
 from objslam.mapping.pipeline import run
 from objslam.sources import read
+
+SETTINGS = Settings(output=Output(recording=False))
+"""The defaults, without the steps of the solver that a recording would show."""
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +39,7 @@ def half(log, second):
 
 
 def objects(log, ledger=None):
-    resolved = run(log, Settings(), ledger or Ledger()).map.resolved()
+    resolved = run(log, SETTINGS, ledger or Ledger()).map.resolved()
     return [o.label for o in resolved], np.array([o.position for o in resolved])
 
 
@@ -79,9 +82,9 @@ def test_no_object_is_there_twice(whole):
 def halves(log):
     """The first half as a map, and the second half in a frame that nobody knows, found in this map."""
     unknown = lift_se2(np.array([3.0, -7.0, 2.0]))
-    first = run(half(log, False), Settings(), Ledger())
+    first = run(half(log, False), SETTINGS, Ledger())
     known = PriorMap("first", first.map)
-    return first, run(moved_log(half(log, True), unknown), Settings(), Ledger(), known=known)
+    return first, run(moved_log(half(log, True), unknown), SETTINGS, Ledger(), known=known)
 
 
 def test_the_second_half_is_found_in_the_map_of_the_first(log, halves, whole):

@@ -63,24 +63,22 @@ def rays_around(rng, count, sizes, noise=0.01, wrong=0.0, spread=3.0):
     return m, n / np.linalg.norm(n, axis=1, keepdims=True), index, places
 
 
-def test_equals_a_convex_solution_of_scipy_on_1000_objects():
+def test_equals_a_convex_solution_of_scipy_on_320_objects():
     rng = np.random.default_rng(0)
-    batches = [
-        rays_around(rng, 250, rng.integers(3, 30, 250), noise, wrong) for noise in (0.002, 0.05) for wrong in (0, 0.4)
-    ]
+    batches = [rays_around(rng, 80, rng.integers(3, 30, 80), noise, wrong) for noise in (0.002, 0.05) for wrong in (0, 0.4)]
     smooth = 0
     for m, n, index, _ in batches:
-        points, _, norm = solve_eq1(m, n, index, 250)
-        start, determined = closed_form(m, n, index, 250)
+        points, _, norm = solve_eq1(m, n, index, 80)
+        start, determined = closed_form(m, n, index, 80)
         assert determined.all()
         assert norm.max() < 1e-9
-        for j in range(250):
+        for j in range(80):
             expected, interior = oracle(m[index == j], n[index == j], start[j])
             smooth += interior
             np.testing.assert_allclose(points[j], expected, rtol=0, atol=1e-8)
             if interior:
                 assert np.linalg.norm(gradient(points[j], m[index == j], n[index == j])) < 1e-9
-    assert 500 < smooth < 1000  # both kinds of optimum were there
+    assert 160 < smooth < 320  # both kinds of optimum were there
 
 
 def test_closed_form_is_the_least_squares_solution():

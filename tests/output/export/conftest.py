@@ -13,7 +13,7 @@ from objslam.output.result_folder import write_result
 from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
 
-LEAN = ("output.recording=false", "output.picture=false")
+LEAN = ("output.recording=false", "output.picture=false", "checks.use=false", "bodies.use=false")
 
 
 @pytest.fixture(scope="session")
