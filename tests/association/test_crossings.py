@@ -103,3 +103,16 @@ def test_far_odds_count_the_boxes_of_other_landmarks() -> None:
         others = state.distance[state.owner != j]
         expected = np.log(((others > away / 1.4).sum() + 1) / (0.1 * len(others) + 1))
         assert odds == pytest.approx(min(expected, 0.0))
+
+
+def test_one_large_thing_that_looks_elsewhere_from_its_other_side_is_one() -> None:
+    """Rays from two sides of a thing of 0.5 m miss each other by 0.3 m. Two things would overlap."""
+    points = np.array([(5.0, 0.0, 0.3), (5.0, 0.0, 0.6), *BESIDE])
+    way = np.column_stack([np.linspace(-3, 3, 50), np.full(50, 3.0), np.zeros(50)])
+    scene = watch(points, lift_se2(np.concatenate([way * [1, -1, 1], way])), size=0.5, pixel_sigma=2.0, seed=0)
+    kept = np.flatnonzero((scene.whose > 1) | ((scene.rays.keyframe < 50) == (scene.whose == 0)))
+    scene = replace(scene, rays=scene.rays.take(kept), whose=scene.whose[kept])
+    state = true_state(scene, {1: 0})
+    with_sizes, without = (find_crossings(state, np.full(len(kept), sized)) for sized in (True, False))
+    assert with_sizes.landmark[0] == without.landmark[0] == 0
+    assert without.odds[0] < 0 < with_sizes.odds[0]

@@ -135,7 +135,18 @@ def find_crossings(state: State, sized: Bools) -> Crossings:
     (a, b), (c, d) = alone.reshape(-1, 2).T, other.reshape(-1, 2).T
     (p, q), (r, s) = alone_cost.reshape(-1, 2).T, other_cost.reshape(-1, 2).T
     better = _bearing_odds(one_cost - np.array([p + q, p + s, r + q]))
+    better[0, _overlap(bundles, position)] = -np.inf
     return Crossings(two, second, one - (np.array([a + b, a + d, c + b]) + better).max(axis=0), position.reshape(-1, 2, 3))
+
+
+def _overlap(bundles: _Bundles, position: Floats) -> Bools:
+    """Return for each pair (S,) of bundles whether things of their size at points (G, 3) m would overlap.
+
+    Two things do not. The rays to the middles of the boxes of a large thing, from two sides, do not meet in one point, and
+    two points inside it explain them better.
+    """
+    apart = np.linalg.norm(position[::2] - position[1::2], axis=1)
+    return np.asarray(apart < np.exp(bundles.size(position)[0]).reshape(-1, 2).mean(axis=1))
 
 
 def without_smaller_bundles(state: State, sized: Bools) -> State:
