@@ -31,7 +31,7 @@ one weighs as much. With a larger deviation, the size tells less about the dista
 _LEAST_VIEW = 1e-3
 """The least measured deviation of ln size between views, so that its logarithm is finite."""
 _SIZED_BY = 5
-"""The least number of boxes that give a landmark a size."""
+"""The least number of boxes that give a landmark a size. A larger number leaves more landmarks without one."""
 _MARGIN = (2.0, 2.0, 0.3)
 """The lengths (m) by which the mapped space exceeds the landmarks, along the axes of the map. Larger lengths mean a lower
 density of things."""
