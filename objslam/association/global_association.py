@@ -279,8 +279,7 @@ def _merge_all(task: _Task, state: State) -> State:
 
 
 def _merged_and_dropped(task: _Task, state: State) -> tuple[State, Floats, Bools]:
-    """Merge and drop landmarks until none is left to drop. Also return the probability (N,) that each exists, and the rays
-    (R,) of dropped ones."""
+    """Merge and drop landmarks until none is left to drop. Also return the existence (N,), and the rays (R,) of dropped ones."""
     refuted = np.zeros(len(state.matched), dtype=bool)
     for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
         merged = _merge_all(task, state)
@@ -294,14 +293,13 @@ def _merged_and_dropped(task: _Task, state: State) -> tuple[State, Floats, Bools
 def _without_crossings(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats, Bools]:
     """Split landmarks that are two things whose rays cross, and search again among the rays that this sets free.
 
-    likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees sizes. Returns the same as
-    `_merged_and_dropped`.
+    likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees sizes. Returns as `_merged_and_dropped`.
     """
     refuted, earlier = np.zeros(len(state.matched), dtype=bool), set[bytes]()
     while (key := state.matched.tobytes()) not in earlier:  # Rays may return to the landmark that they left.
         earlier.add(key)
         found = find_crossings(state, sized)
-        two = found.odds < 0
+        two = (found.odds < 0) & (found.smaller > 1)  # A single ray is no thing that a search finds. It goes in the end.
         if len(earlier) > _TURNS or not two.any():
             break
         split = _alternate(task, state.split(found.landmark[two], found.second, found.position[two]))

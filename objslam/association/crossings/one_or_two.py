@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.association.crossings.bundles import second_bundle
+from objslam.association.crossings.bundles import COUNTED, TIGHTNESS, Bundles, second_bundle
+from objslam.association.crossings.positions import FreeFit, fit_freely, fit_points, points_along
 from objslam.association.crossings.usual_views import UsualViews
 from objslam.association.gating import gated_edges
 from objslam.association.landmarks import State
 from objslam.association.observations import MIN_DEPTH
-from objslam.association.refinement import grouped_sums, refine, squared_offsets, variance
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.statistics import STRAY_RAY, grouped_median
+from objslam.core.statistics import STRAY_RAY
 
 _GAP = np.radians(2.0)
 """The least gap (rad) between the two bundles of a landmark. Closer bundles are one stretch of the path. A smaller gap tests
@@ -27,12 +27,6 @@ more landmarks."""
 _HIDDEN, _HIDDEN_WIDTH = 0.1, 4.6
 """The assumed share of views that show only a part of a thing, and the width of the uniform distribution of their ln size: a
 factor of 100. With a larger share, different sizes tell less."""
-_COUNTED = 10
-"""The most boxes of a bundle that count as independent measurements of its growth, as in `existence`. A larger number trusts
-growing boxes more."""
-_TIGHTNESS = 0.1
-"""The standard deviation by which ln size may change over a bundle beside the distance: a detector's boxes are less tight
-around small things. A larger value trusts growing boxes less."""
 _ASSUMED = 3
 """The number of landmarks that are assumed to have the usual gain, beside those of the log. With a larger number, errors
 that rays share make more landmarks two."""
@@ -41,10 +35,6 @@ _FREE = 3
 _USUAL_GAIN = 2.366
 """The median by which the cost of the rays of one thing falls if two points explain them: that of chi-squared with `_FREE`
 degrees of freedom."""
-_STEPS = 48
-"""The number of distances that are tried for a bundle, evenly in ln distance. A larger number is more exact, and slower."""
-_NEAREST, _FURTHEST = 0.03, 2.0
-"""The least and the greatest tried distance of a bundle, in usual distances of its class."""
 
 
 @dataclass(frozen=True)
@@ -52,64 +42,15 @@ class Crossings:
     """S landmarks whose rays come in two bundles.
 
     landmark: (S,). second: (R,) whether a ray is in the second bundle of its landmark. odds: (S,) log odds that the landmark
-    is one thing. position: (S, 2, 3) m, where the two things are if it is two.
+    is one thing. A positive value can be too small. position: (S, 2, 3) m, where the two things are if it is two. smaller:
+    (S,) the number of rays of the smaller bundle.
     """
 
     landmark: Ints
     second: Bools
     odds: Floats
     position: Floats
-
-
-@dataclass(frozen=True)
-class _Bundles:
-    """G = 2 S bundles of S landmarks. The bundles of landmark i are 2 i and 2 i + 1.
-
-    ray, group: (P,) the rays, and the bundle of each. landmark: (G,) of each bundle. noise: (G,) factor on the noise of its
-    rays. counted: (G,) how many boxes count as independent.
-    """
-
-    usual: UsualViews
-    ray: Ints
-    group: Ints
-    landmark: Ints
-    noise: Floats
-    counted: Ints
-
-    @property
-    def state(self) -> State:
-        return self.usual.state
-
-    @property
-    def count(self) -> int:
-        return len(self.landmark)
-
-    def bearing_cost(self, position: Floats) -> Floats:
-        """Return the sum (G,) of the squared deviations of the rays of each bundle from a point (G, 3) m."""
-        off2, away = squared_offsets(self.state.obs, position[self.group], self.ray)
-        squared = off2 / variance(self.state.obs, away, self.noise[self.group], self.ray)
-        return np.asarray(np.bincount(self.group, np.minimum(squared, STRAY_RAY), self.count), dtype=float)
-
-    def distance(self, position: Floats) -> Floats:
-        """Return the median distance (G,) m of each bundle's cameras from a point (G, 3) m."""
-        away = np.linalg.norm(position[self.group] - self.state.obs.origin[self.ray], axis=1)
-        return grouped_median(away, self.group, self.count)
-
-    def size(self, position: Floats) -> tuple[Floats, Floats]:
-        """Return the median ln size (G,) of each bundle's boxes if they show a thing at a point (G, 3) m, NaN without sizes,
-        and the log likelihood (G,) of how they grow, up to a constant.
-
-        The likelihood is that of a normal distribution of unknown variance.
-        """
-        away = np.linalg.norm(position[self.group] - self.state.obs.origin[self.ray], axis=1)
-        ln_size = self.usual.ln_size[self.ray] + np.log(np.maximum(away, MIN_DEPTH))
-        told = np.isfinite(ln_size)
-        group, ln_size = self.group[told], ln_size[told]
-        number = np.maximum(np.bincount(group, minlength=self.count), 1)
-        mean = np.bincount(group, ln_size, self.count) / number
-        scatter2 = np.bincount(group, (ln_size - mean[group]) ** 2, self.count) / number + _TIGHTNESS**2
-        growth = -0.5 * self.counted * np.log(scatter2)
-        return grouped_median(ln_size, group, self.count), np.asarray(growth, dtype=float)
+    smaller: Ints
 
 
 def find_crossings(state: State, sized: Bools) -> Crossings:
@@ -122,24 +63,47 @@ def find_crossings(state: State, sized: Bools) -> Crossings:
     second[state.assigned] = second_bundle(state.obs.direction[state.assigned], state.owner, state.count, _GAP)
     two = np.flatnonzero(np.bincount(state.owner, second[state.assigned], state.count))
     if not len(two):
-        return Crossings(two, second, np.zeros(0), np.zeros((0, 2, 3)))
+        return Crossings(two, second, np.zeros(0), np.zeros((0, 2, 3)), two)
     ray = state.assigned[np.isin(state.owner, two)]
     group = 2 * np.searchsorted(two, state.matched[ray]) + second[ray]
     number, landmark = np.bincount(group, minlength=2 * len(two)), np.repeat(two, 2)
     # The noise of the class, because a landmark that is two has much noise of its own.
     noise = state.class_noise[state.label[landmark]]
-    bundles = _Bundles(UsualViews.of(state, sized), ray, group, landmark, noise, np.minimum(number, _COUNTED))
+    bundles = Bundles(UsualViews.of(state, sized), ray, group, landmark, noise, np.minimum(number, COUNTED))
     one, one_cost = _as_one(bundles)
-    alone, alone_cost, position = _alone(bundles)
+    free, free_cost = fit_freely(bundles)
     other, other_cost = _as_another(bundles)
-    (a, b), (c, d) = alone.reshape(-1, 2).T, other.reshape(-1, 2).T
-    (p, q), (r, s) = alone_cost.reshape(-1, 2).T, other_cost.reshape(-1, 2).T
-    better = _bearing_odds(one_cost - np.array([p + q, p + s, r + q]))
-    better[0, _overlap(bundles, position)] = -np.inf
-    return Crossings(two, second, one - (np.array([a + b, a + d, c + b]) + better).max(axis=0), position.reshape(-1, 2, 3))
+    excess = _excess(one_cost - free_cost.reshape(-1, 2).sum(axis=1))
+    two_things = _as_two((_most(bundles, free), free_cost), (other, other_cost))
+    odds = one - (two_things[0] + _bearing_odds(one_cost - two_things[1], excess, len(two))).max(axis=0)
+    position, open_ = free.position.copy(), np.flatnonzero(odds < 0)
+    if len(open_):  # Only these can be two. To try all distances takes most of the time.
+        pair = (2 * open_[:, None] + np.arange(2)).ravel()
+        alone, alone_cost, position[pair] = _alone(bundles.take(pair), free.take(pair))
+        two_things = _as_two((alone, alone_cost), (other[pair], other_cost[pair]))
+        better = _bearing_odds(one_cost[open_] - two_things[1], excess[open_], len(two))
+        better[0, _overlap(bundles.take(pair), position[pair])] = -np.inf
+        odds[open_] = one[open_] - (two_things[0] + better).max(axis=0)
+    return Crossings(two, second, odds, position.reshape(-1, 2, 3), number.reshape(-1, 2).min(axis=1))
 
 
-def _overlap(bundles: _Bundles, position: Floats) -> Bools:
+def _as_two(alone: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """Return the log likelihoods (3, S) and the costs (3, S) of pairs of bundles as two things: two new ones, or a new one
+    and another landmark, in both orders. alone, other: the log likelihood (G,) and the cost (G,) of each bundle."""
+    (a, b), (c, d) = alone[0].reshape(-1, 2).T, other[0].reshape(-1, 2).T
+    (p, q), (r, s) = alone[1].reshape(-1, 2).T, other[1].reshape(-1, 2).T
+    return np.array([a + b, a + d, c + b]), np.array([p + q, p + s, r + q])
+
+
+def _most(bundles: Bundles, free: FreeFit) -> Floats:
+    """Return the greatest log likelihood (G,) that a bundle as a thing of its own can have beside its bearings."""
+    usual, landmark = bundles.usual, bundles.landmark
+    variance_ = usual.class_spread[landmark] ** 2 + usual.view**2
+    size = np.maximum(_size_odds(usual.class_mean[landmark], usual.class_mean[landmark], variance_), 0.0)
+    return usual.log_density[landmark] + free.log_volume - bundles.counted * np.log(TIGHTNESS) + size
+
+
+def _overlap(bundles: Bundles, position: Floats) -> Bools:
     """Return for each pair (S,) of bundles whether things of their size at points (G, 3) m would overlap.
 
     Two things do not. The rays to the middles of the boxes of a large thing, from two sides, do not meet in one point, and
@@ -161,28 +125,40 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
     return replace(state, matched=matched)
 
 
-def _bearing_odds(gain: Floats) -> Floats:
-    """Return the log odds (K, S) of two things over one by bearings.
+def _excess(gain: Floats) -> Floats:
+    """Return for each landmark (S,) the factor, at least 1, by which two points gain more than by noise.
 
     Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. The
-    median gain of the other landmarks tells how much better. It is as uncertain as their number says, so that the odds are
-    those of an F distribution.
-
-    gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. The first explanation
-    has two points of its own.
+    median gain of the other landmarks tells how much better. gain: (S,) by how much two free points lower the cost.
     """
-    number = gain.shape[1] - 1 + _ASSUMED
-    usual = [np.median(np.append(np.delete(gain[0], j), np.full(_ASSUMED, _USUAL_GAIN))) for j in range(gain.shape[1])]
-    excess = np.maximum(1.0, np.array(usual) / _USUAL_GAIN)
+    every = np.append(gain, np.full(_ASSUMED, _USUAL_GAIN))
+    order = np.argsort(every, kind="stable")
+    rank = np.argsort(order, kind="stable")[: len(gain)]
+    # Without a landmark's own gain, all gains behind it move one place ahead.
+    middle = [(len(every) - 2) // 2, (len(every) - 1) // 2]
+    usual = np.mean([every[order[at + (at >= rank)]] for at in middle], axis=0)
+    return np.maximum(1.0, usual / _USUAL_GAIN)
+
+
+def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
+    """Return the log odds (K, S) of two things over one by bearings.
+
+    The excess is as uncertain as the number of landmarks says, so that the odds are those of an F distribution.
+
+    gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) as of
+    `_excess`. landmarks: how many gains told it.
+    """
+    number = landmarks - 1 + _ASSUMED
     tail = 0.5 * (number + _FREE) * np.log1p(np.maximum(gain, 0.0) / (excess * number))
     return np.asarray(tail + 0.5 * np.minimum(gain, 0.0) / excess)
 
 
-def _as_one(bundles: _Bundles) -> tuple[Floats, Floats]:
+def _as_one(bundles: Bundles) -> tuple[Floats, Floats]:
     """Return the log likelihood (S,) of each pair of bundles as one thing without that of its bearings, and their cost
     (S,)."""
     usual, landmark = bundles.usual, bundles.landmark[::2]
-    position, log_volume, _ = _fit(bundles, bundles.group // 2, landmark, bundles.noise[::2])
+    start = bundles.state.landmarks.position[landmark]
+    position, log_volume, _ = fit_points(bundles, bundles.group // 2, landmark, bundles.noise[::2], start)
     both = np.repeat(position, 2, axis=0)
     size, growth = bundles.size(both)
     each = growth + usual.far_odds(bundles.distance(both), bundles.landmark)
@@ -194,7 +170,7 @@ def _as_one(bundles: _Bundles) -> tuple[Floats, Floats]:
     return np.asarray(rest), bundles.bearing_cost(both).reshape(-1, 2).sum(axis=1)
 
 
-def _alone(bundles: _Bundles) -> tuple[Floats, Floats, Floats]:
+def _alone(bundles: Bundles, free: FreeFit) -> tuple[Floats, Floats, Floats]:
     """Return the log likelihood (G,) of each bundle as a thing of its own without that of its bearings, their cost (G,), and
     where it most likely is (G, 3) m.
 
@@ -202,22 +178,21 @@ def _alone(bundles: _Bundles) -> tuple[Floats, Floats, Floats]:
     decide between them.
     """
     usual, landmark = bundles.usual, bundles.landmark
-    fitted, log_volume, along = _fit(bundles, bundles.group, landmark, bundles.noise)
     mean, spread2 = usual.class_mean[landmark], usual.class_spread[landmark] ** 2 + usual.view**2
-    tried = np.stack([*_along(bundles), fitted])  # (K, G, 3)
-    fit, size, cost = np.empty((3, *tried.shape[:2]))
+    tried = np.stack([*points_along(bundles), free.position])  # (K, G, 3)
+    growth, size, cost, distance = np.empty((4, *tried.shape[:2]))
     for k, points in enumerate(tried):
-        size[k], growth = bundles.size(points)
-        fit[k] = growth + usual.far_odds(bundles.distance(points), landmark)
-        cost[k] = bundles.bearing_cost(points)
+        size[k], growth[k] = bundles.size(points)
+        distance[k], cost[k] = bundles.distance(points), bundles.bearing_cost(points)
+    fit = growth + usual.far_odds(distance.ravel(), np.tile(landmark, len(tried))).reshape(distance.shape)
     best = (fit - 0.5 * cost + _size_odds(size, mean, spread2)).argmax(axis=0), np.arange(bundles.count)
     # Where the bearings do not tell the distance, the size of the thing is not known either.
-    loose = np.minimum(along / np.maximum(bundles.distance(tried[best]), MIN_DEPTH), 1.0)
+    loose = np.minimum(free.along / np.maximum(distance[best], MIN_DEPTH), 1.0)
     sizes = _size_odds(size[best], mean, spread2 + loose**2)
-    return usual.log_density[landmark] + log_volume + fit[best] + sizes, cost[best], tried[best]
+    return usual.log_density[landmark] + free.log_volume + fit[best] + sizes, cost[best], tried[best]
 
 
-def _as_another(bundles: _Bundles) -> tuple[Floats, Floats]:
+def _as_another(bundles: Bundles) -> tuple[Floats, Floats]:
     """Return the log likelihood (G,) of each bundle as rays of another landmark without that of its bearings, and their cost
     (G,). The likelihood is -inf if no other landmark fits."""
     state, usual = bundles.state, bundles.usual
@@ -242,47 +217,6 @@ def _as_another(bundles: _Bundles) -> tuple[Floats, Floats]:
     fit = growth + usual.far_odds(bundles.distance(at), bundles.landmark)
     alike = _size_odds(size, usual.size[to], np.full(bundles.count, 2 * usual.view**2))
     return np.where(to >= 0, fit + alike, -np.inf), number * STRAY_RAY - most
-
-
-def _fit(bundles: _Bundles, index: Ints, landmark: Ints, noise: Floats) -> tuple[Floats, Floats, Floats]:
-    """Fit points to groups of rays.
-
-    Returns the positions (N, 3) m, ln of the volume (N,) m^3 over which the likelihood integrates, and the standard
-    deviation (N,) m along the direction that is known least. Without parallax, the usual distance of the class limits both.
-    index: (P,) the group of each ray. landmark, noise: (N,) of each group.
-    """
-    state, ray, count = bundles.state, bundles.ray, len(landmark)
-    position = refine(state.obs, ray, index, state.landmarks.position[landmark], noise)
-    away = np.maximum(np.linalg.norm(position[index] - state.obs.origin[ray], axis=1), MIN_DEPTH)
-    n = state.obs.direction[ray]
-    across = (np.eye(3) - n[:, :, None] * n[:, None, :]) / variance(state.obs, away, noise[index], ray)[:, None, None]
-    information = grouped_sums(across.reshape(-1, 9), index, count).reshape(-1, 3, 3)
-    # A uniform distribution over the usual distance has its variance.
-    information += (12 / bundles.usual.distance[landmark] ** 2)[:, None, None] * np.eye(3)
-    eigenvalues = np.linalg.eigvalsh(information)
-    log_volume = 1.5 * np.log(2 * np.pi) - 0.5 * np.log(eigenvalues).sum(axis=1)
-    return position, log_volume, 1 / np.sqrt(eigenvalues[:, 0])
-
-
-def _along(bundles: _Bundles) -> list[Floats]:
-    """Return points (G, 3) m at several distances along the mean ray of each bundle, where its rays agree best.
-
-    The distance counts from the foremost camera, so that the points lie in front of all cameras.
-    """
-    obs, ray, group, count = bundles.state.obs, bundles.ray, bundles.group, bundles.count
-    mean = grouped_sums(obs.direction[ray], group, count)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
-    ahead = np.einsum("pi,pi->p", obs.origin[ray], mean[group])
-    foremost = np.full(count, -np.inf)
-    np.maximum.at(foremost, group, ahead)
-    slope = np.maximum(np.einsum("pi,pi->p", obs.direction[ray], mean[group]), 0.1)
-    points = []
-    for share in np.geomspace(_NEAREST, _FURTHEST, _STEPS).tolist():
-        reach = (foremost[group] - ahead + share * bundles.usual.distance[bundles.landmark][group]) / slope
-        weight = 1 / variance(obs, reach, bundles.noise[group], ray)
-        at = obs.origin[ray] + reach[:, None] * obs.direction[ray]
-        points.append(grouped_sums(weight[:, None] * at, group, count) / np.bincount(group, weight, count)[:, None])
-    return points
 
 
 def _size_odds(size: Floats, mean: Floats, variance_: Floats) -> Floats:
