@@ -279,7 +279,7 @@ def _merge_all(task: _Task, state: State) -> State:
 
 
 def _merged_and_dropped(task: _Task, state: State) -> tuple[State, Floats, Bools]:
-    """Merge and drop landmarks until none is left to drop. Also return the existence (N,), and the rays (R,) of dropped ones."""
+    """Merge and drop landmarks until none is left to drop. Also return existence (N,), and the rays (R,) of dropped ones."""
     refuted = np.zeros(len(state.matched), dtype=bool)
     for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
         merged = _merge_all(task, state)
