@@ -118,7 +118,8 @@ def associate_globally(
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
     state, likely = _by_size(task, state, likely, sized)
     if keyframes.localized_every:
-        state = without_smaller_bundles(state, sized)  # Their things are no landmarks, so that the rays always return.
+        # The things of these bundles are no landmarks, so that their rays always return.
+        state = without_smaller_bundles(state, sized, task.settings.min_rays)
         stays = _plausible(task, state)
         state, likely = state.keep(stays), likely[stays]
     return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])
@@ -291,15 +292,13 @@ def _merged_and_dropped(task: _Task, state: State) -> tuple[State, Floats, Bools
 
 
 def _without_crossings(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats, Bools]:
-    """Split landmarks that are two things whose rays cross, and search again among the rays that this sets free.
-
-    likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees sizes. Returns as `_merged_and_dropped`.
-    """
+    """Split landmarks that are two things whose rays cross, and search again among the rays that this sets free. Return as
+    `_merged_and_dropped`. likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees sizes."""
     refuted, earlier = np.zeros(len(state.matched), dtype=bool), set[bytes]()
     while (key := state.matched.tobytes()) not in earlier:  # Rays may return to the landmark that they left.
         earlier.add(key)
-        found = find_crossings(state, sized)
-        two = (found.odds < 0) & (found.smaller > 1)  # A single ray is no thing that a search finds. It goes in the end.
+        found = find_crossings(state, sized, task.settings.min_rays)
+        two = found.odds < 0
         if len(earlier) > _TURNS or not two.any():
             break
         split = _alternate(task, state.split(found.landmark[two], found.second, found.position[two]))

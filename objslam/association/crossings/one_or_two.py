@@ -42,28 +42,31 @@ class Crossings:
     """S landmarks whose rays come in two bundles.
 
     landmark: (S,). second: (R,) whether a ray is in the second bundle of its landmark. odds: (S,) log odds that the landmark
-    is one thing. A positive value can be too small. position: (S, 2, 3) m, where the two things are if it is two. smaller:
-    (S,) the number of rays of the smaller bundle.
+    is one thing. A positive value can be too small. position: (S, 2, 3) m, where the two things are if it is two.
     """
 
     landmark: Ints
     second: Bools
     odds: Floats
     position: Floats
-    smaller: Ints
 
 
-def find_crossings(state: State, sized: Bools) -> Crossings:
+def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     """Compare one thing and two things as explanations of each landmark whose rays come in two bundles.
 
     Things of a class lie anywhere in the mapped space, as dense as its landmarks. The second thing of a landmark may also be
-    another landmark that fits the bundle's rays. sized: (R,) whether the camera of each ray observes sizes.
+    another landmark that fits the bundle's rays. Both bundles have boxes with sizes: without sizes, nothing but the bearings
+    tells how far away a bundle's thing is, and rays of one stretch of the path share errors.
+
+    sized: (R,) whether the camera of each ray observes sizes. fewest: the number of such boxes that a bundle must have.
     """
     second = np.zeros(len(state.obs), dtype=bool)
-    second[state.assigned] = second_bundle(state.obs.direction[state.assigned], state.owner, state.count, _GAP)
+    told = (sized & (state.obs.size > 0).all(axis=1))[state.assigned]
+    direction = state.obs.direction[state.assigned]
+    second[state.assigned] = second_bundle(direction, state.owner, state.count, _GAP, told, fewest)
     two = np.flatnonzero(np.bincount(state.owner, second[state.assigned], state.count))
     if not len(two):
-        return Crossings(two, second, np.zeros(0), np.zeros((0, 2, 3)), two)
+        return Crossings(two, second, np.zeros(0), np.zeros((0, 2, 3)))
     ray = state.assigned[np.isin(state.owner, two)]
     group = 2 * np.searchsorted(two, state.matched[ray]) + second[ray]
     number, landmark = np.bincount(group, minlength=2 * len(two)), np.repeat(two, 2)
@@ -84,7 +87,7 @@ def find_crossings(state: State, sized: Bools) -> Crossings:
         better = _bearing_odds(one_cost[open_] - two_things[1], excess[open_], len(two))
         better[0, _overlap(bundles.take(pair), position[pair])] = -np.inf
         odds[open_] = one[open_] - (two_things[0] + better).max(axis=0)
-    return Crossings(two, second, odds, position.reshape(-1, 2, 3), number.reshape(-1, 2).min(axis=1))
+    return Crossings(two, second, odds, position.reshape(-1, 2, 3))
 
 
 def _as_two(alone: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
@@ -113,10 +116,10 @@ def _overlap(bundles: Bundles, position: Floats) -> Bools:
     return np.asarray(apart < np.exp(bundles.size(position)[0]).reshape(-1, 2).mean(axis=1))
 
 
-def without_smaller_bundles(state: State, sized: Bools) -> State:
-    """Return the state without the rays of the smaller bundle of each landmark that is two things. sized: as in
-    `find_crossings`."""
-    found = find_crossings(state, sized)
+def without_smaller_bundles(state: State, sized: Bools, fewest: int) -> State:
+    """Return the state without the rays of the smaller bundle of each landmark that is two things. sized, fewest:
+    as in `find_crossings`."""
+    found = find_crossings(state, sized, fewest)
     mine = np.flatnonzero(np.isin(state.matched, found.landmark[found.odds < 0]))
     second = np.bincount(state.owner, found.second[state.assigned], state.count)
     smaller = found.second[mine] == (2 * second <= state.ray_count)[state.matched[mine]]
