@@ -119,7 +119,7 @@ def associate_globally(
     state, likely = _by_size(task, state, likely, sized)
     if keyframes.localized_every:
         # The things of these bundles are no landmarks, so that their rays always return.
-        state = without_smaller_bundles(state, sized, task.settings.min_rays)
+        state = without_smaller_bundles(state, sized)
         stays = _plausible(task, state)
         state, likely = state.keep(stays), likely[stays]
     return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])

@@ -116,10 +116,10 @@ def _overlap(bundles: Bundles, position: Floats) -> Bools:
     return np.asarray(apart < np.exp(bundles.size(position)[0]).reshape(-1, 2).mean(axis=1))
 
 
-def without_smaller_bundles(state: State, sized: Bools, fewest: int) -> State:
-    """Return the state without the rays of the smaller bundle of each landmark that is two things. sized, fewest:
-    as in `find_crossings`."""
-    found = find_crossings(state, sized, fewest)
+def without_smaller_bundles(state: State, sized: Bools) -> State:
+    """Return the state without the rays of the smaller bundle of each landmark that is two things. A single ray of another
+    thing can give a landmark all its parallax. sized: as in `find_crossings`."""
+    found = find_crossings(state, sized, fewest=1)
     mine = np.flatnonzero(np.isin(state.matched, found.landmark[found.odds < 0]))
     second = np.bincount(state.owner, found.second[state.assigned], state.count)
     smaller = found.second[mine] == (2 * second <= state.ray_count)[state.matched[mine]]
