@@ -11,6 +11,7 @@ import numpy as np
 
 from objslam import config
 from objslam.association.appearance.evidence import learn_ratio
+from objslam.association.crossings.one_or_two import find_crossings, without_smaller_bundles
 from objslam.association.existence import chance_odds, existence, rest_odds
 from objslam.association.gating import alternate, explained, gate_limit, near, size_costs
 from objslam.association.hypothesis_search import Search, discover
@@ -104,20 +105,23 @@ def associate_globally(
     state, refuted, moving = _search(task, state, nothing)
     if moving.count and keyframes.localized_every:  # At poses that drift, things at rest seem to move.
         state, refuted = _at_rest(task, state, refuted, moving)
-    state = _add_distant(task, state)
-    for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
-        merged = _merge_all(task, state)
-        state, likely = _drop_all(task, merged)
-        refuted |= (merged.matched >= 0) & (state.matched < 0)
-        if state.count == merged.count:
-            break
+    state, likely, dropped = _merged_and_dropped(task, _add_distant(task, state))
+    refuted |= dropped
+    sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
+    if keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
+        state, likely, dropped = _without_crossings(task, state, likely, sized)
+        refuted |= dropped
     if state.ratio is not None:
         state, likely = _drop_all(task, _annealed(task, state))
     if settings.association.fuse_labels:
         landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
-    sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
     state, likely = _by_size(task, state, likely, sized)
+    if keyframes.localized_every:
+        # The things of these bundles are no landmarks, so that their rays always return.
+        state = without_smaller_bundles(state, sized)
+        stays = _plausible(task, state)
+        state, likely = state.keep(stays), likely[stays]
     return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])
 
 
@@ -273,6 +277,36 @@ def _merge_all(task: _Task, state: State) -> State:
             if state.count == before:
                 break
     return state
+
+
+def _merged_and_dropped(task: _Task, state: State) -> tuple[State, Floats, Bools]:
+    """Merge and drop landmarks until none is left to drop. Also return existence (N,), and the rays (R,) of dropped ones."""
+    refuted = np.zeros(len(state.matched), dtype=bool)
+    for _ in range(_ROUNDS):  # Without the rays of a dropped landmark, two other landmarks may turn out to be one object.
+        merged = _merge_all(task, state)
+        state, likely = _drop_all(task, merged)
+        refuted |= (merged.matched >= 0) & (state.matched < 0)
+        if state.count == merged.count:
+            break
+    return state, likely, refuted
+
+
+def _without_crossings(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats, Bools]:
+    """Split landmarks that are two things whose rays cross, and search again among the rays that this sets free. Return as
+    `_merged_and_dropped`. likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees sizes."""
+    refuted, earlier = np.zeros(len(state.matched), dtype=bool), set[bytes]()
+    while (key := state.matched.tobytes()) not in earlier:  # Rays may return to the landmark that they left.
+        earlier.add(key)
+        found = find_crossings(state, sized, task.settings.min_rays)
+        two = found.odds < 0
+        if len(earlier) > _TURNS or not two.any():
+            break
+        split = _alternate(task, state.split(found.landmark[two], found.second, found.position[two]))
+        searched, dropped, _ = _search(task, split, split.landmarks.take(np.zeros(0, dtype=np.int64)))
+        refuted |= dropped
+        state, likely, dropped = _merged_and_dropped(task, searched)
+        refuted |= dropped
+    return state, likely, refuted
 
 
 def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:

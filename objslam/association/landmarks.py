@@ -185,3 +185,15 @@ class State:
         np.logical_or.at(accepts, target, self.landmarks.accepts)
         landmarks, matched = replace(self.landmarks, accepts=accepts), np.append(target, -1)[self.matched]
         return replace(self, landmarks=landmarks, matched=matched).keep(target == np.arange(len(target)))
+
+    def split(self, which: Ints, second: Bools, position: Floats) -> State:
+        """Split the landmarks `which` (S,) in two. The second of each comes after all others, and gets its rays that are in
+        the mask `second` (R,). position: (S, 2, 3) m, of both."""
+        number = np.full(self.count + 1, -1)
+        number[which] = self.count + np.arange(len(which))
+        moved = self.landmarks.position.copy()
+        moved[which] = position[:, 0]
+        new = replace(self.landmarks.take(which), position=position[:, 1])
+        landmarks = replace(self.landmarks, position=moved).and_also(new)
+        matched = np.where(second & (number[self.matched] >= 0), number[self.matched], self.matched)
+        return replace(self, landmarks=landmarks, matched=matched)

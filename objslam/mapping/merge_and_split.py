@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.association.appearance.evidence import Looks, learn_ratio
+from objslam.association.crossings.bundles import second_bundle
 from objslam.association.duplicates import near_pairs, seen_as_two
-from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats
 from objslam.core.statistics import SAME_POINT
 from objslam.core.types import Association, Rays
@@ -68,7 +68,7 @@ def split_at_gaps(direction: Floats, association: Association, used: Bools, fewe
     """Split objects whose rays come in two bundles: there is a wide gap between the directions of the rays.
 
     The bundles may be two things, such as the signs on both sides of a wall. If a path is bent to bring them together, all
-    their rays agree with one point. The gap is searched along the line on which the directions spread most.
+    their rays agree with one point.
 
     Args:
         direction: (R, 3) unit, of the rays in map.
@@ -76,29 +76,12 @@ def split_at_gaps(direction: Floats, association: Association, used: Bools, fewe
         used: (R,) the rays that agree with their objects. The others go with the bundle on their side of the gap.
         fewest: the fewest used rays of a bundle.
     """
-    mine, count = np.flatnonzero(used & (association.object >= 0)), association.count
-    owner, number = association.object[mine], np.bincount(association.object[mine], minlength=count)
-    mean = grouped_sums(direction[mine], owner, count) / np.maximum(number, 1)[:, None]
-    off = direction[mine] - mean[owner]
-    scatter = grouped_sums((off[:, :, None] * off[:, None, :]).reshape(-1, 9), owner, count).reshape(-1, 3, 3)
-    axis = np.linalg.eigh(scatter)[1][:, :, -1]
-    along = np.einsum("ri,ri->r", off, axis[owner])
-    order = np.lexsort((along, owner))
-    owner, along = owner[order], along[order]
-    before = np.arange(len(owner)) - (np.cumsum(number) - number)[owner] + 1  # Rays of the object up to each one.
-    gap = np.append(np.diff(along), 0.0)
-    gap[(before < fewest) | (number[owner] - before < fewest)] = 0.0
-    widest = np.zeros(count)
-    np.maximum.at(widest, owner, gap)
-    border = np.full(count, np.inf)
-    at = np.flatnonzero((gap == widest[owner]) & (gap >= _GAP))
-    border[owner[at]] = along[at] + gap[at] / 2
-    two = np.flatnonzero(np.isfinite(border))
+    held = np.flatnonzero(association.object >= 0)
+    owner, count = association.object[held], association.count
+    beyond = second_bundle(direction[held], owner, count, _GAP, used[held], fewest)
+    two = np.flatnonzero(np.bincount(owner, beyond, count))
     second = np.full(count, -1)
     second[two] = count + np.arange(len(two))
-    held = np.flatnonzero(association.object >= 0)
-    own = association.object[held]
-    beyond = np.einsum("ri,ri->r", direction[held] - mean[own], axis[own]) > border[own]
     found = association.object.copy()
-    found[held[beyond]] = second[own[beyond]]
+    found[held[beyond]] = second[owner[beyond]]
     return Association(found, np.append(association.label, association.label[two]))

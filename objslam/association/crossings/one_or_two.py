@@ -1,0 +1,229 @@
+"""Tell one thing from two things whose rays cross. In tracking by bearings, such a crossing is a ghost.
+
+Rays from a short stretch of the path, a bundle, hardly tell how far away their thing is. Two bundles in a plane always meet
+somewhere. So two stretches that see two things give a landmark behind both, or between them, and all rays fit it. The
+likelihood of all data of both bundles tells which explanation is right: of bearings, of the sizes of boxes, of how they
+grow, and of distances, which are usual for the class or not. The unknown positions are integrated out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.association.crossings.bundles import COUNTED, TIGHTNESS, Bundles, second_bundle
+from objslam.association.crossings.positions import FreeFit, fit_freely, fit_points, points_along
+from objslam.association.crossings.usual_views import UsualViews
+from objslam.association.gating import gated_edges
+from objslam.association.landmarks import State
+from objslam.association.observations import MIN_DEPTH
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.statistics import STRAY_RAY
+
+_GAP = np.radians(2.0)
+"""The least gap (rad) between the two bundles of a landmark. Closer bundles are one stretch of the path. A smaller gap tests
+more landmarks."""
+_HIDDEN, _HIDDEN_WIDTH = 0.1, 4.6
+"""The assumed share of views that show only a part of a thing, and the width of the uniform distribution of their ln size: a
+factor of 100. With a larger share, different sizes tell less."""
+_ASSUMED = 3
+"""The number of landmarks that are assumed to have the usual gain, beside those of the log. With a larger number, errors
+that rays share make more landmarks two."""
+_FREE = 3
+"""The degrees of freedom of a second point."""
+_USUAL_GAIN = 2.366
+"""The median by which the cost of the rays of one thing falls if two points explain them: that of chi-squared with `_FREE`
+degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """S landmarks whose rays come in two bundles.
+
+    landmark: (S,). second: (R,) whether a ray is in the second bundle of its landmark. odds: (S,) log odds that the landmark
+    is one thing. A positive value can be too small. position: (S, 2, 3) m, where the two things are if it is two.
+    """
+
+    landmark: Ints
+    second: Bools
+    odds: Floats
+    position: Floats
+
+
+def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
+    """Compare one thing and two things as explanations of each landmark whose rays come in two bundles.
+
+    Things of a class lie anywhere in the mapped space, as dense as its landmarks. The second thing of a landmark may also be
+    another landmark that fits the bundle's rays. Both bundles have boxes with sizes: without sizes, nothing but the bearings
+    tells how far away a bundle's thing is, and rays of one stretch of the path share errors.
+
+    sized: (R,) whether the camera of each ray observes sizes. fewest: the number of such boxes that a bundle must have.
+    """
+    second = np.zeros(len(state.obs), dtype=bool)
+    told = (sized & (state.obs.size > 0).all(axis=1))[state.assigned]
+    direction = state.obs.direction[state.assigned]
+    second[state.assigned] = second_bundle(direction, state.owner, state.count, _GAP, told, fewest)
+    two = np.flatnonzero(np.bincount(state.owner, second[state.assigned], state.count))
+    if not len(two):
+        return Crossings(two, second, np.zeros(0), np.zeros((0, 2, 3)))
+    ray = state.assigned[np.isin(state.owner, two)]
+    group = 2 * np.searchsorted(two, state.matched[ray]) + second[ray]
+    number, landmark = np.bincount(group, minlength=2 * len(two)), np.repeat(two, 2)
+    # The noise of the class, because a landmark that is two has much noise of its own.
+    noise = state.class_noise[state.label[landmark]]
+    bundles = Bundles(UsualViews.of(state, sized), ray, group, landmark, noise, np.minimum(number, COUNTED))
+    one, one_cost = _as_one(bundles)
+    free, free_cost = fit_freely(bundles)
+    other, other_cost = _as_another(bundles)
+    excess = _excess(one_cost - free_cost.reshape(-1, 2).sum(axis=1))
+    two_things = _as_two((_most(bundles, free), free_cost), (other, other_cost))
+    odds = one - (two_things[0] + _bearing_odds(one_cost - two_things[1], excess, len(two))).max(axis=0)
+    position, open_ = free.position.copy(), np.flatnonzero(odds < 0)
+    if len(open_):  # Only these can be two. To try all distances takes most of the time.
+        pair = (2 * open_[:, None] + np.arange(2)).ravel()
+        alone, alone_cost, position[pair] = _alone(bundles.take(pair), free.take(pair))
+        two_things = _as_two((alone, alone_cost), (other[pair], other_cost[pair]))
+        better = _bearing_odds(one_cost[open_] - two_things[1], excess[open_], len(two))
+        better[0, _overlap(bundles.take(pair), position[pair])] = -np.inf
+        odds[open_] = one[open_] - (two_things[0] + better).max(axis=0)
+    return Crossings(two, second, odds, position.reshape(-1, 2, 3))
+
+
+def _as_two(alone: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
+    """Return the log likelihoods (3, S) and the costs (3, S) of pairs of bundles as two things: two new ones, or a new one
+    and another landmark, in both orders. alone, other: the log likelihood (G,) and the cost (G,) of each bundle."""
+    (a, b), (c, d) = alone[0].reshape(-1, 2).T, other[0].reshape(-1, 2).T
+    (p, q), (r, s) = alone[1].reshape(-1, 2).T, other[1].reshape(-1, 2).T
+    return np.array([a + b, a + d, c + b]), np.array([p + q, p + s, r + q])
+
+
+def _most(bundles: Bundles, free: FreeFit) -> Floats:
+    """Return the greatest log likelihood (G,) that a bundle as a thing of its own can have beside its bearings."""
+    usual, landmark = bundles.usual, bundles.landmark
+    variance_ = usual.class_spread[landmark] ** 2 + usual.view**2
+    size = np.maximum(_size_odds(usual.class_mean[landmark], usual.class_mean[landmark], variance_), 0.0)
+    return usual.log_density[landmark] + free.log_volume - bundles.counted * np.log(TIGHTNESS) + size
+
+
+def _overlap(bundles: Bundles, position: Floats) -> Bools:
+    """Return for each pair (S,) of bundles whether things of their size at points (G, 3) m would overlap.
+
+    Two things do not. The rays to the middles of the boxes of a large thing, from two sides, do not meet in one point, and
+    two points inside it explain them better.
+    """
+    apart = np.linalg.norm(position[::2] - position[1::2], axis=1)
+    return np.asarray(apart < np.exp(bundles.size(position)[0]).reshape(-1, 2).mean(axis=1))
+
+
+def without_smaller_bundles(state: State, sized: Bools) -> State:
+    """Return the state without the rays of the smaller bundle of each landmark that is two things. A single ray of another
+    thing can give a landmark all its parallax. sized: as in `find_crossings`."""
+    found = find_crossings(state, sized, fewest=1)
+    mine = np.flatnonzero(np.isin(state.matched, found.landmark[found.odds < 0]))
+    second = np.bincount(state.owner, found.second[state.assigned], state.count)
+    smaller = found.second[mine] == (2 * second <= state.ray_count)[state.matched[mine]]
+    matched = state.matched.copy()
+    matched[mine[smaller]] = -1
+    return replace(state, matched=matched)
+
+
+def _excess(gain: Floats) -> Floats:
+    """Return for each landmark (S,) the factor, at least 1, by which two points gain more than by noise.
+
+    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. The
+    median gain of the other landmarks tells how much better. gain: (S,) by how much two free points lower the cost.
+    """
+    every = np.append(gain, np.full(_ASSUMED, _USUAL_GAIN))
+    order = np.argsort(every, kind="stable")
+    rank = np.argsort(order, kind="stable")[: len(gain)]
+    # Without a landmark's own gain, all gains behind it move one place ahead.
+    middle = [(len(every) - 2) // 2, (len(every) - 1) // 2]
+    usual = np.mean([every[order[at + (at >= rank)]] for at in middle], axis=0)
+    return np.maximum(1.0, usual / _USUAL_GAIN)
+
+
+def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
+    """Return the log odds (K, S) of two things over one by bearings.
+
+    The excess is as uncertain as the number of landmarks says, so that the odds are those of an F distribution.
+
+    gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) as of
+    `_excess`. landmarks: how many gains told it.
+    """
+    number = landmarks - 1 + _ASSUMED
+    tail = 0.5 * (number + _FREE) * np.log1p(np.maximum(gain, 0.0) / (excess * number))
+    return np.asarray(tail + 0.5 * np.minimum(gain, 0.0) / excess)
+
+
+def _as_one(bundles: Bundles) -> tuple[Floats, Floats]:
+    """Return the log likelihood (S,) of each pair of bundles as one thing without that of its bearings, and their cost
+    (S,)."""
+    usual, landmark = bundles.usual, bundles.landmark[::2]
+    start = bundles.state.landmarks.position[landmark]
+    position, log_volume, _ = fit_points(bundles, bundles.group // 2, landmark, bundles.noise[::2], start)
+    both = np.repeat(position, 2, axis=0)
+    size, growth = bundles.size(both)
+    each = growth + usual.far_odds(bundles.distance(both), bundles.landmark)
+    larger = bundles.counted.reshape(-1, 2).argmax(axis=1)
+    first, second = (size.reshape(-1, 2)[np.arange(len(larger)), which] for which in (larger, 1 - larger))
+    sizes = _size_odds(first, usual.class_mean[landmark], usual.class_spread[landmark] ** 2 + usual.view**2)
+    sizes += _size_odds(second, first, np.full(len(first), 2 * usual.view**2))
+    rest = usual.log_density[landmark] + log_volume + each.reshape(-1, 2).sum(axis=1) + sizes
+    return np.asarray(rest), bundles.bearing_cost(both).reshape(-1, 2).sum(axis=1)
+
+
+def _alone(bundles: Bundles, free: FreeFit) -> tuple[Floats, Floats, Floats]:
+    """Return the log likelihood (G,) of each bundle as a thing of its own without that of its bearings, their cost (G,), and
+    where it most likely is (G, 3) m.
+
+    Many distances explain the bearings of a bundle. The sizes of its boxes, and distances that are usual for the class,
+    decide between them.
+    """
+    usual, landmark = bundles.usual, bundles.landmark
+    mean, spread2 = usual.class_mean[landmark], usual.class_spread[landmark] ** 2 + usual.view**2
+    tried = np.stack([*points_along(bundles), free.position])  # (K, G, 3)
+    growth, size, cost, distance = np.empty((4, *tried.shape[:2]))
+    for k, points in enumerate(tried):
+        size[k], growth[k] = bundles.size(points)
+        distance[k], cost[k] = bundles.distance(points), bundles.bearing_cost(points)
+    fit = growth + usual.far_odds(distance.ravel(), np.tile(landmark, len(tried))).reshape(distance.shape)
+    best = (fit - 0.5 * cost + _size_odds(size, mean, spread2)).argmax(axis=0), np.arange(bundles.count)
+    # Where the bearings do not tell the distance, the size of the thing is not known either.
+    loose = np.minimum(free.along / np.maximum(distance[best], MIN_DEPTH), 1.0)
+    sizes = _size_odds(size[best], mean, spread2 + loose**2)
+    return usual.log_density[landmark] + free.log_volume + fit[best] + sizes, cost[best], tried[best]
+
+
+def _as_another(bundles: Bundles) -> tuple[Floats, Floats]:
+    """Return the log likelihood (G,) of each bundle as rays of another landmark without that of its bearings, and their cost
+    (G,). The likelihood is -inf if no other landmark fits."""
+    state, usual = bundles.state, bundles.usual
+    bundle = np.full(len(state.obs), -1)
+    bundle[bundles.ray] = bundles.group
+    edges = gated_edges(state.obs, state.landmarks, STRAY_RAY)
+    # A landmark has at most one box in a frame.
+    frames = int(state.obs.frame.max(initial=0)) + 1
+    taken = np.isin(
+        edges.landmark * frames + state.obs.frame[edges.ray], state.owner * frames + state.obs.frame[state.assigned]
+    )
+    useful = np.flatnonzero((bundle[edges.ray] >= 0) & ~taken)
+    pairs, pair = np.unique(bundle[edges.ray[useful]] * state.count + edges.landmark[useful], return_inverse=True)
+    saved = np.bincount(pair, STRAY_RAY - edges.deviation[useful], len(pairs))
+    order = np.argsort(saved, kind="stable")
+    to, most = np.full(bundles.count, -1), np.zeros(bundles.count)
+    to[pairs[order] // state.count] = pairs[order] % state.count  # The last one stays, which saves most.
+    most[pairs[order] // state.count] = saved[order]
+    at = state.landmarks.position[to]
+    size, growth = bundles.size(at)
+    number = np.bincount(bundles.group, minlength=bundles.count)
+    fit = growth + usual.far_odds(bundles.distance(at), bundles.landmark)
+    alike = _size_odds(size, usual.size[to], np.full(bundles.count, 2 * usual.view**2))
+    return np.where(to >= 0, fit + alike, -np.inf), number * STRAY_RAY - most
+
+
+def _size_odds(size: Floats, mean: Floats, variance_: Floats) -> Floats:
+    """Return the log likelihood (N,) of ln sizes (N,) with a mean and a variance (N,), 0 where one of them is not known.
+    Some views show only a part of a thing."""
+    normal = np.exp(-0.5 * (size - mean) ** 2 / variance_) / np.sqrt(2 * np.pi * variance_)
+    return np.nan_to_num(np.log((1 - _HIDDEN) * normal + _HIDDEN / _HIDDEN_WIDTH))
