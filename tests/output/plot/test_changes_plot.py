@@ -16,7 +16,7 @@ from objslam.output.plot.changes_plot import changes_figure
 from objslam.output.plot.figure import Figure, Line, Marks
 from objslam.output.plot.page import render
 
-OUTCOMES = ("confirmed", "unseen", "new", "moved", "gone")
+OUTCOMES = ("confirmed", "unconfirmed", "new", "moved", "gone")
 
 
 def objects(**changes: Any) -> list[MapObject]:
