@@ -53,6 +53,7 @@ def run(
     SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     log = chosen_poses(log, settings)
+    unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
@@ -147,6 +148,7 @@ def run(
         summary={
             **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
             "part": dict(zip(("begin", "end"), log.part, strict=True)),
+            "odometry_unused": unused,
             "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
             **({} if where is None else {"localisation": where.told}),
             **({"map_frame": "map"} if where is not None and where.solution is not None else {}),

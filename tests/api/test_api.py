@@ -185,6 +185,7 @@ def test_what_reading_drops_is_logged_and_counted_once(log: Log, tmp_path: Any, 
     assert len([r for r in caplog.records if "dropped 1:" in r.message]) == 1
     for one in mapped:  # a second run of the same log counts anew
         assert list(one.dropped.values()).count(1) == 1
+        assert len([line for line in one.warnings if line.startswith("dropped 1:")]) == 1
 
 
 def test_wrong_options_and_settings_are_one_line(log: Log, tmp_path: Any) -> None:

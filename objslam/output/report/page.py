@@ -12,6 +12,7 @@ import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.bodies.body import UNKNOWN_YAW
+from objslam.core.diagnostics import is_drop
 from objslam.core.types import Images
 from objslam.core.validity import is_date
 from objslam.errors import ConfigError, OutputError
@@ -137,7 +138,8 @@ def write_report(
         },
         doubts=[(one, [pictures[i] for i in index if i in pictures]) for one, index in zip(doubts, of_doubt, strict=True)],
         dropped=[(why, n, "; ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
-        **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
+        warnings=[line for line in summary.get("warnings", []) if not is_drop(line)],  # These have a table of their own.
+        **{key: summary.get(key, {}) for key in ("seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},
         changed=_changed(settings),
         settings=dump_settings(settings),
