@@ -137,8 +137,8 @@ def assess(e: Evidence) -> Assessment:
 
 
 def _about(e: Evidence) -> list[str]:
-    """Return what a reader must know of the map, which lowers no level: a better mode, the part of the recording, the frame, the
-    scale."""
+    """Return what a reader must know of the map: a better mode, the part of the recording, the frame, the scale. No level
+    depends on it."""
     found = []
     if e.odometry_unused:
         found.append("Hint: the log has odometry too. --mode joint uses both, and its map is usually more exact.")
