@@ -204,7 +204,8 @@ class Keyframes:
     since its start, in the frame of odom_T_base. stretch: (K,) the number of each keyframe's stretch of the odometry between
     two gaps, None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no
     meaning. step: (K,) the place of each keyframe among the steps of the odometry. wander: (K, 6) the variance of that step.
-    Both are those of `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses.
+    Both are those of `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses. given_stamps:
+    (K,) s, as the frames have them in the log or came from the robot, None if they are `stamps`.
     """
 
     stamps: Floats
@@ -220,9 +221,15 @@ class Keyframes:
     stretch: Ints | None = None
     step: Floats | None = None
     wander: Floats | None = None
+    given_stamps: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    @property
+    def frame_stamps(self) -> Floats:
+        """(K,) s, the stamps of the frames before any correction of a clock."""
+        return self.stamps if self.given_stamps is None else self.given_stamps
 
     @property
     def map_T_camera(self) -> Floats:

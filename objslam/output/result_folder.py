@@ -167,6 +167,7 @@ def rays_table(result: RunResult) -> RaysTable:
     return RaysTable(
         object=ids[result.association.object],
         stamp=keyframes.stamps[rays.keyframe],
+        frame_stamp=keyframes.frame_stamps[rays.keyframe],
         origin=result.origins,
         direction=result.directions,
         residual=result.residual,

@@ -31,6 +31,7 @@ def some_rays(count: int = 240) -> RaysTable:
     return RaysTable(
         object=np.zeros(count, dtype=np.int64),
         stamp=np.arange(count, dtype=float),
+        frame_stamp=np.arange(count, dtype=float),
         origin=np.zeros((count, 3)),
         direction=np.tile([1.0, 0, 0], (count, 1)),
         residual=after,
