@@ -13,6 +13,7 @@ import numpy as np
 
 from objslam.core.appearance.features import FeatureTable, are_unit_vectors
 from objslam.core.arrays import Bools, Floats, Floats32, Ints
+from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.statistics import WHITE, Lasting
@@ -253,23 +254,6 @@ class Keyframes:
     def take(self, keyframes: Bools | Ints) -> Self:
         """Select keyframes by a mask or increasing indices."""
         return replace(self, **_rows(self, keyframes))
-
-
-@dataclass(frozen=True)
-class CutBoxes:
-    """The boxes that the image's edge cuts off. Their centres are wrong, so they give no rays, but bodies use their edges.
-
-    camera: (C,) index into log.cameras. frame: (C,) index into detections.frame_stamps of this camera. label: (C,) index
-    into label_names of the rays. box: (C, 4) raw px.
-    """
-
-    camera: Ints
-    frame: Ints
-    label: Ints
-    box: Floats
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
 
 @dataclass(frozen=True)
