@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from objslam.cli.console import console, put, say
+from objslam.cli.console import console, put, say, warn_of_neighbours
 from objslam.cli.options import Json, Out
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ def merge_results(
     from objslam.output.site_folder import islands_of_earlier_merges, summarise_site, write_site
 
     prepare_output(out)
+    warn_of_neighbours(out)
     sessions = [load_session(path) for path in results]
     islands = merge_sessions(sessions)
     names = [session.name for session in sessions]

@@ -61,6 +61,14 @@ def prepare_output(out: Path) -> None:
     try_folder(out, RESULT_FILES)
 
 
+def foreign_files(out: Path) -> list[str]:
+    """Return the names of what stands in a folder without a result, in order, but for hidden files. A result would go among
+    them."""
+    if not out.is_dir() or (out / files.SUMMARY).is_file() or (out / files.OBJECTS).is_file():
+        return []
+    return sorted({one.name for one in out.iterdir() if not one.name.startswith(".")} - set(RESULT_FILES.names(out)))
+
+
 @contextmanager
 def output_folder(out: Path) -> Iterator[None]:
     """Call `prepare_output`, then run the `with` block. If the block fails, delete the new folder if it is empty."""

@@ -131,6 +131,11 @@ def test_wrong_frames_are_named(changes: dict[str, Any], message: str) -> None:
 def test_wrong_poses_are_named(poses: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         objslam.Trajectory.from_arrays([0.0, 1.0], poses)
+    log = small_log()
+    camera, found = log.cameras[0].camera, log.cameras[0].detections
+    for path in ("odometry", "localization"):  # A log has two paths, so it names the wrong one.
+        with pytest.raises(ValueError, match=f"^{path}: .*{message}"):
+            objslam.Log.from_arrays(camera, found, **{path: ([0.0, 1.0], poses)})
 
 
 def test_a_camera_may_have_lists_in_place_of_arrays(log: Log) -> None:

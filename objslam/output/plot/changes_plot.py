@@ -13,7 +13,7 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import printable
 from objslam.mapping.sites.compare import Change, Comparison
 from objslam.output.plot.figure import Colour, Figure, Label, Line, Marks, Shape
-from objslam.output.plot.labels import make_labels, shortened
+from objslam.output.plot.labels import drawn_points, make_labels, shortened
 from objslam.output.plot.page import render
 from objslam.output.plot.style import body_outline, frame_objects
 
@@ -87,7 +87,7 @@ def changes_figure(items: Sequence[tuple[str, MapObject]], title: str, names: Se
         mine = np.array([one == outcome for one, _ in items], dtype=bool)
         if not mine.any():
             continue
-        shapes += _outlines([o for one, o in items if one == outcome], look.colour, 2 * _MARK / scale)
+        shapes += _outlines([o for one, o in items if one == outcome], look.colour, (_MARK + 2 * _LINE) / scale)
         if outcome == "moved":
             shapes += _arrows(before[mine], points[mine], look.colour)
         face, rim = (_WHITE, look.colour) if look.hollow else (look.colour, _WHITE)
@@ -127,5 +127,5 @@ def _labels(
     order = sorted(range(len(items)), key=lambda k: items[k][0] in ("confirmed", "unconfirmed"))
     items, points, names = [items[k] for k in order], points[order], [names[k] for k in order]
     rims = [rim for _, o in items if (rim := body_outline(o)) is not None]
-    avoid = figure.pixels(np.concatenate(rims)) if rims else np.zeros((0, 2))
+    avoid = np.concatenate([np.zeros((0, 2)), *(drawn_points(figure.pixels(rim)) for rim in rims)])
     return make_labels(figure, names, [_LOOKS[outcome].colour for outcome, _ in items], points, avoid)
