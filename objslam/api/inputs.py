@@ -136,7 +136,7 @@ class Log(types.Log):
         if odometry is None and localization is None:
             raise ValueError("a log needs odometry, localization or both")
         views = tuple(types.CameraLog(camera, found) for camera, found in zip(lenses, boxes, strict=True))
-        return cls(name, views, _path(odometry), _path(localization))
+        return cls(name, views, _path(odometry, "odometry"), _path(localization, "localization"))
 
     def with_detections(self, detections: types.Detections | Mapping[str, types.Detections]) -> Self:
         """Return the log with other boxes: the detections of its only camera, or those of each camera by name.
@@ -181,8 +181,13 @@ def _unit_features(features: Sequence[ArrayLike], counts: list[int]) -> Floats32
     return units
 
 
-def _path(given: tuple[ArrayLike, ArrayLike] | types.Trajectory | None) -> types.Trajectory | None:
-    return given if given is None or isinstance(given, types.Trajectory) else Trajectory.from_arrays(*given)
+def _path(given: tuple[ArrayLike, ArrayLike] | types.Trajectory | None, name: str) -> types.Trajectory | None:
+    if given is None or isinstance(given, types.Trajectory):
+        return given
+    try:
+        return Trajectory.from_arrays(*given)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _content(camera: types.CameraLog) -> str:

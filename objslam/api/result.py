@@ -127,7 +127,7 @@ class Result:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The warnings of the run, one line each."""
+        """The warnings of the run, one line each, as the terminal shows them. Dropped data come first."""
         return tuple(self.summary.get("warnings", ()))
 
     @property

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from objslam.core.diagnostics import Ledger
+
+_NEIGHBOURS = 3  # The most names of other files in a warning. A larger number makes the line longer.
 
 
 @contextmanager
@@ -67,6 +70,16 @@ def report(ledger: Ledger) -> None:
     """Print each drop and warning of a ledger as one line on stderr."""
     for line in ledger.lines():
         say(f"warning: {line}", stderr=True)
+
+
+def warn_of_neighbours(out: Path) -> None:
+    """Warn if the folder of a result holds other files and no result yet: the files of the result will stand among them."""
+    from objslam.output.result_folder import foreign_files
+
+    if found := foreign_files(out):
+        shown = ", ".join([*found[:_NEIGHBOURS], *(["..."] if len(found) > _NEIGHBOURS else [])])
+        what = f"{out} holds other files ({shown}), and the files of the result go among them"
+        say(f"warning: {what} (-o names a folder of its own)", stderr=True)
 
 
 def console(*, stderr: bool = False) -> Console:

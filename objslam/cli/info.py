@@ -73,6 +73,7 @@ def _show_log(found: Contents, kind: Source) -> None:
 
 def _show_bag(bag: BagInfo, part: Contents | None) -> None:
     """Show the whole bag, because a table of its topics is for their choice, and then the part that was asked for."""
+    from objslam.core.diagnostics import is_drop
     from objslam.sources.summary import in_words
 
     files = f"{len(bag.files)} file{'s' if len(bag.files) > 1 else ''}"
@@ -95,7 +96,7 @@ def _show_bag(bag: BagInfo, part: Contents | None) -> None:
     _list("damage", bag.damage)
     for line in in_words(part) if part else ():
         say(line)
-    _list("warnings", [line for line in bag.warnings if not line.startswith("dropped")])
+    _list("warnings", [line for line in bag.warnings if not is_drop(line)])
     _list("missing for a run", bag.missing, "nothing is missing for a run")
 
 

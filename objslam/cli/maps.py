@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from objslam.cli.console import put, say
+from objslam.cli.console import console, put, say, warn_of_neighbours
 from objslam.cli.options import Json, Out
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from objslam.mapping.sites.compare import Comparison
 
 NOT_REGISTERED = 1
 """The exit code if the objects of two maps do not prove that both show one place."""
@@ -58,11 +63,13 @@ def merge_results(
     own. To add a session later, give the site and the new result.
     """
     from objslam.api.sites import load_session, warnings_of
+    from objslam.core.object_map import FATES
     from objslam.mapping.sites.merge import merge_sessions
     from objslam.output.result_folder import prepare_output
     from objslam.output.site_folder import islands_of_earlier_merges, summarise_site, write_site
 
     prepare_output(out)
+    warn_of_neighbours(out)
     sessions = [load_session(path) for path in results]
     islands = merge_sessions(sessions)
     names = [session.name for session in sessions]
@@ -75,8 +82,10 @@ def merge_results(
         for told in summarise_site(island, names)["sessions"]:
             say(f"{told['name']}: " + _session_line(told))
         objects = island.objects
+        lives = [o.life.state for o in objects if o.life is not None]
         count = f"{len(island.sessions)} session{'' if len(island.sessions) == 1 else 's'}"
-        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {count}")
+        fates = ", ".join(f"{lives.count(fate)} {fate}" for fate in FATES if fate != "gone")
+        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {count}: {fates}")
         say(f"wrote {folder}")
 
 
@@ -88,50 +97,90 @@ def _session_line(told: dict[str, Any]) -> str:
 
 def diff_results(
     a: Annotated[Path, typer.Argument(metavar="MAP_A", help="The earlier map: result folder, site, or objects.json.")],
-    b: Annotated[Path, typer.Argument(metavar="MAP_B", help="The later map: a result folder, which says what was in view.")],
+    b: Annotated[
+        Path, typer.Argument(metavar="MAP_B", help="The later map: the folder of a run, which says what was in view.")
+    ],
     picture: Annotated[Path | None, typer.Option("-o", "--out", help="Draw the changes into this PNG file.")] = None,
     json: Json = False,
 ) -> None:
-    """Compare two maps of one place: which objects are confirmed, moved, gone, new or unseen.
+    """Compare two maps of one place: which objects are confirmed, moved, gone, new or unconfirmed.
 
-    The exit code is 1 if the maps cannot be registered to each other.
+    An object is unconfirmed if only one map has it, and the other drive did not have its place in view. The ids are those of
+    map A and of map B. The result of a live session does not say what was in view. So nothing can be called gone or moved if
+    it is map B: run its journal (objslam run LIVE_RESULT -o AGAIN), and compare that. The exit code is 1 if the maps cannot
+    be registered to each other.
     """
     from objslam.api.sites import diff
+    from objslam.core.object_map import FATES
     from objslam.io.atomic_files import write_file
-    from objslam.mapping.sites.compare import OUTCOMES
 
     found = diff(a, b)
     if picture is not None and found.registration.accepted:
         from objslam.output.plot.changes_plot import draw_comparison
 
         write_file(picture, draw_comparison(found))
+    warnings = _not_in_view(found, a, b)
+    for line in warnings:
+        say(f"warning: {line}", stderr=True)
     if json:
-        _say_json(found)
+        _say_json(found, warnings)
     elif not found.registration.accepted:
         say(f"not registered: {found.reason}")
     else:
-        for one in found.changes:
-            x, y, z = one.item.position
-            was = None if one.item.life is None else one.item.life.moved_from
-            came = "" if was is None or one.outcome != "moved" else f", was at ({was[0]:.3f}, {was[1]:.3f}, {was[2]:.3f}) m"
-            place = f"at ({x:.3f}, {y:.3f}, {z:.3f}) m{came}"
-            say(f"{one.outcome:<10}{one.item.label} #{one.item.id} {place}, probability {one.probability:.2f}")
-        say(", ".join(f"{len(found.of(outcome))} {outcome}" for outcome in OUTCOMES))
+        console().print(_changes_table(found))
+        say(", ".join(f"{len(found.of(outcome))} {outcome}" for outcome in FATES))
+        if found.of("unconfirmed"):
+            say("unconfirmed: only one map has it, and the other drive did not have its place in view")
         if picture is not None:
             say(f"wrote {picture}")
     if not found.registration.accepted:
         raise typer.Exit(NOT_REGISTERED)
 
 
-def _say_json(found: object) -> None:
-    from objslam.mapping.sites.compare import Comparison
+def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
+    """Return a warning for each map that does not say what was in view: what the comparison then cannot tell, and why."""
+    from objslam.results.files import VIEWS
+    from objslam.sources.journal.segments import NAME
+
+    if not found.registration.accepted:
+        return []
+    warnings = []
+    if not found.has_views[1]:
+        so = f"{b} does not say what was in view (it has no {VIEWS}), so nothing can be called gone or moved"
+        if (b / NAME).is_file():
+            again = b.with_name(f"{b.resolve().name}_again")
+            so += f". It is the result of a live session: objslam run {b} -o {again}, then objslam diff {a} {again}"
+        warnings.append(so)
+    if not found.has_views[0]:
+        warnings.append(f"{a} does not say what was in view (it has no {VIEWS}), so all that only {b} has counts as new")
+    return warnings
+
+
+def _changes_table(found: Comparison) -> Table:
+    from rich.table import Table
+
+    table = Table(title="changes, in the frame of map A", caption="A, B: the id in each map. prob.: of the outcome")
+    for name in ("outcome", "label", "A", "B", "x m", "y m", "z m", "prob.", "was at m"):
+        words = name in ("outcome", "label")
+        wraps = name in ("label", "was at m")
+        table.add_column(name, justify="left" if words else "right", overflow="fold", no_wrap=not wraps)
+    for one in found.changes:
+        was = None if one.outcome != "moved" or one.item.life is None else one.item.life.moved_from
+        ids = ("-" if number is None else str(number) for number in (one.id_a, one.id_b))
+        before = "" if was is None else ", ".join(f"{x:.3f}" for x in was)
+        place = (f"{x:.3f}" for x in one.item.position)
+        table.add_row(one.outcome, one.item.label, *ids, *place, f"{one.probability:.2f}", before)
+    return table
+
+
+def _say_json(found: Comparison, warnings: list[str]) -> None:
     from objslam.results.files import dump_json
 
-    assert isinstance(found, Comparison)
     changes = [
         {
             "outcome": one.outcome,
-            "id": one.item.id,
+            "id_a": one.id_a,
+            "id_b": one.id_b,
             "label": one.item.label,
             "position": one.item.position,
             "moved_from": None if one.item.life is None else one.item.life.moved_from,
@@ -139,5 +188,5 @@ def _say_json(found: object) -> None:
         }
         for one in found.changes
     ]
-    said = {"registered": found.registration.accepted, "reason": found.reason, "a_T_b": found.a_T_b, "changes": changes}
-    put(dump_json(said))
+    said = {"registered": found.registration.accepted, "reason": found.reason, "warnings": warnings}
+    put(dump_json({**said, "a_T_b": found.a_T_b, "changes": changes}))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from objslam.cli.console import console, progress_bar, put, report, say
+from objslam.cli.console import console, progress_bar, put, report, say, warn_of_neighbours
 from objslam.cli.options import (
     CalibrationFile,
     Config,
@@ -98,6 +98,7 @@ def run(
     settings = settings_of(mode, config, set_, calibration, options.class_names)
     ledger = Ledger()
     with output_folder(out):
+        warn_of_neighbours(out)
         tell = _say_nothing if quiet else _say_json if json else say_result
         known = None if map_ is None else prior_map(map_)
         result = run_log(read(log, ledger, options), settings, ledger, out, detector, tell, known, embed)

@@ -6,8 +6,14 @@ from dataclasses import dataclass, field
 
 from objslam.errors import one_line
 
+_DROPPED = "dropped "  # The first word of a line about dropped data.
 _EXAMPLES = 3  # The most places that are kept for each reason. A larger number makes the lines of text longer.
 _MOST_WARNINGS = 1000  # The most warnings. A larger number costs memory if made-up messages cause warnings.
+
+
+def is_drop(line: str) -> bool:
+    """Return whether a line of a ledger is about dropped data."""
+    return line.startswith(_DROPPED)
 
 
 @dataclass
@@ -53,10 +59,10 @@ class Ledger:
             self.warn(message)
 
     def lines(self) -> list[str]:
-        """Return each drop and then each warning as one line of text."""
+        """Return each drop and then each warning as one line of text, as the terminal and summary.json show them."""
         lines = []
         for reason, count in self.dropped.items():
             places, total = self.examples.get(reason), self.totals.get(reason)
             share = f" of {total} ({100 * count / total:.0f} %)" if total else ""
-            lines.append(f"dropped {count}{share}: {reason}" + (f" (first: {'; '.join(places)})" if places else ""))
+            lines.append(f"{_DROPPED}{count}{share}: {reason}" + (f" (first: {'; '.join(places)})" if places else ""))
         return lines + self.warnings

@@ -19,9 +19,10 @@ from objslam.core.maps.spatial_index import SpatialIndex, corners_of, place_of
 from objslam.core.statistics import SAME_POINT
 
 Status = Literal["ok", "unresolved"]
-Fate = Literal["new", "confirmed", "moved", "gone"]
-FATES: tuple[Fate, ...] = ("new", "confirmed", "moved", "gone")
-"""The states that an object can have after several sessions."""
+Fate = Literal["confirmed", "moved", "gone", "new", "unconfirmed"]
+FATES: tuple[Fate, ...] = ("confirmed", "moved", "gone", "new", "unconfirmed")
+"""What can become of an object over several sessions, in the order in which it is shown. A comparison of two maps uses the
+same words."""
 
 _FLOOR = 1e-6  # The least standard deviation (m) between two positions. It keeps singular covariances invertible.
 _SHOWN = 20  # The most objects in the text of a map. A larger number makes the text longer.
@@ -60,11 +61,13 @@ class SeenFrom:
 class Life:
     """The history of one object over several sessions.
 
-    state: `new` if one session found it, `confirmed` if a later session found it again, `moved` if a later session found it
-    at another position, `gone` if it is no longer there. probability: that the object is still at its position.
-    sessions_expected, sessions_seen: in how many sessions it was in view, and in how many it was found. looks, detections:
-    in how many camera frames of all sessions it was in view, and in how many it was detected. updated: the time of the last
-    session, s. moved_from: (3,) m, where it was before it moved, None if it did not move.
+    state: `unconfirmed` if one session found it, and no other session had its place in view. `new` if one session found it,
+    and an earlier one would have found it there, or does not say what it had in view. `confirmed` if a later session found
+    it again, `moved` if a later session found it at another position, `gone` if it is no longer there. probability: that the
+    object is still at its position. sessions_expected, sessions_seen: in how many sessions it was in view, and in how many
+    it was found. looks, detections: in how many camera frames of all sessions it was in view, and in how many it was
+    detected. updated: the time of the last session, s. moved_from: (3,) m, where it was before it moved, None if it did not
+    move.
     """
 
     state: Fate

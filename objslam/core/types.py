@@ -13,6 +13,7 @@ import numpy as np
 
 from objslam.core.appearance.features import FeatureTable, are_unit_vectors
 from objslam.core.arrays import Bools, Floats, Floats32, Ints
+from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.statistics import WHITE, Lasting
@@ -204,7 +205,8 @@ class Keyframes:
     since its start, in the frame of odom_T_base. stretch: (K,) the number of each keyframe's stretch of the odometry between
     two gaps, None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no
     meaning. step: (K,) the place of each keyframe among the steps of the odometry. wander: (K, 6) the variance of that step.
-    Both are those of `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses.
+    Both are those of `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses. given_stamps:
+    (K,) s, as the frames have them in the log or came from the robot, None if they are `stamps`.
     """
 
     stamps: Floats
@@ -220,9 +222,15 @@ class Keyframes:
     stretch: Ints | None = None
     step: Floats | None = None
     wander: Floats | None = None
+    given_stamps: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+    @property
+    def frame_stamps(self) -> Floats:
+        """(K,) s, the stamps of the frames before any correction of a clock."""
+        return self.stamps if self.given_stamps is None else self.given_stamps
 
     @property
     def map_T_camera(self) -> Floats:
@@ -246,23 +254,6 @@ class Keyframes:
     def take(self, keyframes: Bools | Ints) -> Self:
         """Select keyframes by a mask or increasing indices."""
         return replace(self, **_rows(self, keyframes))
-
-
-@dataclass(frozen=True)
-class CutBoxes:
-    """The boxes that the image's edge cuts off. Their centres are wrong, so they give no rays, but bodies use their edges.
-
-    camera: (C,) index into log.cameras. frame: (C,) index into detections.frame_stamps of this camera. label: (C,) index
-    into label_names of the rays. box: (C, 4) raw px.
-    """
-
-    camera: Ints
-    frame: Ints
-    label: Ints
-    box: Floats
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ _LARGEST = 8192  # The largest width or height, px, that is accepted from the me
 _STRIDE = 32  # The stride of an input of free size, px, if the metadata has no stride.
 _PAD = 114  # The grey value of the padding if the settings have no value.
 _QUERIES = 300  # The number of queries of newer DETR models. DETR and its close variants have 100.
-_UNNAMED = "the model names no classes: they are numbered (set detector.names)"
+_UNNAMED = "the model names no classes: they are numbered (--names FILE names them)"
 
 
 def input_size(network: Network, settings: config.Detector) -> InputSize:

@@ -77,7 +77,8 @@ def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts
         f"its outputs fit {what}: {saw}",
         where=str(model),
         hint=f"set detector.layout to one of {', '.join(get_args(Layout))}, and detector.outputs to "
-        "{boxes: NAME, labels: NAME, scores: NAME}, {boxes: NAME, logits: NAME} or {predictions: NAME}",
+        "{boxes: NAME, labels: NAME, scores: NAME}, {boxes: NAME, logits: NAME} or {predictions: NAME}"
+        + ("; or name its classes with --names FILE, whose number tells the layout" if facts.classes is None else ""),
     )
 
 

@@ -11,6 +11,7 @@ from objslam.core.geometry import interpolate, quaternion
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Trajectory, Truth, TruthObject
 from objslam.errors import ConfigError, LogError
+from objslam.evaluation.aligned_covariances import aligned_covariances
 from objslam.evaluation.alignment import IDENTITY, Alignment, Transform, align_objects, correspondences, match_points
 from objslam.evaluation.bodies import BodyMatch, body_scores, match_bodies
 from objslam.evaluation.tags import TagMatch, match_tags, tag_scores
@@ -28,8 +29,9 @@ INSIDE_95_3D = 7.815
 class Match:
     """A map object and the true object that it matches. `offset` (3,) is map minus truth, m, after the alignment.
 
-    squared: squared Mahalanobis distance of the offset in x and y, by the object's covariance, rotated and scaled like the
-    map. squared_3d: the squared distance in x, y and z. Both are None without a covariance.
+    squared: squared Mahalanobis distance of the offset in x and y, by the covariance that the alignment leaves
+    (`aligned_covariances`). squared_3d: the squared distance in x, y and z. Both are None without a covariance, and if the
+    alignment rests on so few objects that it leaves hardly any error.
     body: how the two bodies fit, None if one of the two has no size. tag: how the rotations of two fiducials fit, None if
     one of the two has none.
     """
@@ -62,6 +64,8 @@ class ObjectScores:
     false: tuple[MapObject, ...]
     unresolved: int
     transform: Transform
+    shared_known: bool = True
+    """Whether the map says which errors its objects share, or was not aligned."""
 
     @property
     def errors(self) -> Floats:
@@ -175,29 +179,48 @@ def _score_objects(
     transform = align_objects(ours, theirs, same, radius, kind, start=on_path if repeat else None)
     moved = transform.apply(ours)
     rows, columns = match_points(moved, theirs, same, radius)
+    judged = kind == "none" or len(rows) >= _fewest(kind)
+    left = _covariances_left([mapped[i] for i in rows], map.shared_covariance, transform, kind)
     return ObjectScores(
         matches=tuple(
-            _match(mapped[i], true[k], moved[i] - theirs[k], transform) for i, k in zip(rows, columns, strict=True)
+            _match(mapped[i], true[k], moved[i] - theirs[k], transform, cov if judged else None)
+            for i, k, cov in zip(rows, columns, left, strict=True)
         ),
         missed=tuple(true[k] for k in np.setdiff1d(np.arange(len(true)), columns)),
         false=tuple(mapped[i] for i in np.setdiff1d(np.arange(len(mapped)), rows)),
         unresolved=len(map) - len(mapped),
         transform=transform,
+        shared_known=kind == "none" or map.shared_covariance is not None,
     )
 
 
-def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform) -> Match:
-    """Return a match. offset: (3,) m, after the alignment. The covariance of the object gives its Mahalanobis distance."""
+def _covariances_left(
+    found: list[MapObject], shared: Floats | None, transform: Transform, kind: Alignment
+) -> list[Floats | None]:
+    """Return the covariance (3, 3) of each matched object after the alignment, None for an object without a covariance."""
+    spread = [np.zeros((3, 3)) if o.covariance is None else o.covariance for o in found]
+    points, covariance = (
+        np.array(x).reshape(-1, *shape) for x, shape in (([o.position for o in found], (3,)), (spread, (3, 3)))
+    )
+    left = aligned_covariances(points, covariance, shared, transform, kind)
+    return [None if o.covariance is None else one for o, one in zip(found, left, strict=True)]
+
+
+def _match(found: MapObject, true: TruthObject, offset: Floats, transform: Transform, covariance: Floats | None) -> Match:
+    """Return a match. offset (3,) m, covariance (3, 3) m^2: of the object after the alignment."""
     shape = match_bodies(found, true, transform), match_tags(found, true, transform)
-    if found.covariance is None:
+    if covariance is None:
         return Match(found, true, offset, None, None, *shape)
-    turn = transform.scale * transform.pose[:3, :3]
-    covariance = turn @ found.covariance @ turn.T
     return Match(found, true, offset, _squared(offset[:2], covariance[:2, :2]), _squared(offset, covariance), *shape)
 
 
 def _squared(offset: Floats, covariance: Floats) -> float:
     return float(offset @ np.linalg.pinv(covariance, hermitian=True) @ offset)
+
+
+def _fewest(kind: Alignment) -> int:
+    """Return the least number of matched objects whose errors mean something after an alignment."""
+    return 4 if kind in ("se3", "sim3") else 3
 
 
 def _some(names: set[str]) -> str:
@@ -208,8 +231,7 @@ def _some(names: set[str]) -> str:
 
 def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Alignment) -> list[str]:
     warnings = []
-    few = 4 if kind in ("se3", "sim3") else 3
-    if objects is not None and kind != "none" and 0 < len(objects.matches) < few:
+    if objects is not None and kind != "none" and 0 < len(objects.matches) < _fewest(kind):
         warnings.append(f"the alignment rests on {len(objects.matches)} matched objects only, so their errors mean little")
     if objects is not None and objects.false and not objects.matches and objects.missed:
         of_map, of_truth = ({o.label for o in group} for group in (objects.false, objects.missed))

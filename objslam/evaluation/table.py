@@ -13,7 +13,7 @@ _OBJECT_ROWS = (
     ("matched", "matched objects", ""),
     ("missed", "missed objects", ""),
     ("false", "false objects", ""),
-    ("unresolved", "unresolved objects", ""),
+    ("unresolved", "unresolved objects (their true ones count as missed)", ""),
     ("precision", "precision", ""),
     ("recall", "recall", ""),
     ("position_rmse", "position RMSE", " m"),
@@ -23,6 +23,9 @@ _OBJECT_ROWS = (
     ("inside_95", "share of truths inside the 95 % ellipse", ""),
     ("inside_95_3d", "share of truths inside the 95 % ellipsoid", ""),
 )
+_NOT_SHARED = {"mahalanobis_median": "squared Mahalanobis in x, y, median (honest: 1.39 or less)"}
+"""The names of rows after an alignment, if the map does not say which errors its objects share. The alignment may have taken
+out such errors, and the covariances still contain them."""
 _BODY_ROWS = (
     ("bodies", "bodies compared", ""),
     ("size_error_median", "error of length, width and height, share, median", ""),
@@ -63,6 +66,8 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     scores.add_column("against the ground truth" if evaluation.truth is None else f"against {evaluation.truth}")
     scores.add_column("value", justify="right")
     rows = (_OBJECT_ROWS if evaluation.objects is not None else ()) + (_PATH_ROWS if evaluation.path is not None else ())
+    if evaluation.objects is not None and not evaluation.objects.shared_known:
+        rows = tuple((key, _NOT_SHARED.get(key, name), unit) for key, name, unit in rows)
     for key, name, unit in (*rows, *(_BODY_ROWS if data["bodies"] else ()), *(_TAG_ROWS if data["tags"] else ())):
         scores.add_row(name, _cell(data[key], unit))
     parts: list[RenderableType] = [title, scores]

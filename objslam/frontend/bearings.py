@@ -5,10 +5,11 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.appearance.features import FeatureTable
 from objslam.core.arrays import Bools, Floats, Floats32, Ints
+from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
-from objslam.core.types import CutBoxes, Detections, Keyframes, Log, Rays, label_table
+from objslam.core.types import Detections, Keyframes, Log, Rays, label_table
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
 """The reason to drop a box that ends at the image's edge, because its centre is then wrong."""

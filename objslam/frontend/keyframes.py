@@ -1,5 +1,7 @@
 """Select keyframes: camera frames whose pose is known from the robot's path."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from objslam.config import Settings
@@ -93,6 +95,16 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
         step=step,
         wander=wander,
     ).take(valid)
+
+
+def with_given_stamps(frames: Keyframes, log: Log) -> Keyframes:
+    """Return frames with their stamps in the log from which they were built. log: before any correction of its clocks."""
+    stamps = frames.stamps.copy()
+    for index, one in enumerate(log.cameras):
+        mine = frames.camera == index
+        if one.detections is not None:
+            stamps[mine] = one.detections.frame_stamps[frames.frame[mine]]
+    return replace(frames, given_stamps=stamps)
 
 
 def _on_path(

@@ -88,8 +88,10 @@ def parse_object(text: str | bytes) -> dict[str, Any]:
 
 
 def read_stamp(message: dict[str, Any]) -> float:
-    """Return the timestamp of a message, s. Raises Malformed if it is not a finite number."""
-    (stamp,) = read_numbers([message.get("stamp")], "stamp")
+    """Return the timestamp of a message, s. Raises Malformed if it is missing or no finite number."""
+    if "stamp" not in message:
+        raise Malformed("stamp is missing")
+    (stamp,) = read_numbers([message["stamp"]], "stamp")
     if not math.isfinite(stamp):
         raise Malformed("stamp is not a finite number")
     return stamp

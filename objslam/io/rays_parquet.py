@@ -18,8 +18,19 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-_NUMBERS = {"stamp": 1, "origin": 3, "direction": 3, "residual": 1, "weight": 1, "score": 1, "box": 4, "sigma": 1}
+_NUMBERS = {
+    "stamp": 1,
+    "frame_stamp": 1,
+    "origin": 3,
+    "direction": 3,
+    "residual": 1,
+    "weight": 1,
+    "score": 1,
+    "box": 4,
+    "sigma": 1,
+}
 _NUMBERS |= {"residual_before": 1, "image": 2, "speed": 1, "turn_rate": 1}  # How many numbers each column has in a row.
+_LATER = {"frame_stamp": "stamp"}  # A column that older files do not have, and the column that stands for it there.
 _UNIT = 1e-3  # The most that the length of a direction may differ from 1. A larger value accepts worse directions.
 
 
@@ -28,7 +39,8 @@ class RaysTable:
     """All rays of a result, with one row per ray."""
 
     object: Ints  # (R,) object id, -1 for an unassigned ray.
-    stamp: Floats  # (R,) timestamp, s.
+    stamp: Floats  # (R,) timestamp, s, on the clock of the poses.
+    frame_stamp: Floats  # (R,) timestamp of the frame in the log, s, before any correction of a clock.
     origin: Floats  # (R, 3) m, in map.
     direction: Floats  # (R, 3) unit vector, in map.
     residual: Floats  # (R,) angle between ray and object, rad, NaN for an unassigned ray.
@@ -56,6 +68,7 @@ class RaysTable:
         return arrow_table(
             {
                 "stamp": self.stamp,
+                "frame_stamp": self.frame_stamp,
                 "object": pa.array(self.object, mask=self.object < 0),
                 "origin": self.origin,
                 "direction": self.direction,
@@ -96,7 +109,8 @@ def read_rays(file: Path) -> RaysTable:
 
     try:
         table = pq.read_table(file, partitioning=None)
-        columns = {name: _column(table, name, size) for name, size in _NUMBERS.items()}
+        there = {name: name if name in table.column_names else _LATER.get(name, name) for name in _NUMBERS}
+        columns = {name: _column(table, there[name], size) for name, size in _NUMBERS.items()}
         columns |= {name: _texts(table, name) for name in ("camera", "label")}
         index = table["object"]
         if not pa.types.is_integer(index.type):
@@ -142,7 +156,7 @@ def _fault(rays: RaysTable) -> str | None:
     angles = [np.isnan(angle) | ((angle >= 0) & (angle <= np.pi)) for angle in (rays.residual, rays.residual_before)]
     rates = np.column_stack([rays.speed, rays.turn_rate, rays.image])
     rules = (
-        (valid_stamps(rays.stamp), "a wrong stamp"),
+        (valid_stamps(rays.stamp) & valid_stamps(rays.frame_stamp), "a wrong stamp"),
         (valid_positions(rays.origin), "a wrong origin"),
         (np.abs(lengths(rays.direction) - 1) < _UNIT, "a direction whose length is not 1"),
         (angles[0] & angles[1], "a residual that is not an angle"),

@@ -23,10 +23,12 @@ _BETWEEN = "\n---\n"  # The line between the texts of two cameras.
 class Views:
     """F camera frames in the order of time. margin (px), margin_share: `rays.border` and `rays.border_share` of the run.
 
-    stamps: (F,) s. camera: (F,) index into cameras. map_T_camera: (F, 4, 4).
+    stamps: (F,) s, on the clock of the poses. frame_stamps: (F,) s, as in the log, before any correction of a clock. camera:
+    (F,) index into cameras. map_T_camera: (F, 4, 4).
     """
 
     stamps: Floats
+    frame_stamps: Floats
     camera: Ints
     map_T_camera: Floats
     cameras: tuple[Camera, ...]
@@ -36,7 +38,7 @@ class Views:
     @classmethod
     def of(cls, frames: Keyframes, cameras: tuple[Camera, ...], margin: float, margin_share: float) -> Self:
         """Return the views of frames at their poses."""
-        return cls(frames.stamps, frames.camera, frames.map_T_camera, cameras, margin, margin_share)
+        return cls(frames.stamps, frames.frame_stamps, frames.camera, frames.map_T_camera, cameras, margin, margin_share)
 
 
 def dump_views(views: Views) -> bytes:
@@ -45,7 +47,8 @@ def dump_views(views: Views) -> bytes:
     import pyarrow.parquet as pq
 
     pose = pa.FixedSizeListArray.from_arrays(pa.array(views.map_T_camera.reshape(-1)), 16)
-    table = pa.table({"stamp": views.stamps, "camera": views.camera, "map_T_camera": pose})
+    stamps = {"stamp": views.stamps, "frame_stamp": views.frame_stamps}
+    table = pa.table({**stamps, "camera": views.camera, "map_T_camera": pose})
     cameras = _BETWEEN.join(dump_camera(camera) for camera in views.cameras)
     margins = f"{float(views.margin)!r} {float(views.margin_share)!r}"
     buffer = io.BytesIO()
@@ -59,19 +62,21 @@ def read_views(file: Path) -> Views:
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(file, columns=["stamp", "camera", "map_T_camera"], partitioning=None)
+        table = pq.read_table(file, partitioning=None)
         header = table.schema.metadata or {}
         texts = header[_CAMERAS].decode().split(_BETWEEN)
         cameras = tuple(parse_camera(text.encode(), str(file), Ledger(), None) for text in texts)
         margin, share = (float(word) for word in header[_MARGINS].decode().split())
         stamps = np.asarray(table["stamp"].to_numpy(), dtype=np.float64)
+        own = "frame_stamp" if "frame_stamp" in table.column_names else "stamp"  # Older files have one column.
+        frame_stamps = np.asarray(table[own].to_numpy(), dtype=np.float64)
         camera = np.asarray(table["camera"].to_numpy(), dtype=np.int64)
         flat = np.asarray(table["map_T_camera"].combine_chunks().flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
         poses, rigid = rigid_poses(flat.reshape(len(stamps), 4, 4))
-        if not (rigid.all() and valid_stamps(stamps).all() and np.isfinite([margin, share]).all()):
+        if not (rigid.all() and valid_stamps(np.append(stamps, frame_stamps)).all() and np.isfinite([margin, share]).all()):
             raise ValueError("a pose, a stamp or a margin is not valid")
         if len(camera) and not 0 <= camera.min() <= camera.max() < len(cameras):
             raise ValueError("a frame names a camera that is not in the file")
     except (OSError, pa.ArrowException, AttributeError, KeyError, ValueError, TypeError, LogError) as error:
         raise OutputError(f"not what a run writes: {str(error).splitlines()[0][:100]}", where=str(file)) from error
-    return Views(stamps, camera, poses, cameras, margin, share)
+    return Views(stamps, frame_stamps, camera, poses, cameras, margin, share)

@@ -205,7 +205,7 @@ def summarise(
         "iterations": estimate.iterations,
         "seconds": seconds,
         "versions": _versions(),
-        "warnings": list(ledger.warnings),
+        "warnings": ledger.lines(),
     }
 
 

@@ -16,7 +16,7 @@ from objslam.core.trajectory import correct_path
 from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.keyframes import build_keyframes
+from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.least_squares.libraries import load_libraries
@@ -52,7 +52,8 @@ def run(
     LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path.
     SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
-    log = chosen_poses(log, settings)
+    given = log = chosen_poses(log, settings)
+    unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
@@ -141,12 +142,13 @@ def run(
         "detections": sum(len(detections) for detections in found),
     }
     return make_result(
-        solution,
+        replace(solution, keyframes=with_given_stamps(keyframes, given)),
         objects,
         residual,
         summary={
             **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
             "part": dict(zip(("begin", "end"), log.part, strict=True)),
+            "odometry_unused": unused,
             "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
             **({} if where is None else {"localisation": where.told}),
             **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
@@ -159,7 +161,7 @@ def run(
         surface=surface,
         surface_before=before,
         residual_before=residual_before,
-        views=solved_views(log, settings, path_after),
+        views=with_given_stamps(solved_views(log, settings, path_after), given),
     )
 
 

@@ -61,6 +61,14 @@ def prepare_output(out: Path) -> None:
     try_folder(out, RESULT_FILES)
 
 
+def foreign_files(out: Path) -> list[str]:
+    """Return the names of what stands in a folder without a result, in order, but for hidden files. A result would go among
+    them."""
+    if not out.is_dir() or (out / files.SUMMARY).is_file() or (out / files.OBJECTS).is_file():
+        return []
+    return sorted({one.name for one in out.iterdir() if not one.name.startswith(".")} - set(RESULT_FILES.names(out)))
+
+
 @contextmanager
 def output_folder(out: Path) -> Iterator[None]:
     """Call `prepare_output`, then run the `with` block. If the block fails, delete the new folder if it is empty."""
@@ -167,6 +175,7 @@ def rays_table(result: RunResult) -> RaysTable:
     return RaysTable(
         object=ids[result.association.object],
         stamp=keyframes.stamps[rays.keyframe],
+        frame_stamp=keyframes.frame_stamps[rays.keyframe],
         origin=result.origins,
         direction=result.directions,
         residual=result.residual,

@@ -131,6 +131,11 @@ def test_wrong_frames_are_named(changes: dict[str, Any], message: str) -> None:
 def test_wrong_poses_are_named(poses: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         objslam.Trajectory.from_arrays([0.0, 1.0], poses)
+    log = small_log()
+    camera, found = log.cameras[0].camera, log.cameras[0].detections
+    for path in ("odometry", "localization"):  # A log has two paths, so it names the wrong one.
+        with pytest.raises(ValueError, match=f"^{path}: .*{message}"):
+            objslam.Log.from_arrays(camera, found, **{path: ([0.0, 1.0], poses)})
 
 
 def test_a_camera_may_have_lists_in_place_of_arrays(log: Log) -> None:
@@ -185,6 +190,7 @@ def test_what_reading_drops_is_logged_and_counted_once(log: Log, tmp_path: Any, 
     assert len([r for r in caplog.records if "dropped 1:" in r.message]) == 1
     for one in mapped:  # a second run of the same log counts anew
         assert list(one.dropped.values()).count(1) == 1
+        assert len([line for line in one.warnings if line.startswith("dropped 1:")]) == 1
 
 
 def test_wrong_options_and_settings_are_one_line(log: Log, tmp_path: Any) -> None:

@@ -612,6 +612,19 @@ def test_a_file_in_the_way_of_the_output(objslam, log_folder, tmp_path):
     failed.says("objects.json")
 
 
+def test_files_of_others_in_the_folder_of_a_result_are_named_once(objslam, log_folder, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "notes.txt").write_text("mine")
+    first = objslam("run", log_folder, "-o", out, *LEAN)
+    assert first.code == 0
+    assert f"warning: {out} holds other files (notes.txt)" in first.err
+    again = objslam("run", log_folder, "-o", out, *LEAN)
+    assert again.code == 0
+    assert "holds other files" not in again.err
+    assert (out / "notes.txt").read_text() == "mine"
+
+
 def test_an_output_on_a_drive_that_is_not_there(objslam, log_folder):
     failed = objslam("run", log_folder, "-o", "/proc/no_such_drive/out", *QUICK)
     assert failed.code == 1

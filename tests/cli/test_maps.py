@@ -54,7 +54,8 @@ def test_diff_tells_what_changed_and_draws_it(days, tmp_path, monkeypatch, capsy
     picture = tmp_path / "diff.png"
     code, said, _ = call(monkeypatch, capsys, "diff", out / "a", out / "b", "-o", picture)
     assert code == 0
-    assert "12 confirmed, 1 moved, 1 gone, 1 new, 0 unseen" in said
+    assert "12 confirmed, 1 moved, 1 gone, 1 new, 0 unconfirmed" in said
+    assert len(re.findall("│ confirmed +│", said)) == 12
     assert picture.read_bytes()[:4] == b"\x89PNG"
     code, said, _ = call(monkeypatch, capsys, "diff", out / "a", out / "b", "--json")
     told = json.loads(said)
@@ -64,13 +65,38 @@ def test_diff_tells_what_changed_and_draws_it(days, tmp_path, monkeypatch, capsy
     np.testing.assert_allclose(by["moved"]["moved_from"], objects[MOVED][1], atol=0.05)
     np.testing.assert_allclose(by["new"]["position"], ADDED, atol=0.05)
     np.testing.assert_allclose(np.array(told["a_T_b"]) @ UNKNOWN, np.eye(4), atol=0.05)
+    maps = [objslam.ObjectMap.load(out / name) for name in ("a", "b")]
+    for one in told["changes"]:  # Each id is one of the map that it is said to be of.
+        labels = [
+            next((o.label for o in m if o.id == one[key]), None) for m, key in zip(maps, ("id_a", "id_b"), strict=True)
+        ]
+        assert {one["label"]} == set(labels) - {None}
+    assert [by["gone"]["id_b"], by["new"]["id_a"]] == [None, None]
+    assert told["warnings"] == []
+
+
+def test_diff_says_what_a_live_result_cannot_tell_and_what_to_do(days, tmp_path, monkeypatch, capsys):
+    out, _ = days
+    live = tmp_path / "live"
+    shutil.copytree(out / "b", live)
+    (live / "views.parquet").unlink()
+    (live / "journal.objslam").write_bytes(b"")
+    code, said, warned = call(monkeypatch, capsys, "diff", out / "a", live)
+    assert code == 0
+    assert "12 confirmed, 0 moved, 0 gone, 2 new, 2 unconfirmed" in said
+    assert "nothing can be called gone or moved" in warned
+    assert f"objslam run {live} -o {live}_again, then objslam diff {out / 'a'} {live}_again" in warned
+    code, said, warned = call(monkeypatch, capsys, "diff", live, out / "b", "--json")
+    (line,) = json.loads(said)["warnings"]
+    assert f"warning: {line}\n" == warned
+    assert f"all that only {out / 'b'} has counts as new" in line
 
 
 def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeypatch, capsys):
     out, _ = days
     code, said, _ = call(monkeypatch, capsys, "merge", out / "a", out / "b", "-o", tmp_path / "site")
     assert code == 0
-    assert "14 objects (1 gone) from 2 sessions" in said
+    assert "14 objects (1 gone) from 2 sessions: 12 confirmed, 1 moved, 1 new, 0 unconfirmed" in said
     site = objslam.ObjectMap.load(tmp_path / "site")
     assert [len(site), len(site.gone)] == [14, 1]
     assert {o.life.state for o in site} == {"confirmed", "moved", "new"}

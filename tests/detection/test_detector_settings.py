@@ -115,8 +115,13 @@ def test_outputs_can_be_named(tmp_path):
         names={"boxes": "a", "classes": "b", "scores": "c"},
         metadata={"names": list(COLOURS)},
     )
-    with pytest.raises(DetectorError, match="fit no layout"):
+    with pytest.raises(DetectorError, match="fit no layout") as failed:
         load_detector(model, Settings())
+    assert "--names" not in str(failed.value)  # It has names.
+    with pytest.raises(DetectorError, match="name its classes with --names FILE"):
+        load_detector(
+            tiny_model(tmp_path / "n.onnx", "ssd_fractions", names={"boxes": "a", "classes": "b", "scores": "c"}), Settings()
+        )
     roles = {"boxes": "a", "labels": "b", "scores": "c"}
     detector = load_detector(model, Settings(outputs=roles, first_label=1))
     assert labels(detector) == set(COLOURS)
@@ -245,7 +250,7 @@ class TestNames:
     def test_a_model_without_names(self, tmp_path):
         detector = load(tmp_path, metadata={})
         assert labels(detector) == {"class_0", "class_1", "class_2"}
-        assert "names no classes" in detector.warnings[0]
+        assert "names no classes: they are numbered (--names FILE names them)" in detector.warnings[0]
         assert labels(load(tmp_path, "ssd", metadata={})) == {"class_0", "class_1", "class_2"}
         assert labels(load(tmp_path, "ssd", metadata={}, classes=("class_2",))) == {"class_2"}
         assert "needs detector.names" in refused(tmp_path, ConfigError, "ssd", metadata={}, classes=("cup",))

@@ -126,7 +126,7 @@ def test_a_frame_as_the_format_describes_it(tmp_path):
         ("\x00" * 50, "not JSON"),
         ("[1, 2]", "not a JSON object"),
         ("3", "not a JSON object"),
-        ({k: v for k, v in _GOOD.items() if k != "stamp"}, "stamp must hold numbers only"),
+        ({k: v for k, v in _GOOD.items() if k != "stamp"}, "stamp is missing"),
         (_GOOD | {"stamp": "2"}, "stamp must hold numbers only"),
         (_GOOD | {"stamp": True}, "stamp must hold numbers only"),
         (_GOOD | {"stamp": None}, "stamp must hold numbers only"),

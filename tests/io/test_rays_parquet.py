@@ -24,6 +24,7 @@ def three_rays() -> RaysTable:
     return RaysTable(
         object=np.array([7, -1, 0]),
         stamp=np.array([1.0, 1.5, 2.0]),
+        frame_stamp=np.array([1.1, 1.6, 2.1]),
         origin=rng.normal(size=(3, 3)),
         direction=direction / np.linalg.norm(direction, axis=1, keepdims=True),
         residual=np.array([0.0, np.nan, 0.0]),

@@ -144,3 +144,17 @@ def test_boxes_at_the_edge_are_told() -> None:
     dropped, boxes = cut.dropped[CUT_OFF], cut.summary["counts"]["detections"]
     assert dropped > boxes / 3
     assert f"{100 * dropped / boxes:.0f} % of the boxes were dropped" in str(cut.assessment)
+
+
+def test_a_hint_at_the_mode_that_uses_the_odometry_too_is_no_doubt() -> None:
+    """It comes once, and only if the mode was left to a log that has both paths."""
+    assert assess(replace(GOOD, odometry_unused=True)).level == "good"
+    assert len(assess(replace(GOOD, odometry_unused=True, spoilt=True)).reasons) == 1
+
+    def hints(log: object, **changes: object) -> int:
+        return str(objslam.run(log, {**QUIET, **changes}).assessment).count("--mode joint uses both")  # type: ignore[arg-type]
+
+    log = small_log()
+    assert hints(log) == 1
+    assert hints(log, mode="fixed") == hints(log, mode="joint") == hints(replace(log, odometry=None)) == 0
+    assert hints(log, poses={"use": "localization"}) == hints(replace(log, localization=None)) == 0

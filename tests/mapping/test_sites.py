@@ -58,8 +58,15 @@ def test_what_became_of_each_object_is_told():
     lone = next(k for k, (name, _) in place.truth.items() if name not in (gone[0], label))
     place.truth[99] = (place.truth[lone][0], place.spot())
     b, own = all_in_view(place, 1)
+    b = Sees(b.name, ObjectMap(tuple(replace(o, id=o.id + 1000) for o in b.objects)))
     found = compare(a, b)
     assert found.registration.accepted
+    for one in found.changes:  # Each map is asked for its own ids.
+        known = next(iter(one.item.labels or {one.item.label: 1.0}))
+        assert all(o.label == known for o, number in ((a, one.id_a), (b, one.id_b)) for o in o.objects if o.id == number)
+    ids = {(one.outcome, one.id_a, one.id_b) for one in found.changes if one.outcome != "confirmed"}
+    assert ids == {("moved", 5, 1005), ("gone", 3, None), ("new", None, 1099)}
+    assert all(one.id_b == one.id_a + 1000 for one in found.of("confirmed"))
     np.testing.assert_allclose(found.a_T_b, own, atol=1e-6)
     assert len(found.of("confirmed")) == 18
     assert {one.item.id for one in found.of("confirmed")} == set(range(20)) - {3, 5}
@@ -82,7 +89,59 @@ def test_a_map_without_views_says_of_nothing_that_it_is_gone():
 
     found = compare(a, Session("objects alone", b.objects))
     assert not found.of("gone")
-    assert [one.item.id for one in found.of("unseen")] == [3]
+    assert [one.item.id for one in found.of("unconfirmed")] == [3]
+    assert found.has_views == (False, False)
+
+
+class SeesHalf(Sees):
+    """A session whose cameras saw only one half of the place, in its own frame."""
+
+    def looks(self, objects, positions, session_T_map):
+        here = positions @ session_T_map[:3, :3].T + session_T_map[:3, 3]
+        return np.where(here[:, 0] < 6.0, 60, 0)
+
+
+def test_a_merge_and_a_comparison_say_the_same_of_each_object():
+    """Both days saw one half of the place, with a thing taken and a thing put there in each half."""
+    place = Place(np.random.default_rng(21), count=24)
+    halves = [[k for k, (_, at) in place.truth.items() if (at[0] < 6.0) == near] for near in (True, False)]
+    views = object()  # Its content is not read: the test says what was in view.
+    lone = [halves[0][0], halves[1][0]]
+    for k in lone:
+        place.truth[k] = ("clock", place.truth[k][1])  # Only these two are clocks, and they are taken.
+    a = SeesHalf("day 0", all_in_view(place, 0)[0].objects, views)
+    taken = [place.truth.pop(k) for k in lone]
+    beside = np.array([0.3, 0.0, 0.4])
+    place.truth |= {200 + k: ("globe", at + beside) for k, (_, at) in enumerate(taken)}
+    seen, own = all_in_view(place, 1)
+    found_there = tuple(replace(o, position=own[:3, :3] @ o.position + own[:3, 3]) for o in seen.objects)
+    b = SeesHalf("day 1", ObjectMap(found_there), views)
+    found = compare(a, b)
+    assert {(one.outcome, one.item.label, one.id_a, one.id_b) for one in found.changes if one.outcome != "confirmed"} == {
+        ("gone", "clock", lone[0], None),
+        ("unconfirmed", "clock", lone[1], None),
+        ("new", "globe", None, 200),
+        ("unconfirmed", "globe", None, 201),
+    }
+    (island,) = merge_sessions([a, b])
+    states = {o.id: o.life.state for o in (*island.objects, *island.objects.gone)}
+    assert states == {one.item.id: one.outcome for one in found.changes}
+    (alone,) = merge_sessions([a])
+    assert {o.life.state for o in alone.objects} == {"unconfirmed"}
+
+
+def test_what_was_gone_before_is_no_change():
+    place = Place(np.random.default_rng(22), count=20)
+    a, _ = all_in_view(place, 0)
+    taken = place.truth.pop(4)
+    b, _ = all_in_view(place, 1)
+    site = Sees("site", merge_sessions([a, b])[0].objects)
+    assert [o.id for o in site.objects.gone] == [4]
+    assert {one.outcome for one in compare(site, b).changes} == {"confirmed"}
+    place.truth[4] = taken
+    c, _ = all_in_view(place, 2)
+    (back,) = [one for one in compare(site, c).changes if one.outcome != "confirmed"]
+    assert (back.outcome, back.id_a, back.id_b) == ("new", None, 4)
 
 
 def test_an_object_that_comes_back_is_the_same_one():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from objslam.cli.console import progress_bar, say
+from objslam.cli.console import progress_bar, say, warn_of_neighbours
 from objslam.cli.live_command.drive import LatestObjects, drive, finish
 from objslam.cli.options import CalibrationFile, Config, Out, PriorMapPath, Quiet, Set, settings_of, with_options
 from objslam.live.adapters import ADAPTERS, Feed, LiveOptions, NetworkOptions
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Speed = Annotated[
     float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0, also for stdin: as fast as the map follows.")
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue a killed session from its journal.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue a session that was killed or has ended, from its journal.")]
 Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]
 Publish = Annotated[
     bool, typer.Option("--publish", help="At each --interval, publish objects, markers and path over DDS for RViz and Nav2.")
@@ -89,6 +89,8 @@ def live(
     # The recording is read first, because it may be the journal in OUT, which is renamed below.
     recording = None if source in ADAPTERS else _read(Path(source), options, settings)
     with output_folder(out), ExitStack() as stack:
+        if not (out / NAME).exists():
+            warn_of_neighbours(out)
         if journal:
             _look_for_journal(out / NAME, resume, stack)
         patient = speed == 0 if recording is not None else _is_recorded(source, speed)

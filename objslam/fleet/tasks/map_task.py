@@ -144,7 +144,7 @@ def _said(result: Result) -> dict[str, Any]:
         "mode": result.summary["mode"],
         "verdict": result.assessment.level,
         "counts": dict(result.summary["counts"]),
-        "warnings": (*result.warnings, *(f"{reason}: {count}" for reason, count in result.dropped.items())),
+        "warnings": result.warnings,
         "calibration": tuple(
             Parameter(name, one["value"], one["sigma"], one["unit"], one["observable"]) for name, one in parameters.items()
         ),

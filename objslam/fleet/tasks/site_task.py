@@ -178,6 +178,7 @@ def _island(found: SiteMap, order: Mapping[str, int]) -> Island:
         np.array([one.log_odds for one in found.sessions]),
         tuple(one.common for one in found.sessions),
         {},
+        {},
     )
 
 

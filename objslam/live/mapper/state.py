@@ -149,6 +149,7 @@ class MapState:
             odom_T_base=k.start_T_base[rows] if reckoned else None,
             drift=k.drift[rows] if reckoned else None,
             stretch=np.where(k.by_odometry[rows], k.piece[rows], -1) if reckoned else None,
+            given_stamps=k.sent[rows],
         )
 
     def rows_of(self, ids: Ints) -> Ints:

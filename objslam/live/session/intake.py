@@ -73,6 +73,7 @@ class Intake:
         self._labels: set[str] = set()
         self._stamps: dict[str, dict[float, None]] = {}  # The last stamps of frames by camera, in the order of arrival.
         self._resumed: dict[str, float] = {}  # The stamp of the last frame of each camera in a resumed journal.
+        self._resumed_path: dict[PathKind, float] = {}  # The stamp of the last pose of each path there, in session time, s.
         self._restarts = OdometryRestarts(settings, counters)
         self._last: dict[PathKind, PoseMessage] = {}
         self._heard: dict[PathKind, OrderedDict[float, Floats]] = {}  # The newest poses by stamp, in session time, s.
@@ -155,6 +156,7 @@ class Intake:
                 self._cameras[message.camera.name] = message.camera
             elif isinstance(message, PoseMessage):
                 self._last[message.path] = message
+                self._resumed_path[message.path] = message.stamp
                 self._keep(message)
                 self._lead.choose(message.path, message.stamp)
                 if message.path == self._lead.path:
@@ -266,10 +268,10 @@ class Intake:
         return self._hand_on(MountMessage(self._place(stamp), camera, pose))
 
     def _is_known(self, path: PathKind, at: float, pose: Floats) -> bool:
-        """Return whether this pose was accepted before at this stamp, in session time, s, and newer poses were accepted
-        after it."""
+        """Return whether this pose was accepted before at this stamp, in session time, s, and something came after it: a
+        newer pose, or the end of a session that this one resumes."""
         known = self._heard[path].get(at) if path in self._heard else None
-        if known is None or at >= self._last[path].stamp:
+        if known is None or (at >= self._last[path].stamp and at > self._resumed_path.get(path, -math.inf)):
             return False
         pose = self._restarts.start_T_odom @ pose if path == "odometry" else pose
         return bool(np.abs(known - pose).max() < _SAME_POSE)

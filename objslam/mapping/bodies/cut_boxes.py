@@ -13,9 +13,10 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES
+from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import undistort
 from objslam.core.statistics import NORMAL_MEDIAN
-from objslam.core.types import CutBoxes, Keyframes, Rays
+from objslam.core.types import Keyframes, Rays
 from objslam.frontend.bearings import cut_edges
 from objslam.mapping.bodies.box_views import BoxViews
 from objslam.mapping.solution import Solution

@@ -51,7 +51,8 @@ class Evidence:
     journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
     whether they name one object or several. odometry: the largest factor on a noise of the odometry that the log shows.
     scale: the standard deviation of the scale of the odometry, as a share. None if the log tells the scale. part: the limits
-    of a log that is a part of a recording, as in `Log`.
+    of a log that is a part of a recording, as in `Log`. odometry_unused: whether the mode was left to the log, and a
+    `fixed` run did not use its odometry.
     """
 
     resolved: int
@@ -73,6 +74,7 @@ class Evidence:
     odometry: float = 1.0
     scale: float | None = None
     part: tuple[float | None, float | None] = (None, None)
+    odometry_unused: bool = False
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
         scale=_untold_scale(summary),
         part=(summary["part"]["begin"], summary["part"]["end"]) if "part" in summary else (None, None),
+        odometry_unused=summary.get("odometry_unused", False),
     )
 
 
@@ -134,8 +137,11 @@ def assess(e: Evidence) -> Assessment:
 
 
 def _about(e: Evidence) -> list[str]:
-    """Return what a reader must know of the map: the part of the recording, the frame, the scale. It lowers no level."""
+    """Return what a reader must know of the map: a better mode, the part of the recording, the frame, the scale. No level
+    depends on it."""
     found = []
+    if e.odometry_unused:
+        found.append("Hint: the log has odometry too. --mode joint uses both, and its map is usually more exact.")
     if part := part_in_words(e.part):
         found.append(f"The map is of a part of the recording: {part}.")
     if e.odometry_frame:

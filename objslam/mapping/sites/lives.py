@@ -1,14 +1,16 @@
-"""The life of each object of a site: whether it is new, confirmed, moved or gone, updated session after session (`Life`)."""
+"""The life of each object of a site: what became of it, updated session after session (`Life`)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from objslam.association.persistence import persistence
-from objslam.core.arrays import Bools, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.object_map import Fate, Life, MapObject
+from objslam.mapping.sites.session import Session
 
 GONE = 0.5
 """The probability below which an object counts as gone. A larger value gives objects up sooner."""
@@ -29,7 +31,8 @@ class Track:
 
     item: the object as seen last. number: its id in the site, None for a new object. life: the life after the sessions so
     far, None before the first session. places: its measurements, as rows of the joint solve. begun, met: the first and the
-    last session that found it, as indices in the order of time. since: when it was seen first, s.
+    last session that found it, as indices in the order of time. since: when it was seen first, s. was: the track of the same
+    object at its earlier place, None if it did not move.
     """
 
     item: MapObject
@@ -39,6 +42,7 @@ class Track:
     begun: int = 0
     met: int = 0
     since: float = np.nan
+    was: Track | None = None
 
 
 def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[MapObject | None], when: float) -> list[Life]:
@@ -61,7 +65,7 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
         if life is None:
             assert item is not None
             exists = UNPROVEN if item.existence is None else min(item.existence, UNPROVEN)
-            lives.append(Life("new", exists, 1, 1, views, detections, when))
+            lives.append(Life("unconfirmed", exists, 1, 1, views, detections, when))
             continue
         p = float(probability[k])
         met = bool(found[k])
@@ -78,6 +82,26 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
             )
         )
     return lives
+
+
+def there_before(
+    session: Session, items: Sequence[MapObject], positions: Floats, session_T_site: Floats, before: Floats
+) -> Floats:
+    """Return the probability (N,) that each object was already there in an earlier session that did not find it.
+
+    It is 0 if the session does not say what was in view. Below `GONE`, the object counts as new. positions: (N, 3) m, in the
+    site. session_T_site: (4, 4). before: (N,) this probability from the sessions treated so far, `UNPROVEN` at first.
+    """
+    visits = session.visits() if session.views is None else ()
+    parts = [(one.session, one.session_T_site @ session_T_site) for one in visits] or [(session, session_T_site)]
+    if any(part.views is None for part, _ in parts):
+        return np.zeros(len(items))
+    past = np.array([(0, 0) if o.life is None else (o.life.looks, o.life.detections) for o in items]).reshape(-1, 2)
+    none = np.zeros(len(items))
+    for part, part_T_site in parts:
+        looks = part.looks(tuple(items), positions, part_T_site)
+        before = persistence(before, none, none.astype(bool), looks, past[:, 0], past[:, 1])
+    return before
 
 
 def joined(old: Life, new: Life) -> Life:

@@ -1,7 +1,7 @@
 """Join many sessions, each in a frame of its own, to one map of the site.
 
 An island is a group of sessions that share objects. A track is one object over the sessions of an island. The life of an
-object tells whether it is new, confirmed, moved or gone (`Life`).
+object tells what became of it (`Life`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,16 @@ from objslam.core.geometry import inverse
 from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
 from objslam.mapping.sites.covariances import Row, measured_objects, site_covariances
-from objslam.mapping.sites.lives import FORGOTTEN, GONE, Track, after_session, joined, may_be_one
+from objslam.mapping.sites.lives import (
+    FORGOTTEN,
+    GONE,
+    UNPROVEN,
+    Track,
+    after_session,
+    joined,
+    may_be_one,
+    there_before,
+)
 from objslam.mapping.sites.placement import Part, mean_labels, place_sessions, sessions_behind
 from objslam.mapping.sites.session import Session
 
@@ -36,7 +45,9 @@ class Island:
     objects: the map, with the life of each object. sessions: the indices of the sessions, in the order of time.
     site_T_session: (S, 4, 4). covariance: (S, 4, 4) of x, y, z (m) and yaw (rad) of each session, 0 for the first. log_odds:
     (S,) the log odds of the registration that tied each session to the others, NaN for the first. common: for each session,
-    how many of its objects another session found too. seen_by: for each object id, the sessions that found it.
+    how many of its objects another session found too. found_as: for each object id, the sessions that found it, and its id
+    in each. moved_as: the same for the earlier place of an object that moved, only for objects that moved between these
+    sessions.
     """
 
     objects: ObjectMap
@@ -45,7 +56,8 @@ class Island:
     covariance: Floats
     log_odds: Floats
     common: tuple[int, ...]
-    seen_by: dict[int, tuple[int, ...]]
+    found_as: dict[int, dict[int, int]]
+    moved_as: dict[int, dict[int, int]]
 
 
 def merge_sessions(sessions: Sequence[Session]) -> tuple[Island, ...]:
@@ -76,15 +88,20 @@ def _island(sessions: Sequence[Session], part: Part) -> Island:
     for row, (_, at, _) in enumerate(rows):
         tracks[at].places.append(row)
     alive = _live(sessions, order, tracks, rows, solved)
+    _name_new(sessions, order, [tracks[at] for at in alive], solved.positions[alive], solved.site_T_map)
     objects, track_of = _objects(tracks, alive, rows, solved, shared)
-    seen_by = {number: tuple(order[rows[row][0]] for row in tracks[at].places) for number, at in track_of.items()}
+    found_as, moved_as = {}, {}
+    for number, at in track_of.items():
+        found_as[number] = {order[turn]: o.id for turn, _, o in (rows[row] for row in tracks[at].places)}
+        if (was := tracks[at].was) is not None:
+            moved_as[number] = {order[turn]: o.id for turn, _, o in (rows[row] for row in was.places)}
     often = np.bincount([at for _, at, _ in rows], minlength=len(tracks))
     common = np.bincount([n for n, at, _ in rows if often[at] > 1], minlength=len(order))
     odds = [part.log_odds[s] for s in order]
     odds[int(np.isnan(odds).argmax())], odds[0] = odds[0], np.nan  # The earliest session gives the frame of the island.
-    return Island(
-        objects, tuple(order), solved.site_T_map, solved.frame_covariance, np.array(odds), tuple(common.tolist()), seen_by
-    )
+    frames, covariance = solved.site_T_map, solved.frame_covariance
+    seen = (tuple(common.tolist()), found_as, moved_as)
+    return Island(objects, tuple(order), frames, covariance, np.array(odds), *seen)
 
 
 def _live(
@@ -123,6 +140,26 @@ def _live(
             tracks[at].item, tracks[at].met = _in_site(item, tracks[at].item, solved.site_T_map[turn]), turn
         begun = _follow(tracks, begun, solved.positions, fresh if site and turn else ())
     return begun
+
+
+def _name_new(
+    sessions: Sequence[Session], order: list[int], tracks: list[Track], positions: Floats, site_T_session: Floats
+) -> None:
+    """Call an unconfirmed object `new` if an earlier session would have found it there.
+
+    positions: (N, 3) m, of the tracks.
+    """
+    alone = [k for k, t in enumerate(tracks) if t.begun and t.life is not None and t.life.state == "unconfirmed"]
+    probability = np.full(len(tracks), UNPROVEN)
+    for turn, s in enumerate(order):
+        some = [k for k in alone if tracks[k].begun > turn and probability[k] >= GONE]
+        if some:
+            items = [replace(tracks[k].item, life=tracks[k].life) for k in some]
+            back = inverse(site_T_session[turn])
+            probability[some] = there_before(sessions[s], items, positions[some], back, probability[some])
+    for k in alone:
+        if probability[k] < GONE and (life := tracks[k].life) is not None:
+            tracks[k].life = replace(life, state="new")
 
 
 def _join_lives(tracks: list[Track], begun: list[int], here: dict[int, MapObject]) -> None:
@@ -175,7 +212,7 @@ def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequ
             continue
         now = min(may, key=lambda k: float(np.linalg.norm(positions[k] - positions[at])))
         state = "moved" if lives[now].sessions_seen <= _YOUNG else lives[now].state
-        tracks[now].life = replace(lives[now], state=state, moved_from=positions[at])
+        tracks[now].life, tracks[now].was = replace(lives[now], state=state, moved_from=positions[at]), tracks[at]
         if tracks[at].number is not None:
             tracks[now].number = tracks[at].number
         left.remove(at)

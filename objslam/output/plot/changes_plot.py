@@ -11,9 +11,9 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import printable
-from objslam.mapping.sites.compare import Comparison
+from objslam.mapping.sites.compare import Change, Comparison
 from objslam.output.plot.figure import Colour, Figure, Label, Line, Marks, Shape
-from objslam.output.plot.labels import make_labels, shortened
+from objslam.output.plot.labels import drawn_points, make_labels, shortened
 from objslam.output.plot.page import render
 from objslam.output.plot.style import body_outline, frame_objects
 
@@ -39,7 +39,7 @@ class _Look:
 
 _LOOKS = {
     "confirmed": _Look((0.294, 0.333, 0.388), "dot"),
-    "unseen": _Look((0.463, 0.463, 0.463), "dot", hollow=True),
+    "unconfirmed": _Look((0.463, 0.463, 0.463), "dot", hollow=True),
     "new": _Look((0.102, 0.498, 0.216), "plus"),
     "moved": _Look((0.043, 0.388, 0.773), "diamond"),
     "gone": _Look((0.761, 0.184, 0.184), "x"),
@@ -55,14 +55,25 @@ def draw_site(objects: ObjectMap) -> bytes:
 
 def draw_comparison(found: Comparison) -> bytes:
     """Return a PNG of the comparison of two maps, in the frame of the first."""
-    return render(changes_figure([(one.outcome, one.item) for one in found.changes], "changes since the first map"))
+    items = [(one.outcome, one.item) for one in found.changes]
+    names = [_named(one) for one in found.changes]
+    return render(changes_figure(items, "changes since the first map (A, the later one is B)", names))
 
 
-def changes_figure(items: Sequence[tuple[str, MapObject]], title: str) -> Figure:
-    """Return what the picture of objects with their outcomes shows."""
+def _named(one: Change) -> str:
+    """Return the name of an object with its id in both maps, such as "cup A5 B14"."""
+    ids = [f"{name}{number}" for name, number in (("A", one.id_a), ("B", one.id_b)) if number is not None]
+    return " ".join([one.item.label, *ids])
+
+
+def changes_figure(items: Sequence[tuple[str, MapObject]], title: str, names: Sequence[str] | None = None) -> Figure:
+    """Return what the picture of objects with their outcomes shows. names: of the objects, else their labels and ids."""
+    if names is None:
+        names = [f"{o.label} #{o.id}" for _, o in items]
     everything = np.array([o.position[:2] for _, o in items]).reshape(-1, 2)
     inside, low, high = frame_objects(everything, np.zeros((0, 2)))
     items = [item for item, there in zip(items, inside, strict=True) if there]
+    names = [shortened(printable(name)) for name, there in zip(names, inside, strict=True) if there]
     points, before = everything[inside], np.array([_before(o)[:2] for _, o in items]).reshape(-1, 2)
     title += f", {int((~inside).sum())} far away not shown" if not inside.all() else ""
     low, high = np.minimum(low, before.min(axis=0, initial=np.inf)), np.maximum(high, before.max(axis=0, initial=-np.inf))
@@ -76,13 +87,13 @@ def changes_figure(items: Sequence[tuple[str, MapObject]], title: str) -> Figure
         mine = np.array([one == outcome for one, _ in items], dtype=bool)
         if not mine.any():
             continue
-        shapes += _outlines([o for one, o in items if one == outcome], look.colour, 2 * _MARK / scale)
+        shapes += _outlines([o for one, o in items if one == outcome], look.colour, (_MARK + 2 * _LINE) / scale)
         if outcome == "moved":
             shapes += _arrows(before[mine], points[mine], look.colour)
         face, rim = (_WHITE, look.colour) if look.hollow else (look.colour, _WHITE)
         marks.append(Marks(points[mine], look.kind, face, rim, _MARK, f"{outcome} ({int(mine.sum())})"))
     figure = Figure(title, ("x", "y"), low - wider, high + wider, scale, (*shapes, *marks))
-    return replace(figure, labels=_labels(figure, items, points))
+    return replace(figure, labels=_labels(figure, items, points, names))
 
 
 def _outcome(o: MapObject) -> str:
@@ -109,11 +120,12 @@ def _arrows(starts: Floats, ends: Floats, colour: Colour) -> list[Shape]:
     return found
 
 
-def _labels(figure: Figure, items: Sequence[tuple[str, MapObject]], points: Floats) -> tuple[Label, ...]:
+def _labels(
+    figure: Figure, items: Sequence[tuple[str, MapObject]], points: Floats, names: Sequence[str]
+) -> tuple[Label, ...]:
     """Return the label of each object that has room for one. Objects that changed come first."""
-    order = sorted(range(len(items)), key=lambda k: items[k][0] in ("confirmed", "unseen"))
-    items, points = [items[k] for k in order], points[order]
-    names = [shortened(printable(f"{o.label} #{o.id}")) for _, o in items]
+    order = sorted(range(len(items)), key=lambda k: items[k][0] in ("confirmed", "unconfirmed"))
+    items, points, names = [items[k] for k in order], points[order], [names[k] for k in order]
     rims = [rim for _, o in items if (rim := body_outline(o)) is not None]
-    avoid = figure.pixels(np.concatenate(rims)) if rims else np.zeros((0, 2))
+    avoid = np.concatenate([np.zeros((0, 2)), *(drawn_points(figure.pixels(rim)) for rim in rims)])
     return make_labels(figure, names, [_LOOKS[outcome].colour for outcome, _ in items], points, avoid)

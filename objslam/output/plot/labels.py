@@ -12,6 +12,9 @@ from objslam.output.plot.figure import Colour, Figure, Label
 from objslam.output.plot.label_layout import needs_leader, place_labels
 from objslam.output.plot.page import FONT, LINE
 
+_STEP = (
+    2.0  # The distance, px, between the points of an outline that labels avoid. A larger one lets labels cover more of it.
+)
 _MAX_LETTERS = 28  # A label has at most this many letters. An ellipsis replaces the rest.
 
 
@@ -32,6 +35,16 @@ def make_labels(
         leader = np.stack([anchors[i], near]) if led[i] else None
         labels.append(Label(names[i], colours[i], np.concatenate([corners[i], corners[i] + sizes[i]]), leader))
     return tuple(labels)
+
+
+def drawn_points(rim: Floats) -> Floats:
+    """Return points (P, 2), px, along a drawn outline (n, 2), px, so dense that no label gets between them.
+
+    The outline of a cuboid has its corners alone, between which a label would have room.
+    """
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(rim, axis=0), axis=1)))
+    at = np.linspace(0.0, way[-1], max(int(way[-1] / _STEP), 1) + 1)
+    return np.column_stack([np.interp(at, way, rim[:, axis]) for axis in (0, 1)])
 
 
 def shortened(name: str) -> str:

@@ -118,15 +118,15 @@ def cut_crops(
 ) -> dict[int, Crop]:
     """Return a crop for each ray whose index is in `chosen`, by this index.
 
-    A ray has no crop if there is no readable image within `MAX_IMAGE_LAG` of its stamp, or if its box is outside the image.
+    A ray has no crop if there is no readable image within `MAX_IMAGE_LAG` of its frame, or if its box is outside the image.
     progress: is called with the number of image files that are done, and the number of all.
     """
     by_file: dict[Path, list[int]] = {}
     for ray in chosen:
         listed = images.get(str(rays.camera[ray]))
         if listed is not None:
-            near = int(nearest_stamps(listed.stamps, rays.stamp[ray : ray + 1])[0])
-            if abs(listed.stamps[near] - rays.stamp[ray]) <= MAX_IMAGE_LAG:
+            near = int(nearest_stamps(listed.stamps, rays.frame_stamp[ray : ray + 1])[0])
+            if abs(listed.stamps[near] - rays.frame_stamp[ray]) <= MAX_IMAGE_LAG:
                 by_file.setdefault(listed.paths[near], []).append(ray)
     crops = {}
     for done, (file, wanted) in enumerate(by_file.items()):

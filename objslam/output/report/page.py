@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.bodies.body import UNKNOWN_YAW
-from objslam.core.types import Images
+from objslam.core.diagnostics import is_drop
 from objslam.core.validity import is_date
 from objslam.errors import ConfigError, OutputError
 from objslam.evaluation.alignment import lay_truth
@@ -94,7 +93,6 @@ def write_report(
     of_doubt = [spread_over_time(rays, one.rays[one.rays < len(rays)], crops) for one in doubts]
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
-    images = _on_one_clock(images, summary.get("calibration"))
     wanted: dict[int, Kind] = {}
     for some in (*chosen.values(), *unexplained.values(), *of_doubt):
         wanted |= some
@@ -137,7 +135,8 @@ def write_report(
         },
         doubts=[(one, [pictures[i] for i in index if i in pictures]) for one, index in zip(doubts, of_doubt, strict=True)],
         dropped=[(why, n, "; ".join(examples.get(why, []))) for why, n in summary.get("dropped", {}).items()],
-        **{key: summary.get(key, {}) for key in ("warnings", "seconds", "versions")},
+        warnings=[line for line in summary.get("warnings", []) if not is_drop(line)],  # These have a table of their own.
+        **{key: summary.get(key, {}) for key in ("seconds", "versions")},
         costs={key: summary[key] for key in ("cost_before", "cost_after", "iterations") if summary.get(key) is not None},
         changed=_changed(settings),
         settings=dump_settings(settings),
@@ -151,16 +150,6 @@ def _unexplained(rays: RaysTable, crops: int) -> dict[str, dict[int, Kind]]:
     labels, counts = np.unique(rays.label[rays.object < 0].astype(str), return_counts=True)
     most = labels[np.argsort(-counts, kind="stable")][:_LABELS]
     return {str(label): choose_unexplained(rays, str(label), crops) for label in most}
-
-
-def _on_one_clock(images: dict[str, Images], calibration: dict[str, Any] | None) -> dict[str, Images]:
-    """Return the images of each camera with corrected stamps: the clock offset that the run estimated is added.
-
-    images: the images by camera name. calibration: the entry of summary.json, None if the run estimated no shared errors.
-    """
-    found = calibration["parameters"] if calibration else {}
-    clock = {name: found.get(f"{name}.clock", {"value": 0.0})["value"] for name in images}
-    return {name: replace(listed, stamps=listed.stamps + clock[name]) for name, listed in images.items()}
 
 
 def _evaluation(out: Path) -> tuple[dict[int, tuple[float, str]], dict[str, Any] | None]:

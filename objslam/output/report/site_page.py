@@ -4,7 +4,7 @@ from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
 
-from objslam.core.object_map import Fate, Life, ObjectMap
+from objslam.core.object_map import FATES, Life, ObjectMap
 from objslam.core.validity import is_date
 from objslam.io.atomic_files import write_file
 from objslam.output.plot.style import captions, label_colours
@@ -12,9 +12,6 @@ from objslam.output.report.render import render
 from objslam.output.report.scene import hexadecimal, scene_data
 from objslam.results.files import PICTURE, REPORT
 from objslam.results.read import load_map, load_summary
-
-_STATES: tuple[Fate, ...] = ("confirmed", "moved", "new", "gone")
-"""The states of objects, in the order of the page."""
 
 
 def write_site_report(out: Path) -> Path:
@@ -30,7 +27,7 @@ def write_site_report(out: Path) -> Path:
         folder=out.resolve().name,
         frame=objects.frame,
         picture=picture.read_bytes() if picture.is_file() else None,
-        states=[(state, number[state]) for state in _STATES if number[state]],
+        states=[(state, number[state]) for state in FATES if number[state]],
         sessions=summary.get("sessions", []),
         warnings=summary.get("warnings", []),
         rows=[

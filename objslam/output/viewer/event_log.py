@@ -54,8 +54,6 @@ def drive_events(result: RunResult) -> list[Event]:
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
     events = [Event(start, "INFO", f"{objects}, {len(result.rays)} rays, {len(result.keyframes)} keyframes")]
     events += [Event(start, "WARN", str(text)) for text in result.summary.get("warnings", [])]
-    dropped = result.summary.get("dropped", {})
-    events += [Event(start, "WARN", f"dropped {count}: {reason}") for reason, count in dropped.items()]
     enough = _enough_parallax(result)
     rejected = np.bincount(result.association.object[ray_kinds(result)["rejected"]], minlength=max(len(result.map), 1))
     later: list[Event] = []

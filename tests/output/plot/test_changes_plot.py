@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -16,7 +17,7 @@ from objslam.output.plot.changes_plot import changes_figure
 from objslam.output.plot.figure import Figure, Line, Marks
 from objslam.output.plot.page import render
 
-OUTCOMES = ("confirmed", "unseen", "new", "moved", "gone")
+OUTCOMES = ("confirmed", "unconfirmed", "new", "moved", "gone")
 
 
 def objects(**changes: Any) -> list[MapObject]:
@@ -92,3 +93,17 @@ def test_a_mark_is_drawn_where_it_is(kind: str) -> None:
 
 def test_no_object_is_a_picture_too() -> None:
     assert render(changes_figure([], "0 objects")).startswith(b"\x89PNG")
+
+
+def test_labels_leave_the_outlines_of_bodies_free() -> None:
+    """Also the sides of a cuboid, which are drawn between its corners."""
+    body = Body("cuboid", np.array([1.2, 0.9, 0.8]), 0.0, np.full(3, 0.01), 0.1)
+    model = objects()[0]
+    at = [np.array([x, y, 0.4]) for x in (0.0, 3.0, 6.0) for y in (0.0, 3.0)]
+    items = [replace(model, id=k, label="a long name", position=p, body=body) for k, p in enumerate(at)]
+    figure = changes_figure([("new", o) for o in items], "changes")
+    rims = [figure.pixels(shape.points) for shape in figure.shapes if isinstance(shape, Line)]
+    assert len(figure.labels) == len(rims) == len(items)
+    along = np.concatenate([a + np.linspace(0, 1, 500)[:, None] * (b - a) for rim in rims for a, b in pairwise(rim)])
+    for label in figure.labels:
+        assert not ((along > label.box[:2]) & (along < label.box[2:])).all(axis=1).any()

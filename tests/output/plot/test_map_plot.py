@@ -123,7 +123,7 @@ def test_lines_far_outside_and_without_points_can_be_drawn() -> None:
             draw_line(image, points, (0.0, 0.0, 0.0), 1, dash)
 
 
-@pytest.mark.parametrize(("sigma", "whole"), [(0.6, True), (500.0, False)])
+@pytest.mark.parametrize(("sigma", "whole"), [(0.6, True), (1.1, True), (500.0, False)])
 def test_an_ellipse_is_in_the_picture_as_long_as_it_leaves_room_for_the_map(sigma: float, whole: bool) -> None:
     positions, labels = clusters()
     result, _ = synthetic_result(positions, labels, keyframes=50)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from synthetic_result import clusters, synthetic_result
@@ -15,7 +16,7 @@ from objslam.core.types import Images
 from objslam.io.rays_parquet import RaysTable
 from objslam.output.report import write_report
 from objslam.output.report.charts import HEIGHT, WIDTH
-from objslam.output.report.page import _on_one_clock
+from objslam.output.report.crops import cut_crops
 from objslam.output.report.trends import trends
 from objslam.output.result_folder import write_result
 from objslam.results.read import load_rays
@@ -31,6 +32,7 @@ def some_rays(count: int = 240) -> RaysTable:
     return RaysTable(
         object=np.zeros(count, dtype=np.int64),
         stamp=np.arange(count, dtype=float),
+        frame_stamp=np.arange(count, dtype=float),
         origin=np.zeros((count, 3)),
         direction=np.tile([1.0, 0, 0], (count, 1)),
         residual=after,
@@ -126,9 +128,14 @@ def test_without_shared_errors_the_report_has_one_curve_and_no_table(tmp_path: P
     assert 'class="curve before"' not in text
 
 
-def test_images_are_found_by_the_clock_that_the_run_corrected() -> None:
-    listed = {name: Images(np.array([1.0, 2.0]), (Path("a"), Path("b"))) for name in ("front", "rear")}
-    moved = _on_one_clock(listed, {"parameters": {"front.clock": {"value": 0.2}}})
-    assert moved["front"].stamps.tolist() == [1.2, 2.2]
-    assert moved["rear"].stamps.tolist() == [1.0, 2.0]
-    assert _on_one_clock(listed, None)["front"].stamps.tolist() == [1.0, 2.0]
+def test_images_are_found_by_the_stamps_of_their_frames(tmp_path: Path) -> None:
+    """Whatever clock the run corrected, and at an end of the path, where corrected stamps are squeezed."""
+    rays = some_rays(2)
+    own = np.array([10.0, 11.0])
+    rays = RaysTable(**{**vars(rays), "frame_stamp": own, "box": np.tile([20.0, 20.0, 60.0, 60.0], (2, 1))})
+    for name, shade in (("a.png", 0), ("b.png", 255)):
+        cv2.imwrite(str(tmp_path / name), np.full((80, 80, 3), shade, dtype=np.uint8))
+    images = {"front": Images(own, (tmp_path / "a.png", tmp_path / "b.png"))}
+    crops = cut_crops(rays, {0: "best", 1: "best"}, images, lambda done, total: None)
+    middle = [cv2.imdecode(np.frombuffer(crops[k].jpeg, np.uint8), 0)[20:-20, 20:-20].mean() for k in (0, 1)]
+    assert middle[0] < 60 < 200 < middle[1]

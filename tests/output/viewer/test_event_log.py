@@ -59,7 +59,7 @@ def test_many_objects_are_not_all_told() -> None:
 
 def test_the_drive_says_when_and_why() -> None:
     result, _ = synthetic_result(*clusters(), keyframes=40, unresolved=(2,))
-    lines = drive_events(dataclasses.replace(result, summary={**result.summary, "dropped": {"cut off": 3}}))
+    lines = drive_events(dataclasses.replace(result, summary={**result.summary, "warnings": ["dropped 3: cut off"]}))
     texts = [line.text for line in lines]
     assert texts[0] == "14 objects, 1 unresolved, 600 rays, 40 keyframes"
     assert ("WARN", "dropped 3: cut off") in [(line.level, line.text) for line in lines]
