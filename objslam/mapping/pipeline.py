@@ -18,6 +18,7 @@ from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
+from objslam.frontend.localization_jumps import find_jumps, without_jumps
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
@@ -34,7 +35,7 @@ from objslam.mapping.fixed.lasting_errors import with_lasting_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
 from objslam.mapping.refuted import without_refuted
-from objslam.mapping.solution import seen_something
+from objslam.mapping.solution import seen_something, with_jumps
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
 
@@ -56,6 +57,8 @@ def run(
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
+    jumps = find_jumps(log, settings)
+    log = without_jumps(log, settings)
     seconds: dict[str, float] = {}
     with _stage("load", seconds, progress):
         load_libraries()  # Loading is a stage of its own, because it takes longer than a small solve.
@@ -101,6 +104,8 @@ def run(
             say(diagnosis, ledger)
     if settings.mode == "fixed":
         solution = with_lasting_errors(solution, settings)
+    if jumps is not None:
+        solution = with_jumps(solution, jumps)
     solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate

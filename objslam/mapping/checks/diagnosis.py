@@ -11,6 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
+from objslam.frontend.localization_jumps import without_jumps
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes, refuse_shares
 from objslam.mapping.checks.finding import Finding
@@ -104,6 +105,7 @@ def diagnose(
     if stamps is not None and stamps.spoils:
         raise LogError(stamps.message, where=log.name, hint="write all stamps in s")
     of_path = check_path(log, settings)
+    log = without_jumps(log, settings)
     impossible = any(finding.spoils for finding in of_path)
     findings = [*([stamps] if stamps else []), *of_path, *check_boxes(log, ledger)]
     if not any(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None):
