@@ -77,6 +77,21 @@ class Jumps:
         turns = rotation_vector(self.rotations)
         return self.shares @ self.offsets, rotation_from_vector(self.shares @ turns)
 
+    @property
+    def likely(self) -> Floats:
+        """(J + 1,) the probability that each part is right, proportional to the root of its share of the time.
+
+        It lies between two beliefs: that a localisation is right at a random moment, so that a short part is hardly ever
+        right, and that each part is right with the same probability, so that a single wrong pose would be one of three.
+        """
+        found = np.sqrt(self.shares)
+        return found / found.sum()
+
+    @property
+    def sigma(self) -> float:
+        """The root mean squared distance, m, of the mean place from the part that is right."""
+        return float(np.sqrt(self.likely @ ((self.offsets - self.middle[0]) ** 2).sum(axis=1)))
+
     def part(self, stamps: Floats) -> Ints:
         """Return the part (Q,) of the path at stamps (Q,), s."""
         return np.searchsorted(self.stamps, stamps, side="right")
@@ -92,9 +107,9 @@ class Jumps:
     def spread(self, stamps: Floats, origins: Floats, owner: Ints, positions: Floats) -> Floats:
         """Return the error of the objects because it is not known which part is right, as a factor (N, 3, m), m.
 
-        The localisation was right at a random moment of the drive. So each part is right with the probability of its share
-        of the time, and then all objects are off by its distance from the mean. Beside this, the size of each jump is known
-        to its noise only. It moves an object by the share of its rays that are beyond the jump.
+        Each part is right with its probability `likely`, and then all objects are off by its distance from the mean. Beside
+        this, the size of each jump is known to its noise only. It moves an object by the share of its rays that are beyond
+        the jump.
 
         stamps: (R,) s, origins: (R, 3) m, owner: (R,) the object of each ray. positions: (N, 3) m of the objects.
         """
@@ -103,7 +118,7 @@ class Jumps:
         centre = np.stack([np.bincount(owner, origins[:, k], count) for k in range(3)], axis=1) / seen[:, None]
         turned = self.rotations @ rotation.T - np.eye(3)
         shift = (self.offsets - place)[:, None] + np.einsum("kij,nj->kni", turned, positions - centre)
-        found = [np.sqrt(share) * one for share, one in zip(self.shares, shift, strict=True)]
+        found = [np.sqrt(chance) * one for chance, one in zip(self.likely, shift, strict=True)]
         for number in range(len(self)):
             beyond = np.bincount(owner, part > number, count) / seen - self.shares[number + 1 :].sum()
             found += [beyond[:, None] * axis for axis in np.diag(self.noise[0])]

@@ -94,12 +94,11 @@ def check_path(log: Log, settings: Settings) -> list[Finding]:
 def _corrected(jumps: Jumps) -> Finding:
     """Return the finding about jumps that a run takes out."""
     way, angle = np.linalg.norm(jumps.moves[0]), np.degrees(np.linalg.norm(jumps.turns[0]))
-    sigma = np.sqrt(jumps.shares @ ((jumps.offsets - jumps.middle[0]) ** 2).sum(axis=1))
     return Finding(
         "localisation jumps",
         f"the localisation jumps {len(jumps)} time{'' if len(jumps) == 1 else 's'} (first by {way:.2f} m and "
         f"{angle:.0f} deg at stamp {jumps.stamps[0]:.3f}): the run moves the poses on both sides together. It does not know "
-        f"which side was right, so the whole map may be off by {sigma:.2f} m, and its sigmas contain this",
+        f"which side was right, so the whole map may be off by {jumps.sigma:.2f} m, and its sigmas contain this",
         spoils=False,
     )
 
