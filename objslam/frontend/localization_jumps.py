@@ -163,12 +163,6 @@ def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     return Jumps(stamps, odd[found, 0], odd[found, 1], noise, np.diff(ends) / (ends[-1] - ends[0]))
 
 
-def without_jumps(log: Log, settings: Settings) -> Log:
-    """Return the log without the jumps of `find_jumps`."""
-    jumps = find_jumps(log, settings)
-    return log if jumps is None or log.localization is None else replace(log, localization=jumps.taken_out(log.localization))
-
-
 def _by_neighbours(path: Trajectory) -> tuple[Floats, Floats, Bools]:
     """Judge each step of a path by the steps beside it.
 

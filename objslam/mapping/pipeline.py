@@ -18,13 +18,13 @@ from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_expected, take_out_known
-from objslam.frontend.localization_jumps import find_jumps, without_jumps
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.jumps import taken_out
 from objslam.mapping.checks.residuals import check_pose_noise, check_residuals
 from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.upright import lies_on_its_side
@@ -57,8 +57,6 @@ def run(
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
-    jumps = find_jumps(log, settings)
-    log = without_jumps(log, settings)
     seconds: dict[str, float] = {}
     with _stage("load", seconds, progress):
         load_libraries()  # Loading is a stage of its own, because it takes longer than a small solve.
@@ -72,6 +70,7 @@ def run(
             ledger.warn("the poses stay as they are, because no solve corrects wrong input")
             diagnosis = diagnosis.proven()  # No joint solve will test the other findings.
             settings = settings.model_copy(update={"mode": "fixed"})
+        log = taken_out(diagnosis.jumps, log)
         frames = build_keyframes(log, settings, ledger)
         if settings.mode == "fixed" and not frames.localized_every and not diagnosis.certain:
             cause = " and allow no calibration" if settings.calibration.use is True else ""
@@ -104,8 +103,8 @@ def run(
             say(diagnosis, ledger)
     if settings.mode == "fixed":
         solution = with_lasting_errors(solution, settings)
-    if jumps is not None:
-        solution = with_jumps(solution, jumps)
+    if diagnosis.jumps is not None:
+        solution = with_jumps(solution, diagnosis.jumps)
     solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate

@@ -11,7 +11,7 @@ from objslam.config import load_settings
 from objslam.core.geometry import lift_se2
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log, Trajectory
-from objslam.frontend.localization_jumps import Jumps, find_jumps, without_jumps
+from objslam.frontend.localization_jumps import Jumps, find_jumps
 
 SETTINGS = load_settings(None, ())
 
@@ -65,8 +65,7 @@ def test_a_jump_there_and_back_is_measured_and_taken_out(wheels: bool) -> None:
     np.testing.assert_allclose(jumps.moves, [[0.25, -0.1, 0], [-0.25, 0.1, 0]], atol=0.06)
     np.testing.assert_allclose(jumps.turns[:, 2], [0.06, -0.06], atol=0.012)
     np.testing.assert_allclose(jumps.shares, [25 / 60, 20 / 60, 15 / 60], atol=0.01)
-    after = without_jumps(log, SETTINGS).localization
-    assert after is not None
+    after = jumps.taken_out(path)
     off = after.poses[:, :3, 3] - right.poses[:, :3, 3]
     assert np.ptp(off, axis=0).max() < 0.1  # Before, 0.25 m.
     np.testing.assert_allclose(after.poses[:, :3, 3].mean(axis=0), path.poses[:, :3, 3].mean(axis=0), atol=1e-3)
@@ -89,7 +88,6 @@ def test_a_long_jump_and_the_will_of_the_user_stay() -> None:
     log = Log("log", (), localization=jumped(drive(0.1, 0.01), 30.0, (0.5, 0.0)))
     keep = load_settings(None, ("poses.jumps=keep",))
     assert find_jumps(log, keep) is None
-    assert without_jumps(log, keep) is log
 
 
 def test_the_error_of_a_map_is_that_of_the_draws() -> None:

@@ -10,7 +10,6 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.rotation import rotation_vector
 from objslam.core.types import Log, Trajectory
-from objslam.frontend.localization_jumps import Jumps, find_jumps, without_jumps
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
 
@@ -73,10 +72,6 @@ def check_path(log: Log, settings: Settings) -> list[Finding]:
     """
     max_gap, joint = settings.poses.max_gap, settings.mode == "joint"
     found: list[Finding] = []
-    jumps = find_jumps(log, settings)
-    if jumps is not None:
-        found.append(_corrected(jumps))
-        log = without_jumps(log, settings)
     for name, path in (("localisation", log.localization), ("odometry", log.odometry)):
         if path is not None and len(path) > _FEWEST_STEPS:
             used = joint or path is log.robot_path
@@ -89,18 +84,6 @@ def check_path(log: Log, settings: Settings) -> list[Finding]:
         if not any(one.name.endswith("jumps") for one in found):
             found += _compare_steps(log.localization, log.odometry, max_gap)
     return found
-
-
-def _corrected(jumps: Jumps) -> Finding:
-    """Return the finding about jumps that a run takes out."""
-    way, angle = np.linalg.norm(jumps.moves[0]), np.degrees(np.linalg.norm(jumps.turns[0]))
-    return Finding(
-        "localisation jumps",
-        f"the localisation jumps {len(jumps)} time{'' if len(jumps) == 1 else 's'} (first by {way:.2f} m and "
-        f"{angle:.0f} deg at stamp {jumps.stamps[0]:.3f}): the run moves the poses on both sides together. It does not know "
-        f"which side was right, so the whole map may be off by {jumps.sigma:.2f} m, and its sigmas contain this",
-        spoils=False,
-    )
 
 
 def _find_restarts(odometry: Trajectory, max_gap: float) -> Iterator[Finding]:
