@@ -151,9 +151,9 @@ def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     drift = 0.0 if log.odometry is None else _drift(_lengths(_steps(path.poses)), settings)
     poses = 2 * np.array([settings.localization.xy, settings.localization.yaw]) ** 2
     least = np.maximum(_TIMES_ODD * np.quantile(off[judged], 0.9, axis=0), _CERTAIN * np.sqrt(poses + drift))
-    # A hand turns a camera as fast as a jump. So turns are jumps only if the odometry does not show them.
-    possible = _ACCELERATION * np.diff(path.stamps) ** 2
-    jumps = (off > least).any(axis=1) if log.odometry is not None else off[:, 0] > np.maximum(least[..., 0], possible)
+    # A turn alone is no jump: a hand turns a camera as fast, and wheels that slip do not show a turn.
+    possible = 0.0 if log.odometry is not None else _ACCELERATION * np.diff(path.stamps) ** 2
+    jumps = off[:, 0] > np.maximum(least[..., 0], possible)
     found = np.flatnonzero(jumps & judged)
     noise = np.median(np.abs(odd[judged]), axis=0) / NORMAL_MEDIAN
     if not len(found) or len(found) > _MOST_JUMPS or _lengths(odd[found])[:, 0].max() > ANOTHER_MAP:
