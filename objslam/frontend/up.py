@@ -59,3 +59,9 @@ def from_above(up: Up) -> list[int]:
 def up_vector(up: Up) -> Floats:
     """Return the unit vector (3,) of an axis."""
     return np.eye(3)["xyz".index(up[-1])] * (-1.0 if up.startswith("-") else 1.0)
+
+
+def upright(keyframes: Keyframes) -> Floats:
+    """Return the rotation (3, 3) from the map to axes of which the first two are level, and the third one points up."""
+    up = up_axis(keyframes)
+    return np.stack([*np.eye(3)[from_above(up)], up_vector(up)])

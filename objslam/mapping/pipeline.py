@@ -24,6 +24,7 @@ from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.jumps import taken_out
 from objslam.mapping.checks.residuals import check_pose_noise, check_residuals
 from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.upright import lies_on_its_side
@@ -34,7 +35,7 @@ from objslam.mapping.fixed.lasting_errors import with_lasting_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
 from objslam.mapping.refuted import without_refuted
-from objslam.mapping.solution import seen_something
+from objslam.mapping.solution import seen_something, with_jumps
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
 
@@ -70,6 +71,7 @@ def run(
             ledger.warn("the poses stay as they are, because no solve corrects wrong input")
             diagnosis = diagnosis.proven()  # No joint solve will test the other findings.
             settings = settings.model_copy(update={"mode": "fixed"})
+        log = taken_out(diagnosis.jumps, log)
         frames = build_keyframes(log, settings, ledger)
         if settings.mode == "fixed" and not frames.localized_every and not diagnosis.certain:
             cause = " and allow no calibration" if settings.calibration.use is True else ""
@@ -102,6 +104,8 @@ def run(
             say(diagnosis, ledger)
     if settings.mode == "fixed":
         solution = with_lasting_errors(solution, settings)
+    if diagnosis.jumps is not None:
+        solution = with_jumps(solution, diagnosis.jumps)
     solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate

@@ -11,6 +11,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.bodies.body import PlacedBody
 from objslam.core.trace import Round
 from objslam.core.types import Association, Keyframes, Rays
+from objslam.frontend.localization_jumps import Jumps
 from objslam.frontend.shared_errors import SharedErrors
 
 if TYPE_CHECKING:
@@ -55,6 +56,20 @@ def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
     """
     noise = errors.noise if estimate.noise is None else estimate.noise
     return errors.with_noise(replace(noise, shrinkage=0.0))
+
+
+def with_jumps(solution: Solution, jumps: Jumps) -> Solution:
+    """Return the solution with the error of a map at poses of which `jumps` were taken out. All objects share it."""
+    estimate, association, rays = solution.estimate, solution.association, solution.rays
+    used = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
+    keyframe = rays.keyframe[used]
+    origins = solution.keyframes.map_T_camera[keyframe, :3, 3]
+    stamps = solution.keyframes.stamps[keyframe]
+    factor = jumps.spread(stamps, origins, association.object[used], estimate.positions)
+    covariance = estimate.covariance + factor @ np.swapaxes(factor, 1, 2)
+    factor = np.nan_to_num(factor)
+    correlated = factor if estimate.correlated is None else np.concatenate([estimate.correlated, factor], axis=2)
+    return replace(solution, estimate=replace(estimate, covariance=covariance, correlated=correlated))
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:

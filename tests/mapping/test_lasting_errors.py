@@ -10,7 +10,8 @@ from quick import HELD
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import lift_se2
+from objslam.core.geometry import lift_se2, make_pose
+from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log
 from objslam.mapping import pipeline
 from objslam.mapping.fixed.lasting_errors import Cells, lasting_variances
@@ -82,3 +83,27 @@ def test_the_size_of_lasting_errors_is_found(factor, time):
         seen.append(replace(cells, mean=mean))
     found = lasting_variances(seen)
     assert np.sqrt(found.sum()) == pytest.approx(factor, rel=0.25, abs=0.1)
+
+
+def test_lasting_errors_are_the_same_with_any_axis_up_and_reach_heights_in_3d(monkeypatch):
+    """A map on its side is the same map. Poses in a plane do not err in height, and other poses do."""
+    made, wider = [], pipeline.with_lasting_errors
+    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda *given: made.append(given) or wider(*given))
+    log = simulate(preset("demo", odometry=None, objects=6, classes=6, frames=150, false=0.0, pixel_sigma=1.0), 0)
+    log = with_lasting(log, 2.5, 16.0, 0)
+    squares(log)
+    pitch = 0.005 * np.sin(log.localization.stamps / 3)[:, None] * [0.0, 1.0, 0.0]
+    tilted = log.localization.poses @ make_pose(rotation_from_vector(pitch), np.zeros(3))
+    squares(replace(log, localization=replace(log.localization, poses=tilted)))
+    (flat, settings), (solid, _) = made
+
+    def added(solution):
+        return wider(solution, settings).estimate.covariance - solution.estimate.covariance
+
+    assert np.median(added(solid)[:, 2, 2]) > 5 * np.median(added(flat)[:, 2, 2])
+    turn = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # y points down.
+    poses, estimate = make_pose(turn, np.zeros(3)) @ solid.keyframes.map_T_base, solid.estimate
+    covariance = turn @ estimate.covariance @ turn.T
+    estimate = replace(estimate, positions=estimate.positions @ turn.T, covariance=covariance)
+    turned = replace(solid, keyframes=replace(solid.keyframes, map_T_base=poses), estimate=estimate)
+    np.testing.assert_allclose(added(turned), turn @ added(solid) @ turn.T, atol=1e-9)

@@ -11,12 +11,14 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
+from objslam.frontend.localization_jumps import Jumps
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes, refuse_shares
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.disagreement import disagree
 from objslam.mapping.checks.hypotheses.every import later
 from objslam.mapping.checks.hypotheses.trials import Trial, crooked, try_hypotheses, verdict
+from objslam.mapping.checks.jumps import corrected_jumps, taken_out, wrong_jumps
 from objslam.mapping.checks.parts.halves import check_halves
 from objslam.mapping.checks.parts.mixture import check_mixture
 from objslam.mapping.checks.parts.moved_camera import check_moved_camera
@@ -54,12 +56,14 @@ the run does not estimate. A larger value reports fewer errors."""
 class Diagnosis:
     """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
 
-    errors: small errors of the calibration that a run does not correct, None if there are none.
+    errors: small errors of the calibration that a run does not correct, None if there are none. jumps: those of the
+    localisation, which a run takes out, None if there are none.
     """
 
     findings: tuple[Finding, ...] = ()
     trials: tuple[Trial, ...] = ()
     errors: SmallErrors | None = None
+    jumps: Jumps | None = None
 
     @property
     def spoilt(self) -> bool:
@@ -97,6 +101,13 @@ def diagnose(
 
     ledger: from the reading of the log. LogError if stamps are not in s, or boxes not in px.
     """
+    jumps = wrong_jumps(log, settings)
+    found = _diagnosed(taken_out(jumps, log), settings, ledger, progress, thorough=thorough)
+    return found if jumps is None else replace(found, findings=(corrected_jumps(jumps), *found.findings), jumps=jumps)
+
+
+def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress, *, thorough: bool) -> Diagnosis:
+    """Return the diagnosis of a log without jumps. The rest is as in `diagnose`."""
     if log.localization is None and log.odometry is None:
         return Diagnosis()
     refuse_shares(log)

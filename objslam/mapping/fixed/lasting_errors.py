@@ -1,6 +1,7 @@
 """Errors of given poses that last for some seconds. All rays of this time miss their objects on the same side.
 
-Many rays from one visit do not average such an error out, so they count as few. The rays of several visits show its size.
+Poses in a plane turn and shift rays to the left or to the right. Poses in 3D turn and shift them up or down as well. Many
+rays from one visit do not average such an error out, so they count as few. The rays of several visits show its size.
 """
 
 from dataclasses import dataclass, replace
@@ -10,6 +11,9 @@ import numpy as np
 from objslam.association.observations import MIN_DEPTH
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import is_planar
+from objslam.core.rotation import cross
+from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import noise_of_poses
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
@@ -35,12 +39,12 @@ settings more."""
 
 @dataclass(frozen=True)
 class Cells:
-    """The rays of one object by time, in C cells.
+    """The misses of the rays of one object along one axis, by time, in C cells.
 
-    times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left. white: (C,) rad, the
-    standard deviation of the mean from noise that does not last. shift: (C, 2) rad per m, the derivative of the mean by the
-    object's x and y. size: (C,) rad, the error of the mean by one standard deviation of the poses. pull: (C, 3) m, the shift
-    of the object by such an error in the cell.
+    times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left, or above it. white: (C,)
+    rad, the standard deviation of the mean from noise that does not last. shift: (C, n) rad per m, the derivative of the
+    mean by n coordinates of the object. size: (C,) rad, the error of the mean by one standard deviation of the poses. pull:
+    (C, 3) m, the shift of the object by such an error in the cell.
     """
 
     times: Floats
@@ -58,10 +62,11 @@ class Cells:
 def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
     """Return the solution of a run at given poses with their lasting errors added to its covariances.
 
-    A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. The
-    size of the errors is `localization` times a factor with a half-normal prior of 1. Their correlation falls exponentially
-    over time. The factor and the correlation time are estimated by restricted maximum likelihood (Patterson and Thompson
-    1971), and averaged over their posterior.
+    A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
+    poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. The size of the errors
+    is `localization` times a factor with a half-normal prior of 1. Their correlation falls exponentially over time. The
+    factor and the correlation time are estimated by restricted maximum likelihood (Patterson and Thompson 1971), and
+    averaged over their posterior.
     """
     if not solution.keyframes.localized_every:
         return solution
@@ -70,9 +75,9 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
         return solution
     from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
 
-    variance = lasting_variances(list(seen.values()))
+    variance = lasting_variances([cells for _, cells in seen])
     covariance = solution.estimate.covariance.copy()
-    for j, cells in seen.items():
+    for j, cells in seen:
         kernel = sum(v * cells.alike(time) for v, time in zip(variance.tolist(), _TIMES, strict=True))
         covariance[j] += cells.pull.T @ kernel @ cells.pull
     wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
@@ -83,7 +88,7 @@ def lasting_variances(seen: list[Cells]) -> Floats:
     """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum over these times is the
     squared factor of all errors.
 
-    seen: the cells of each object.
+    seen: the cells of each object along each axis.
     """
     likelihood = np.tile(-0.5 * _FACTORS**2, (len(_TIMES), 1))
     for cells in seen:
@@ -93,7 +98,7 @@ def lasting_variances(seen: list[Cells]) -> Floats:
             size, vectors = np.linalg.eigh(own * cells.alike(time))
             y, x = vectors.T @ mean, vectors.T @ shift
             variance = 1 + _FACTORS[:, None] ** 2 * np.maximum(size, 0.0)
-            matrix = np.einsum("ki,kj,sk->sij", x, x, 1 / variance) + np.eye(2) / _LOOSE**2
+            matrix = np.einsum("ki,kj,sk->sij", x, x, 1 / variance) + np.eye(x.shape[1]) / _LOOSE**2
             vector = np.einsum("ki,k,sk->si", x, y, 1 / variance)
             explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
             row -= 0.5 * ((y**2 / variance + np.log(variance)).sum(axis=1) + np.linalg.slogdet(matrix)[1] - explained)
@@ -101,24 +106,23 @@ def lasting_variances(seen: list[Cells]) -> Floats:
     return np.asarray((weight * _FACTORS**2).sum(axis=1) / weight.sum())
 
 
-def _cells_of(solution: Solution, settings: Settings) -> dict[int, Cells]:
-    """Return the cells of each object with a covariance, by its index. Rejected rays, and ranges, do not count."""
+def _cells_of(solution: Solution, settings: Settings) -> list[tuple[int, Cells]]:
+    """Return the index of an object and its cells along one axis, for each object with a covariance and each axis. Rejected
+    rays, and ranges, do not count."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     which = which[placed[association.object[which]]]
     if not len(which):
-        return {}
+        return []
     rays, owner, count = solution.rays.take(which), association.object[which], len(placed)
-    times = keyframes.stamps[rays.keyframe]
-    origin, direction = rays.in_map(keyframes.map_T_camera)
-    to = estimate.positions[owner] - origin
+    up = upright(keyframes)
+    origin, direction = (values @ up.T for values in rays.in_map(keyframes.map_T_camera))
+    to = estimate.positions[owner] @ up.T - origin
     level = np.maximum(np.hypot(to[:, 0], to[:, 1]), MIN_DEPTH)
     distance = np.maximum(np.linalg.norm(to, axis=1), MIN_DEPTH)
-    left = np.column_stack([-to[:, 1], to[:, 0]]) / level[:, None]
-    miss = (direction[:, :2] * left).sum(axis=1) / np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
+    left = np.column_stack([-to[:, 1], to[:, 0], np.zeros(len(to))]) / level[:, None]
     yaw, place = noise_of_poses(keyframes, settings)
-    white, size = rays.sigma * distance / level, np.hypot(yaw, place / level)
 
     across = np.hypot(np.hypot(rays.sigma, yaw) * distance, place)
     strength = 1 / across if settings.fixed.loss == "l1" else across**-2
@@ -128,7 +132,36 @@ def _cells_of(solution: Solution, settings: Settings) -> dict[int, Cells]:
     inverse = np.zeros_like(information)
     inverse[held] = np.linalg.inv(information[held])
 
-    first, cell = _cells(times, owner, count)
+    times = keyframes.stamps[rays.keyframe]
+    turned = np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
+    miss = (direction * left).sum(axis=1) / turned
+    found = _by_cell(times, owner, miss, rays.sigma * distance / level, left, level, (yaw, place), strength, inverse)
+    if not is_planar(keyframes.map_T_base):
+        above = cross(to / distance[:, None], left)
+        miss = (direction * above).sum(axis=1)
+        found += _by_cell(times, owner, miss, rays.sigma, above, distance, (yaw, place), strength, inverse)
+    return [(number, replace(cells, pull=cells.pull @ up)) for number, cells in found]
+
+
+def _by_cell(
+    times: Floats,
+    owner: Ints,
+    miss: Floats,
+    white: Floats,
+    axis: Floats,
+    lever: Floats,
+    noise: tuple[float, float],
+    strength: Floats,
+    inverse: Floats,
+) -> list[tuple[int, Cells]]:
+    """Return the index and the cells of each object, from misses along one axis.
+
+    times: (R,) s. owner: (R,) objects. miss: (R,) rad, and white: (R,) rad, its noise. axis: (R, 3) the unit vector, and
+    lever: (R,) m, the distance, at which the miss moves an object. noise: of headings, rad, and of places, m. strength: (R,)
+    the weight of each ray in the solve. inverse: (N, 3, 3) of the information about each object.
+    """
+    size = np.hypot(noise[0], noise[1] / lever)
+    first, cell = _cells(times, owner, len(inverse))
     weight = white**-2
     total = np.bincount(cell, weight)
 
@@ -140,16 +173,15 @@ def _cells_of(solution: Solution, settings: Settings) -> dict[int, Cells]:
     scatter = ((within / white) ** 2).sum()
     factor = np.sqrt((scatter + _POOLED) / (free + _POOLED))
     pull = np.zeros((len(total), 3))
-    np.add.at(pull[:, :2], cell, (strength * size * level)[:, None] * left)
+    np.add.at(pull, cell, (strength * size * lever)[:, None] * axis)
     columns = mean(times), mean(miss), factor / np.sqrt(total), mean(size)
-    shift = np.column_stack([mean(left[:, 0] / level), mean(left[:, 1] / level)])
+    shift = np.column_stack([mean(axis[:, k] / lever) for k in range(3)])
     pull = np.einsum("cij,cj->ci", inverse[first], pull)
-    ends = np.flatnonzero(np.diff(first, append=count))
-    seen, begin = {}, 0
-    for end in (ends + 1).tolist():
+    seen, begin = [], 0
+    for end in (np.flatnonzero(np.diff(first, append=len(inverse))) + 1).tolist():
         mine = slice(begin, end)
-        when, missed, noise, sized = (column[mine] for column in columns)
-        seen[int(first[begin])] = Cells(when, missed, noise, shift[mine], sized, pull[mine])
+        when, missed, noisy, sized = (column[mine] for column in columns)
+        seen.append((int(first[begin]), Cells(when, missed, noisy, shift[mine], sized, pull[mine])))
         begin = end
     return seen
 

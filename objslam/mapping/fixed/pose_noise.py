@@ -14,6 +14,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.noise import MOST_NOISE
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.core.types import Association, Keyframes, Rays
+from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import noise_of_poses
 
 _FEWEST = 4
@@ -91,8 +92,9 @@ def noise_in_frames(
     if not len(held) or not keyframes.localized_every:
         return 1.0, 1.0
     owner = association.object[held]
-    origin, direction = (values[held] for values in rays.in_map(keyframes.map_T_camera))
-    to = positions[owner] - origin
+    up = upright(keyframes)
+    origin, direction = (values[held] @ up.T for values in rays.in_map(keyframes.map_T_camera))
+    to = positions[owner] @ up.T - origin
     level = np.maximum(np.hypot(to[:, 0], to[:, 1]), MIN_DEPTH)
     left = np.column_stack([-to[:, 1], to[:, 0]]) / level[:, None]
     miss = (direction[:, :2] * left).sum(axis=1) / np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)

@@ -1,0 +1,93 @@
+"""Maps at poses of a localisation that jumps once: errors, sigmas, the camera's mount and what is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_lasting_errors import with_lasting
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.maps.shared_covariance import jacobian
+from objslam.core.types import Log
+from objslam.frontend.localization_jumps import find_jumps
+from objslam.mapping import pipeline
+from objslam.mapping.checks.jumps import wrong_jumps
+from objslam.simulation import PoseNoise, preset, simulate
+
+
+def jumping(seed: int, early: bool) -> Log:
+    """A drive whose localisation is 0.25 m off before, or after, the middle. Beside this it errs as the settings say."""
+    noise = {"localization": PoseNoise(xy=0.008, yaw=0.0016), "pixel_sigma": 2.0}
+    log = simulate(preset("demo", odometry=None, objects=12, classes=12, frames=300, false=0.0, **noise), seed)
+    log = with_lasting(log, 1.0, 3.0, seed)
+    path = log.localization
+    assert path is not None
+    poses = path.poses.copy()
+    poses[(path.stamps < np.median(path.stamps)) == early, :2, 3] += [0.15, 0.2]
+    return replace(log, localization=replace(path, poses=poses))
+
+
+def mapped(log: Log, jumps: str) -> pipeline.RunResult:
+    settings = load_settings(None, ("mode=fixed", "output.recording=false", f"poses.jumps={jumps}"))
+    return pipeline.run(log, settings, Ledger())
+
+
+def misses(result: pipeline.RunResult, log: Log) -> tuple[list[np.ndarray], list[float]]:
+    """Return the errors, m, and the squared Mahalanobis distances of the objects."""
+    assert log.truth is not None
+    place = {item.label: item.position for item in log.truth.objects}
+    off = [(item.position - place[item.label], item.covariance) for item in result.map.resolved()]
+    return [miss for miss, _ in off], [float(miss @ np.linalg.solve(covariance, miss)) for miss, covariance in off]
+
+
+def test_the_sigmas_contain_a_jump_and_the_map_is_not_bent() -> None:
+    before, after = [], []
+    for seed, early in ((0, False), (1, True)):
+        log = jumping(seed, early)
+        before += misses(mapped(log, "keep"), log)[1]
+        result = mapped(log, "correct")
+        errors, squares = misses(result, log)
+        after += squares
+        # All objects are off together, by half of the jump.
+        assert np.std(errors, axis=0)[:2].max() < 0.06
+        np.testing.assert_allclose(np.abs(np.mean(errors, axis=0))[:2], [0.075, 0.1], atol=0.05)
+        assert [one["name"] for one in result.summary["wrong_input"]] == ["localisation jumps"]
+    # The 95 % quantile of chi-squared is 7.81.
+    assert np.mean(np.array(before) < 7.81) < 0.7
+    assert np.mean(np.array(after) < 7.81) > 0.85
+
+
+def test_the_whole_map_shares_the_error() -> None:
+    """Distances inside the map are surer than places."""
+    log = jumping(2, True)
+    result = mapped(log, "correct")
+    shared = result.map.shared_covariance
+    assert shared is not None
+    centre = np.mean([item.position for item in result.map.resolved()], axis=0)
+    lever = jacobian(centre)
+    sigma = np.sqrt(np.linalg.eigvalsh(lever @ shared @ lever.T)[-1])
+    assert sigma == pytest.approx(0.125, abs=0.03)
+
+
+def drifting(seed: int) -> Log:
+    """A drive whose localisation drifts by 0.4 m in the 15 s before it corrects itself by a jump, in the middle."""
+    noise = {"localization": PoseNoise(xy=0.008, yaw=0.0016), "pixel_sigma": 2.0}
+    log = simulate(preset("demo", odometry=None, objects=12, classes=12, frames=300, false=0.0, **noise), seed)
+    path = log.localization
+    assert path is not None
+    middle, poses = np.median(path.stamps), path.poses.copy()
+    drift = np.clip((path.stamps - middle + 15) / 15, 0, None) * (path.stamps < middle)
+    poses[:, :2, 3] += 0.4 * drift[:, None] * [0.6, 0.8]
+    return replace(log, localization=replace(path, poses=poses))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_boxes_tell_a_correction_from_a_mistake(seed: int) -> None:
+    settings = load_settings(None, ("mode=fixed",))
+    right, wrong = drifting(seed), jumping(seed, True)
+    assert find_jumps(right, settings) is not None
+    assert wrong_jumps(right, settings) is None
+    assert wrong_jumps(wrong, settings) is not None
