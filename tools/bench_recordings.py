@@ -111,8 +111,8 @@ def short(data: Path, only: str, overrides: list[str]) -> None:
         inside, squared, errors, times = 0, [], [], []
         for name, whole in drives(data, only, with_range):
             for begin, end in PARTS if name != "woods" else ():
-                log = part(whole, begin, end)
                 try:
+                    log = part(whole, begin, end)
                     result, seconds = solve(log, overrides)
                 except ObjslamError as error:  # One robot saw no landmark in one part.
                     print(f"{name}, {begin} to {end} s: {error}", file=sys.stderr)
