@@ -298,10 +298,9 @@ def _without_crossings(task: _Task, state: State, likely: Floats, sized: Bools) 
     while (key := state.matched.tobytes()) not in earlier:  # Rays may return to the landmark that they left.
         earlier.add(key)
         found = find_crossings(state, sized, task.settings.min_rays)
-        two = found.odds < 0
-        if len(earlier) > _TURNS or not two.any():
+        if len(earlier) > _TURNS or not found.two.any():
             break
-        split = _alternate(task, state.split(found.landmark[two], found.second, found.position[two]))
+        split = _alternate(task, state.split(found.landmark[found.two], found.second, found.position[found.two]))
         searched, dropped, _ = _search(task, split, split.landmarks.take(np.zeros(0, dtype=np.int64)))
         refuted |= dropped
         state, likely, dropped = _merged_and_dropped(task, searched)

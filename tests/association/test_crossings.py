@@ -70,7 +70,7 @@ def test_odds_tell_one_thing_from_two(seed: int) -> None:
     """Of the landmarks whose rays come in two bundles, only the first has the rays of two things."""
     scene = hall(seed, np.array([AHEAD, BEYOND, *BESIDE]), step=0.04)
     found = find_crossings(true_state(scene, {1: 0}), np.ones(len(scene.rays), dtype=bool), 3)
-    assert found.landmark[found.odds < 0].tolist() == [0]
+    assert found.landmark[found.two].tolist() == [0]
     assert len(found.landmark) >= 2
     assert all(np.linalg.norm(found.position[0] - thing, axis=1).min() < 2.5 for thing in (AHEAD, BEYOND))
 

@@ -27,6 +27,9 @@ more landmarks."""
 _HIDDEN, _HIDDEN_WIDTH = 0.1, 4.6
 """The assumed share of views that show only a part of a thing, and the width of the uniform distribution of their ln size: a
 factor of 100. With a larger share, different sizes tell less."""
+_CLEAR = 3.0
+"""A landmark is two things only if two are more likely by this, in ln, which is a factor of 20. A larger value splits fewer
+landmarks. To split one thing may lose it."""
 _ASSUMED = 3
 """The number of landmarks that are assumed to have the usual gain, beside those of the log. With a larger number, errors
 that rays share make more landmarks two."""
@@ -49,6 +52,11 @@ class Crossings:
     second: Bools
     odds: Floats
     position: Floats
+
+    @property
+    def two(self) -> Bools:
+        """Whether each landmark (S,) is clearly two things."""
+        return self.odds < -_CLEAR
 
 
 def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
@@ -120,7 +128,7 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
     """Return the state without the rays of the smaller bundle of each landmark that is two things. A single ray of another
     thing can give a landmark all its parallax. sized: as in `find_crossings`."""
     found = find_crossings(state, sized, fewest=1)
-    mine = np.flatnonzero(np.isin(state.matched, found.landmark[found.odds < 0]))
+    mine = np.flatnonzero(np.isin(state.matched, found.landmark[found.two]))
     second = np.bincount(state.owner, found.second[state.assigned], state.count)
     smaller = found.second[mine] == (2 * second <= state.ray_count)[state.matched[mine]]
     matched = state.matched.copy()
