@@ -11,7 +11,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.geometry import interpolate
+from objslam.core.geometry import interpolate, is_planar
 from objslam.core.rotation import cross, rotation_from_vector, rotation_vector
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.core.types import Log, Trajectory
@@ -22,6 +22,8 @@ may have carried the robot. A larger value corrects longer jumps."""
 _ACCELERATION = 5.0
 """The acceleration (m/s^2) that a robot does not exceed from one step to the next and back. Wheels on a floor slip at 4 to
 8. A larger value finds fewer jumps."""
+_FREE_ACCELERATION = 20.0
+"""The same for poses that are not in a plane: a hand swings a camera, and a drone flies, with up to 2 g."""
 _TIMES_ODD = 3.5
 """The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
@@ -152,7 +154,8 @@ def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     poses = 2 * np.array([settings.localization.xy, settings.localization.yaw]) ** 2
     least = np.maximum(_TIMES_ODD * np.quantile(off[judged], 0.9, axis=0), _CERTAIN * np.sqrt(poses + drift))
     # A turn alone is no jump: a hand turns a camera as fast, and wheels that slip do not show a turn.
-    possible = 0.0 if log.odometry is not None else _ACCELERATION * np.diff(path.stamps) ** 2
+    most = _ACCELERATION if is_planar(path.poses) else _FREE_ACCELERATION
+    possible = 0.0 if log.odometry is not None else most * np.diff(path.stamps) ** 2
     jumps = off[:, 0] > np.maximum(least[..., 0], possible)
     found = np.flatnonzero(jumps & judged)
     noise = np.median(np.abs(odd[judged]), axis=0) / NORMAL_MEDIAN

@@ -48,6 +48,19 @@ def test_a_drive_with_stops_has_no_jumps(every: float, noise: float, speed: floa
         assert found(path, drive(0.05, 0.0, 0, speed)) is None
 
 
+def test_a_camera_that_a_hand_swings_has_no_jump() -> None:
+    """At 10 Hz, 5 cm a step, 23 cm in one, and 3 cm in the next: a hand does this, and a robot on a floor does not."""
+    path = drive(0.1)
+    way = np.full(len(path), 0.05)
+    way[300:302] = 0.23, 0.03
+    poses = np.tile(np.eye(4), (len(path), 1, 1))
+    poses[:, 0, 3] = np.cumsum(way)
+    floor = replace(path, poses=poses.copy())
+    poses[:, 2, 3] = 0.1 * np.sin(path.stamps)
+    assert found(replace(path, poses=poses)) is None
+    assert found(floor) is not None
+
+
 def test_a_localisation_that_repeats_each_pose_has_no_jumps() -> None:
     path, slow = drive(0.1), np.repeat(np.arange(0, 600, 10), 10)
     assert found(replace(path, poses=path.poses[slow])) is None
