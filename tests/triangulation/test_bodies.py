@@ -130,6 +130,26 @@ def test_the_error_that_boxes_of_one_side_share_is_found():
     assert found.share[1] < 0.3 * share
 
 
+def test_boxes_that_grow_do_not_tell_the_distance_better_than_outlines_allow():
+    """On a straight way to a thing, sizes err by 5 %, and by 5 % more or less at a distance larger by the factor e."""
+    rng, camera, many, each, share = np.random.default_rng(3), CAMERAS["pinhole"], 400, 20, 0.05
+    true = from_axes(np.zeros((1, 3)), np.array([[0.2, 0.2, 0.4]]), np.zeros(1))
+    away = np.linspace(6.0, 2.0, each)
+    poses = np.array([looking_at(np.array([-x, 0.4, 0.3]), true[0, :3]) for x in away])
+    boxes = np.array([outline_box(camera, true[0], pose) for pose in poses])
+    distance = np.log(np.linalg.norm(poses[:, :3, 3], axis=1))
+    half = np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1)) / 2
+    error = rng.normal(size=(many, 1, 2)) + rng.normal(size=(many, 1, 2)) * (distance - distance.mean())[:, None]
+    error = (share * half[:, None] * error).reshape(-1, 2)
+    noisy = np.tile(boxes, (many, 1)) + np.concatenate([-error, error], axis=1) + rng.normal(0, 0.5, (each * many, 4))
+    edges = edges_of(camera, noisy, np.tile(poses, (many, 1, 1)), np.repeat(np.arange(many), each), sigma=0.5)
+    prior = weak_prior(np.zeros((many, 3)), np.tile([[0.2, 0.4]], (many, 1)))
+    sigma = nominal_noise(edges)
+    found = fit(edges, prior.mean, prior, Weights(sigma**2, sigma, robust=False), ELLIPSOID)
+    told = covariance_of(edges, found, sides_of(edges, prior.mean[:, :3]), np.ones(2), np.array([0.0, share]))
+    assert np.sqrt(told[:, 0, 0].mean()) == pytest.approx(found.values[:, 0].std(), rel=0.3)
+
+
 def test_the_shape_is_chosen_by_what_the_boxes_show():
     rng, camera = np.random.default_rng(5), CAMERAS["pinhole"]
     ball = from_axes(np.zeros((1, 3)), np.full((1, 3), 0.3), np.zeros(1))[0]

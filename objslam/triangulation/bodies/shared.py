@@ -26,6 +26,9 @@ angle, views must differ more to average the errors out. A detector had 5 to 20 
 WITHIN = 0.7
 """The correlation between the errors of two boxes from one side, whose directions differ by 10 degrees on average. So the
 mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
+_ALONG = 1.0
+"""The change of the error of a side over a distance that is larger by the factor e, in standard deviations of this error.
+With a larger change, the growth of boxes tells less about the distance."""
 _SHARES = 41
 """The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
@@ -184,6 +187,9 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
 
     An estimate that weighs residuals with W has the covariance A^-1 (J^T W V W J + P) A^-1, where A = J^T W J + P. V is the
     true covariance of the residuals, and P is the information of the prior.
+
+    The error of a side also changes with the distance. If it did not, the growth of boxes on the way to a thing would tell
+    its distance exactly, however wrong its outline is.
     """
     count = len(fit.values)
     pulled = on_shift_and_size(edges, fit.found.by * fit.weight[..., None])
@@ -197,6 +203,17 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
         for row in range(ROWS - 1):
             middle[body] += mine[:, row].T @ sides.alike[body] @ mine[:, row]
         middle[body] += np.outer(*[mine[:, -1].sum(axis=0)] * 2)
+    away = _ALONG * _ln_distances(edges, fit)
+    change = grouped(edges.body, together[:, : ROWS - 1] * away[:, None, None], count)
+    middle += np.swapaxes(change, 1, 2) @ change
     inverse = np.linalg.inv(fit.information)
     covariance = inverse @ middle @ inverse
     return np.asarray((covariance + np.swapaxes(covariance, 1, 2)) / 2)
+
+
+def _ln_distances(edges: BoxEdges, fit: Fit) -> Floats:
+    """Return ln of the distance (B,) of each box's camera from its body, less the mean over the boxes of the body."""
+    away = np.linalg.norm(fit.values[edges.body, :3] - edges.origin, axis=1)
+    found = np.log(np.maximum(away, 1e-9))
+    number = np.maximum(np.bincount(edges.body, minlength=len(fit.values)), 1)
+    return np.asarray(found - (np.bincount(edges.body, found, len(fit.values)) / number)[edges.body])
