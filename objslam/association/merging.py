@@ -82,8 +82,8 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
 
 
 def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
-    """Return the pairs of landmarks a < b (P,) that may be one object. They are near compared with the noise of their rays
-    or with their sizes, or they lie on one line of sight."""
+    """Return the pairs of landmarks a < b (P,) that may be one object. Two landmarks of a pair lie on one line of sight, or
+    their distance is small beside the noise of their rays or their sizes."""
     count, position = state.count, state.landmarks.position
     b = nearest_points(position, min(_NEIGHBOURS + 1, count)).ravel()
     a = np.repeat(np.arange(count), len(b) // max(count, 1))

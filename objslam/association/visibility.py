@@ -63,9 +63,10 @@ def frames_of(
     *,
     drifts: bool = False,
 ) -> CameraFrames:
-    """Return keyframes in an order (K,) as observed frames.
+    """Convert keyframes to observed frames.
 
-    map_T_camera: (K, 4, 4) of the keyframes. drifts: whether these poses drift as the odometry does.
+    order: (K,) the keyframes, in the order of the frames. map_T_camera: (K, 4, 4) of the keyframes. drifts: whether these
+    poses drift as the odometry does.
     """
     poses, margins = map_T_camera[order], (settings.rays.border, settings.rays.border_share)
     drift = keyframes.drift[order] if drifts and keyframes.drift is not None else None

@@ -200,8 +200,9 @@ class IncrementalGraph(GrowingGraph):
 
         The newest keyframe X(k) and the landmarks that it observes make the root. The landmarks `coming` make the clique
         below the root. GTSAM merges a clique into its parent if the clique involves all variables of the parent. The cliques
-        below these two are dense and would be merged. So each of the two gets a pose that no clique below it involves. The
-        root has X(k), which motions tie to X(k-1) only. The clique of `coming` has X(k-1), which motions tie to X(k-2).
+        below these two are dense and would be merged. So the root and the clique of `coming` each get a pose that no
+        clique below them involves. The root gets X(k): motions tie it only to X(k-1). The clique of `coming` gets X(k-1):
+        motions tie it to X(k-2).
         """
         chain = [self._newest]
         while len(chain) < 3 and (before := self.before(chain[-1])) is not None:

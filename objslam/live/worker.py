@@ -45,7 +45,7 @@ class Worker(Generic[Answer]):
         self._waiting: list[bytes] = []  # The request until it is sent, because it may be large.
 
     def ask(self, request: Request[Answer]) -> None:
-        """Send a request. The process must not have an earlier request whose `result` was not taken."""
+        """Send a request. Take the `result` of the request before first."""
         self._answer, self._asked = None, True
         if self._process is None or self._process.poll() is not None:
             self._process = _start()

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PriorMap:
-    """The map of another day. name: as shown in messages. objects: in the frame of this map. up: its axis that points up."""
+    """The map of another day. name: as shown in messages. objects: in the frame of that map. up: the axis of that frame that
+    points up."""
 
     name: str
     objects: ObjectMap

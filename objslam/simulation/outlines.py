@@ -1,4 +1,4 @@
-"""Exact boxes around the images of ellipsoids, by their outlines, for tests and benchmarks of bodies."""
+"""Compute exact boxes around ellipsoids from the outlines of their images. Tests and benchmarks of bodies use them."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ class JointGraph:
 
     @cached_property
     def _absolute_roots(self) -> Floats:
-        """(a, 6, 6) matrices that whiten the absolute poses: all poses with a localisation, else the anchor."""
+        """(a, 6, 6) matrices that whiten the absolute poses: all poses, or the anchor alone without a localisation."""
         keyframes = self.measured.keyframes
         if not keyframes.localized_every:
             return np.eye(6)[None] / ANCHOR

@@ -51,8 +51,10 @@ class SquareRows:
         return (3 * self.corner[:, :, None] + np.arange(3)).reshape(-1, 12)
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> tuple[Floats, Floats, float]:
-        """Return the whitened residuals (T, 12) at landmarks (m, 3), m, their derivatives (T, 12, 12) by the corners, and
-        the cost. The poses (P, 4, 4) are not used."""
+        """Return the whitened residuals (T, 12), the derivatives (T, 12, 12) of the residuals by the corners, and the cost.
+
+        landmarks: (M, 3) m. map_T_camera: not used.
+        """
         corners = landmarks[self.corner]
         rotation, centre, found = squares_of(corners, self.shape)
         free = np.isnan(self.side)

@@ -30,9 +30,9 @@ _CHI2 = 13.28
 """The largest squared deviation of a box from its predicted box, chi-squared of 4 degrees of freedom at 99 %. A larger value
 accepts boxes of other things."""
 _FEWEST = 2
-"""A box is used if at least this number of its edges are edges of the body, not bounds. With a larger number, fewer boxes
-are used. One edge alone agrees with too many bodies. In simulated drives, boxes with fewer such edges made centres a little
-worse."""
+"""The least number of edges of a used box that are edges of its body. The body only reaches the other edges. With a larger
+number, fewer boxes are used. One edge alone agrees with too many bodies. In simulated drives, boxes with one such edge made
+centres a little worse."""
 _WITHIN = 0.1
 """An edge is a bound if the body touches it outside the image. It is also a bound if the body touches it inside the image,
 but at most this share of the box away from the cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly

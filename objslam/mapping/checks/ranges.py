@@ -20,9 +20,9 @@ points. The ratios of points at wrong positions differ. A larger value also judg
 _SPREAD_OF_UNITS = 0.3
 """`_SPREAD` for a factor that only a wrong unit explains (`_UNIT`). A larger value also judges points at wrong positions."""
 _LEAST = 0.04
-"""The least error of the ranges that is reported, as a share. Smaller errors also come from the depth of things and from
-cameras that are turned a little: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger
-share warns less often."""
+"""Errors of the ranges below this share of the range are not reported. The depth of things and cameras that are turned a
+little also make such errors: up to 0.03 in simulation, and 0.02 on the MRCLAM robots with their true poses. A larger share
+warns less often."""
 _SPOILING = 0.06
 """Positions are unreliable if the scale has a larger error than this share. With a larger share, fewer maps are
 unreliable."""
