@@ -18,6 +18,7 @@ from small_log import THINGS, small_log
 from waiting import LIMIT
 
 import objslam
+from objslam.association.registration import object_maps
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import COLUMNS
@@ -228,6 +229,22 @@ def test_a_saved_result_loads_as_it_was(result: objslam.Result, tmp_path: Any) -
         assert (tmp_path / "copy" / file.name).read_bytes() == file.read_bytes()
     with pytest.raises(OutputError, match="there is no such result folder"):
         objslam.Result.load(tmp_path / "nowhere")
+
+
+def test_maps_are_registered_from_results_maps_and_paths_alike(result: objslam.Result, tmp_path: Any) -> None:
+    result.save(tmp_path / "out")
+    file = tmp_path / "alone.json"
+    result.objects.save(file)
+    expected = object_maps.register(result.objects, result.objects)
+    assert len(expected.matches) == len(THINGS)
+    loaded = objslam.Result.load(tmp_path / "out")
+    for given in (result.objects, result, loaded, tmp_path / "out", str(tmp_path / "out"), file):
+        for pair in ((given, result.objects), (result.objects, given)):
+            found = objslam.register(*pair)
+            np.testing.assert_allclose(found.b_T_a, expected.b_T_a, atol=1e-6)
+            np.testing.assert_array_equal(found.matches, expected.matches)
+    with pytest.raises(OutputError, match="absent"):
+        objslam.register(tmp_path / "absent", result)
 
 
 def test_a_session_maps_what_is_pushed(log: Log) -> None:
