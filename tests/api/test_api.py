@@ -247,6 +247,20 @@ def test_maps_are_registered_from_results_maps_and_paths_alike(result: objslam.R
         objslam.register(tmp_path / "absent", result)
 
 
+def test_pushes_before_the_start_are_counted_in_the_snapshot() -> None:
+    session = objslam.Session()
+    assert not session.push_detections(1.0, "front", [[1, 2, 30, 40]], ["cup"], [0.5])
+    assert not session.push_odometry(1.0, [1, 2])
+    assert sum(session.snapshot().dropped.values()) == 2
+
+
+def test_pushes_after_the_end_are_counted_in_the_snapshot(log: Log) -> None:
+    with objslam.Session() as session:
+        session.push_camera(log.cameras[0].camera)
+    assert not session.push_odometry(1.0, [1, 2])
+    assert sum(session.snapshot().dropped.values()) == 1
+
+
 def test_a_session_maps_what_is_pushed(log: Log) -> None:
     camera, boxes, path = log.cameras[0].camera, log.cameras[0].detections, log.localization
     assert boxes is not None
