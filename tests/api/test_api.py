@@ -150,6 +150,15 @@ def test_a_camera_may_have_lists_in_place_of_arrays(log: Log) -> None:
         objslam.Log.from_arrays(replace(camera, matrix=np.eye(4)), boxes, odometry=log.odometry)
 
 
+def test_a_wrong_number_of_lens_coefficients_is_told(log: Log) -> None:
+    camera = log.cameras[0]
+    told = "whose lens model plumb_bob takes 4 or 5 coefficients, got 3"
+    with pytest.raises(ValueError, match=told):
+        objslam.Log.from_arrays(
+            replace(camera.camera, distortion=[0, 0, 0]), camera.detections, localization=log.localization
+        )
+
+
 def test_rays_print_as_one_line(result: objslam.Result) -> None:
     free = sum(one is None for one in result.rays.to_arrow()["object"].to_pylist())
     assert repr(result.rays) == f"RaysTable of {len(result.rays)} rays, {free} of no object"
