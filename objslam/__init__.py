@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from objslam.api.mapping import read, run
     from objslam.api.result import Result
     from objslam.api.session import Session
-    from objslam.api.sites import diff, merge
-    from objslam.association.registration.object_maps import register
+    from objslam.api.sites import diff, merge, register
     from objslam.config import Settings
     from objslam.core.camera import Camera
     from objslam.core.object_map import MapObject
@@ -43,8 +42,7 @@ __all__ = [
 _HOMES = {
     **dict.fromkeys(("Detections", "Log", "Trajectory"), "objslam.api.inputs"),
     **dict.fromkeys(("read", "run"), "objslam.api.mapping"),
-    **dict.fromkeys(("diff", "merge"), "objslam.api.sites"),
-    **{"register": "objslam.association.registration.object_maps"},
+    **dict.fromkeys(("diff", "merge", "register"), "objslam.api.sites"),
     **{"Result": "objslam.api.result", "Session": "objslam.api.session", "Settings": "objslam.config"},
     **{"Camera": "objslam.core.camera", "MapObject": "objslam.core.object_map"},
     **{"ObjslamError": "objslam.errors", "ObjectMap": "objslam.results.object_map"},

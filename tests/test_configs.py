@@ -87,7 +87,13 @@ def test_each_says_what_it_is_for_and_how_it_is_run(name: str) -> None:
     lines = (CONFIGS / name).read_text(encoding="utf-8").splitlines()
     header = lines[: next(i for i, line in enumerate(lines) if not line.startswith("#"))]
     assert header
-    assert any(re.match(rf"# +objslam run .*--config configs/{re.escape(name)}\b", line) for line in header)
+    word = re.escape(name.removesuffix(".yaml"))
+    assert any(re.match(rf"# +objslam run .*--config {word}(?= |$)", line) for line in header)
+
+
+def test_no_page_takes_ready_settings_by_a_path_that_only_a_checkout_has() -> None:
+    for page in (*CONFIGS.parent.glob("docs/*.md"), CONFIGS.parent / "README.md"):
+        assert "--config configs/" not in page.read_text(encoding="utf-8"), page.name
 
 
 @pytest.fixture(scope="module")

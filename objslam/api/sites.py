@@ -1,4 +1,4 @@
-"""Join and compare the maps of several sessions."""
+"""Register, join and compare the maps of several sessions."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from os import PathLike
 from pathlib import Path
 
 from objslam.api.result import Result
+from objslam.association.registration import object_maps
+from objslam.association.registration.map_registration import Registration
 from objslam.core import object_map
 from objslam.frontend.up import on_its_side
 from objslam.mapping.sites.compare import Comparison, compare
@@ -44,6 +46,16 @@ def diff(a: Given, b: Given) -> Comparison:
     return compare(_session(a, "the first map"), _session(b, "the other map"))
 
 
+def register(a: Given, b: Given) -> Registration:
+    """Find the transform b_T_a from the frame of map a to the frame of map b, from the relative positions of their objects.
+
+    Both frames have z up. The transform turns about z and shifts along x, y and z, m. Only resolved objects count. `matches`
+    are indices into the objects of a and b. Use the transform only if `accepted` is true. OutputError if a path cannot be
+    read.
+    """
+    return object_maps.register(_objects(a), _objects(b))
+
+
 def load_session(path: Path) -> Session:
     """Load one session. OutputError names what is missing or damaged."""
     return Session.load(path)
@@ -64,6 +76,12 @@ def warnings_of(sessions: Sequence[Session], islands: Sequence[Island]) -> list[
             what = f"{session.name} was localised in a map, and has the objects of that map in its own"
             found.append(f"{what}: merge a run without --map, so that the map does not count twice")
     return found
+
+
+def _objects(given: Given) -> object_map.ObjectMap:
+    if isinstance(given, object_map.ObjectMap):
+        return given
+    return given.objects if isinstance(given, Result) else ObjectMap.load(given)
 
 
 def _session(given: Given, name: str) -> Session:

@@ -56,7 +56,8 @@ def detect(
     if json:
         put(dump_json({"layout": recipe.layout, "image": [width, height], "boxes": rows}))
         return
-    say(f"{model}: outputs in the {recipe.layout} layout, boxes as {recipe.box_form} in {recipe.box_units}, {recipe.resize}")
+    units = recipe.box_units or "pixels or fractions as their values tell"
+    say(f"{model}: outputs in the {recipe.layout} layout, boxes as {recipe.box_form} in {units}, {recipe.resize}")
     say(f"{image}: {width}x{height}, {len(rows)} boxes with a score of {settings.detector.min_score:g} or more")
     for row in rows:
         x1, y1, x2, y2 = row["box"]

@@ -33,13 +33,16 @@ def explain(
     json: Json = False,
 ) -> None:
     """Say what is doubtful in a result, and why: objects that may be one or two, and boxes that became no object."""
-    from objslam.errors import OutputError
+    from objslam.errors import ConfigError, OutputError
     from objslam.results.files import DOUBTS
     from objslam.results.read import load_doubts, load_summary
 
     doubts = load_doubts(out)
     if doubts is None:
         raise OutputError(f"this result has no {DOUBTS}", where=str(out), hint="an older version wrote it: run it again")
+    if label is not None and label not in (known := _labels(out, doubts)):
+        there = f"there are {', '.join(known)}" if known else "there are none"
+        raise ConfigError(f"no object, box or doubt has the label {label}", where=str(out), hint=there)
     chosen = [one for one in doubts if label is None or one.label == label]
     if json:
         put(json_text.dumps([one.to_dict() for one in chosen], indent=2, ensure_ascii=False) + "\n")
@@ -52,6 +55,14 @@ def explain(
     if label is None and (left := load_summary(out).get("counts", {}).get("rays_unexplained")):
         grouped = sum(len(one.rays) for one in chosen if one.kind == "boxes")
         say(f"{left} boxes became no object: {grouped} in these groups, and {left - grouped} scattered")
+
+
+def _labels(out: Path, doubts: Sequence[Doubt]) -> list[str]:
+    """Return the labels of the result's objects, boxes and doubts, in the order of the alphabet."""
+    from objslam.results.read import load_map, load_rays
+
+    boxes = load_rays(out).label.tolist()
+    return sorted({*(o.label for o in load_map(out)), *boxes, *(one.label for one in doubts)})
 
 
 def doubts_table(doubts: Sequence[Doubt], title: str) -> Table:

@@ -38,7 +38,7 @@ def register_results(
         x, y, z = found.b_T_a[:3, 3]
         yaw = np.degrees(np.arctan2(found.b_T_a[1, 0], found.b_T_a[0, 0]))
         sigma = np.sqrt(np.diag(found.covariance)) * [1, 1, 1, np.degrees(1)]
-        say(f"B_T_A: x {x:.3f} y {y:.3f} z {z:.3f} m, yaw {yaw:.2f} deg")
+        say(f"B_T_A: x {x:z.3f} y {y:z.3f} z {z:z.3f} m, yaw {yaw:z.2f} deg")
         say("sigma: x {:.3f} y {:.3f} z {:.3f} m, yaw {:.2f} deg".format(*sigma))
     for i, k in found.matches.tolist():
         say(f"  {one[i].label} #{one[i].id} is #{other[k].id}")
@@ -90,7 +90,7 @@ def merge_results(
 
 
 def _session_line(told: dict[str, Any]) -> str:
-    at = "x {x:.3f} y {y:.3f} z {z:.3f} m, yaw {yaw_deg:.2f} deg, {common_objects} objects in common".format(**told)
+    at = "x {x:z.3f} y {y:z.3f} z {z:z.3f} m, yaw {yaw_deg:z.2f} deg, {common_objects} objects in common".format(**told)
     odds = told["log_odds"]
     return f"{at}, log odds {odds:.1f}" if math.isfinite(odds) else at
 

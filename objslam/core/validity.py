@@ -164,8 +164,13 @@ def camera_fault(camera: Camera) -> str | None:
     if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
         return "without a size"
     distortion, counts = camera.distortion, COEFFICIENTS.get(camera.distortion_model, ())
-    if distortion.ndim != 1 or len(distortion) not in counts or not (np.abs(distortion) < MAX_DISTORTION).all():
+    if distortion.ndim != 1 or not counts:
         return "with an unknown lens model"
+    if len(distortion) not in counts:
+        takes = " or ".join(map(str, counts))
+        return f"whose lens model {camera.distortion_model} takes {takes} coefficients, got {len(distortion)}"
+    if not (np.abs(distortion) < MAX_DISTORTION).all():
+        return "whose distortion coefficients are not finite or too large"
     if camera.base_T_camera.shape != (4, 4) or not rigid_poses(camera.base_T_camera[None])[1][0]:
         return "whose mount is not a rigid pose"
     if not 0 < camera.depth_scale < math.inf:

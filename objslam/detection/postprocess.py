@@ -28,7 +28,7 @@ class Candidates:
 def decode(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:
     """Decode and filter the boxes of one image. They are x1, y1, x2, y2 in px of the input, the highest score first. A label
     is an index into the names, or a class number if there are no names. The outputs have no batch axis. Raises DetectorError
-    if a score is above 1 or a class has no name."""
+    if a score is above 1, a class has no name, or a class number is impossible."""
     found = _DECODERS[recipe.layout](recipe, outputs, width, height)
     boxes, scores = _corners(recipe, found.boxes, width, height), found.scores
     if len(scores) and scores.max() > 1.001:
@@ -71,9 +71,22 @@ def _end_to_end(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> C
     rows = outputs["predictions"]
     if rows.shape[1] == 7:  # a row of YOLOv7 is image number, box, class, score
         rows = rows[:, [1, 2, 3, 4, 6, 5]]
+    _check_classes(rows[:, 5])
     scores = _probability(rows[:, 4], recipe)
     keep = np.flatnonzero(scores >= recipe.min_score)
     return _candidates(rows[keep, :4], scores[keep], rows[keep, 5])
+
+
+def _check_classes(values: Array) -> None:
+    """Raise DetectorError if a class number is impossible, also in rows with a low score: then the column holds no classes.
+
+    values: (N,) class numbers. A row without a box may have -1 or a number that is not finite.
+    """
+    known = values[np.isfinite(values)].astype(np.float64)
+    wrong = (known != np.rint(known)) | (known < -1)
+    if wrong.any():
+        hint = "the outputs are not in the layout end_to_end: set detector.layout, such as yolov8"
+        raise DetectorError(f"the model gives class {known[wrong][0]:g}, which is no number of a class", hint=hint)
 
 
 def _yolov8(recipe: Recipe, outputs: _Outputs, width: int, height: int) -> Candidates:

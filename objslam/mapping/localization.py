@@ -260,6 +260,6 @@ def _line(told: dict[str, Any]) -> str:
     return (
         f"localised in {told['map']} by {told['objects']} objects, log odds {told['log_odds']:.1f}, "
         f"lead {told['lead']:.1f}: "
-        f"x {at['x']:.3f} y {at['y']:.3f} z {at['z']:.3f} m, yaw {at['yaw_deg']:.2f} deg, sigma at the objects "
+        f"x {at['x']:z.3f} y {at['y']:z.3f} z {at['z']:z.3f} m, yaw {at['yaw_deg']:z.2f} deg, sigma at the objects "
         f"{max(sigma['x'], sigma['y'], sigma['z']):.3f} m and {sigma['yaw_deg']:.2f} deg"
     )

@@ -18,6 +18,7 @@ from small_log import THINGS, small_log
 from waiting import LIMIT
 
 import objslam
+from objslam.association.registration import object_maps
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import COLUMNS
@@ -149,6 +150,15 @@ def test_a_camera_may_have_lists_in_place_of_arrays(log: Log) -> None:
         objslam.Log.from_arrays(replace(camera, matrix=np.eye(4)), boxes, odometry=log.odometry)
 
 
+def test_a_wrong_number_of_lens_coefficients_is_told(log: Log) -> None:
+    camera = log.cameras[0]
+    told = "whose lens model plumb_bob takes 4 or 5 coefficients, got 3"
+    with pytest.raises(ValueError, match=told):
+        objslam.Log.from_arrays(
+            replace(camera.camera, distortion=[0, 0, 0]), camera.detections, localization=log.localization
+        )
+
+
 def test_rays_print_as_one_line(result: objslam.Result) -> None:
     free = sum(one is None for one in result.rays.to_arrow()["object"].to_pylist())
     assert repr(result.rays) == f"RaysTable of {len(result.rays)} rays, {free} of no object"
@@ -228,6 +238,36 @@ def test_a_saved_result_loads_as_it_was(result: objslam.Result, tmp_path: Any) -
         assert (tmp_path / "copy" / file.name).read_bytes() == file.read_bytes()
     with pytest.raises(OutputError, match="there is no such result folder"):
         objslam.Result.load(tmp_path / "nowhere")
+
+
+def test_maps_are_registered_from_results_maps_and_paths_alike(result: objslam.Result, tmp_path: Any) -> None:
+    result.save(tmp_path / "out")
+    file = tmp_path / "alone.json"
+    result.objects.save(file)
+    expected = object_maps.register(result.objects, result.objects)
+    assert len(expected.matches) == len(THINGS)
+    loaded = objslam.Result.load(tmp_path / "out")
+    for given in (result.objects, result, loaded, tmp_path / "out", str(tmp_path / "out"), file):
+        for pair in ((given, result.objects), (result.objects, given)):
+            found = objslam.register(*pair)
+            np.testing.assert_allclose(found.b_T_a, expected.b_T_a, atol=1e-6)
+            np.testing.assert_array_equal(found.matches, expected.matches)
+    with pytest.raises(OutputError, match="absent"):
+        objslam.register(tmp_path / "absent", result)
+
+
+def test_pushes_before_the_start_are_counted_in_the_snapshot() -> None:
+    session = objslam.Session()
+    assert not session.push_detections(1.0, "front", [[1, 2, 30, 40]], ["cup"], [0.5])
+    assert not session.push_odometry(1.0, [1, 2])
+    assert sum(session.snapshot().dropped.values()) == 2
+
+
+def test_pushes_after_the_end_are_counted_in_the_snapshot(log: Log) -> None:
+    with objslam.Session() as session:
+        session.push_camera(log.cameras[0].camera)
+    assert not session.push_odometry(1.0, [1, 2])
+    assert sum(session.snapshot().dropped.values()) == 1
 
 
 def test_a_session_maps_what_is_pushed(log: Log) -> None:

@@ -54,7 +54,16 @@ def test_the_doubts_of_a_result_are_said_in_sentences(explain: Any) -> None:
 
 def test_no_doubt_is_said_too(explain: Any) -> None:
     assert explain("sure")[:2] == (0, "no doubts\n")
-    assert explain("out", "--label", "dog")[:2] == (0, "no doubts about dog\n")
+    sure = clusters()[1][0]
+    assert explain("sure", "--label", sure)[:2] == (0, f"no doubts about {sure}\n")
+
+
+def test_a_label_that_the_result_lacks_is_an_error_that_names_those_there(explain: Any) -> None:
+    for words in ((), ("--json",)):
+        code, out, err = explain("out", "--label", "zebra", *words)
+        assert (code, out, len(err.splitlines())) == (2, "", 1)
+        assert "zebra" in err
+        assert all(label in err for label in (*clusters()[1], "cup", "mug"))
 
 
 def test_json_is_what_the_file_has(explain: Any, tmp_path: Path) -> None:
@@ -63,7 +72,8 @@ def test_json_is_what_the_file_has(explain: Any, tmp_path: Path) -> None:
     assert told == json.loads((tmp_path / "out" / "doubts.json").read_text())["doubts"]
     assert told[1]["text"] == TEXT
     assert told[1]["numbers"] == {"miss_m": 0.061235}
-    assert [len(json.loads(explain("out", "--json", "--label", label)[1])) for label in ("cup", "dog")] == [1, 0]
+    labels = ("cup", clusters()[1][0])
+    assert [len(json.loads(explain("out", "--json", "--label", label)[1])) for label in labels] == [1, 0]
 
 
 def test_a_file_is_read_back(explain: Any, tmp_path: Path) -> None:

@@ -38,6 +38,24 @@ def test_a_turned_copy_is_found_and_an_empty_map_refused(tmp_path, monkeypatch, 
         assert words in capsys.readouterr().out
 
 
+def test_no_shift_or_turn_is_said_as_minus_zero(tmp_path, monkeypatch, capsys):
+    one = some_map(np.random.default_rng(0))
+    pose = lift_se2(np.array([-1e-4, -1e-4, -1e-5]))
+    two = replace(one, objects=tuple(replace(o, position=pose[:3, :3] @ o.position + pose[:3, 3]) for o in one))
+    files = [str(tmp_path / f"{name}.json") for name in "ab"]
+    for pair in ((one, two), (two, one)):
+        for objects, file in zip(pair, files, strict=True):
+            objects.save(file)
+        for command in (["register", *files], ["merge", *files, "-o", str(tmp_path / "site")]):
+            monkeypatch.setattr(sys, "argv", ["objslam", *command])
+            with pytest.raises(SystemExit) as ended:
+                main()
+            said = capsys.readouterr().out
+            assert ended.value.code == 0
+            assert "x 0.000 y 0.000 z 0.000 m, yaw 0.00 deg" in said
+            assert "-0.0" not in said
+
+
 def test_an_empty_folder_is_one_line_and_code_1(tmp_path, monkeypatch, capsys):
     (tmp_path / "nothing").mkdir()
     monkeypatch.setattr(sys, "argv", ["objslam", "register", str(tmp_path / "nothing"), str(tmp_path / "nothing")])

@@ -129,6 +129,15 @@ def test_what_cannot_be_a_box_is_left_out():
     assert found.boxes.tolist() == [[50, 50, 90, 90]]
 
 
+@pytest.mark.parametrize("number", [0.5, 632.5, -19999.0])
+@pytest.mark.parametrize("score", [0.0, 0.9])
+def test_a_class_that_cannot_be_tells_that_the_layout_is_wrong_at_any_score(number, score):
+    rows = np.array([[50, 50, 90, 90, 0.9, 0], [1, 1, 9, 9, score, number]], np.float32)
+    with pytest.raises(DetectorError, match=f"class {number:g}, which is no number of a class") as refused:
+        decode(recipe("end_to_end"), {"predictions": rows}, 320, 256)
+    assert "detector.layout" in str(refused.value)
+
+
 def test_units_are_told_by_the_values_where_they_are_not_known():
     outputs = {"labels": np.array([0, 1]), "scores": np.array([0.9, 0.8], np.float32)}
     for boxes, first in (

@@ -44,6 +44,13 @@ def test_the_boxes_are_told_and_drawn(files: tuple[Path, Path], tmp_path: Path) 
         assert not (np.abs(changed - ((x1 + x2) // 2, (y1 + y2) // 2)).max(axis=1) <= 3).any()
 
 
+def test_units_that_only_the_values_tell_are_said_in_words(files: tuple[Path, Path], tmp_path: Path) -> None:
+    model = tiny_model(tmp_path / "ssd.onnx", "ssd")
+    done = detect(model, files[1])
+    assert done.returncode == 0, done.stderr
+    assert "boxes as xyxy in pixels or fractions as their values tell" in done.stdout
+
+
 def test_only_a_picture_is_written(files: tuple[Path, Path], tmp_path: Path) -> None:
     refused = detect(*files, "-o", tmp_path / "boxes.txt")
     assert refused.returncode == 2

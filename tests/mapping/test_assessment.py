@@ -149,6 +149,7 @@ def test_boxes_at_the_edge_are_told() -> None:
 def test_a_hint_at_the_mode_that_uses_the_odometry_too_is_no_doubt() -> None:
     """It comes once, and only if the mode was left to a log that has both paths."""
     assert assess(replace(GOOD, odometry_unused=True)).level == "good"
+    assert "for objects seen from several sides" in str(assess(replace(GOOD, odometry_unused=True)))
     assert len(assess(replace(GOOD, odometry_unused=True, spoilt=True)).reasons) == 1
 
     def hints(log: object, **changes: object) -> int:

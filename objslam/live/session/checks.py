@@ -23,6 +23,7 @@ from objslam.sources.journal.records import FrameMessage
 _LONGEST_NAME = 1000  # The most characters of a camera's name. A larger number accepts longer names.
 _LETTERS = 80  # The most characters that a report shows of a text in a message. A larger number makes longer lines.
 _NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
+_MOST_COEFFICIENTS = max(map(max, COEFFICIENTS.values()))  # Above it, a count is not told, so reports of cameras stay few.
 _EXACT = 2**53  # The bound below which a float represents every whole number exactly.
 
 
@@ -98,7 +99,7 @@ def sound_camera(camera: object) -> Camera | str:
     if width is None or height is None:
         return "without a size"
     model: object = camera.distortion_model
-    if distortion is None or not isinstance(model, str) or model not in COEFFICIENTS:
+    if distortion is None or distortion.size > _MOST_COEFFICIENTS or not isinstance(model, str) or model not in COEFFICIENTS:
         return "with an unknown lens model"
     base_T_camera = rigid(camera.base_T_camera)
     if base_T_camera is None:

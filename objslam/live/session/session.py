@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
@@ -100,7 +101,14 @@ class Session(Intake):
         return self
 
     def snapshot(self) -> Snapshot:
-        """Return the present map, or the last snapshot if the session has stopped or is busy for several seconds."""
+        """Return the present map, or the last one if the session has stopped or is busy for several seconds.
+
+        The counts are always the present ones: a session that does not run counts what it refuses.
+        """
+        found = self._present()
+        return replace(found, counters=self.counters.accepted(), dropped=self.counters.dropped())
+
+    def _present(self) -> Snapshot:
         with self._changed:
             if not self._running:
                 return self._snapshot

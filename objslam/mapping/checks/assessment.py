@@ -141,7 +141,8 @@ def _about(e: Evidence) -> list[str]:
     depends on it."""
     found = []
     if e.odometry_unused:
-        found.append("Hint: the log has odometry too. --mode joint uses both, and its map is usually more exact.")
+        better = "usually more exact for objects seen from several sides"
+        found.append(f"Hint: the log has odometry too. --mode joint uses both: {better}.")
     if part := part_in_words(e.part):
         found.append(f"The map is of a part of the recording: {part}.")
     if e.odometry_frame:
