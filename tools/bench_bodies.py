@@ -2,9 +2,11 @@
 
     python tools/bench_bodies.py [--objects 200] [--boxes 30] [--noise 2] [--seeds 3]
     python tools/bench_bodies.py --drives 10 [--short 0.05]
+    python tools/bench_bodies.py --live 8
 
 The second line runs whole drives in joint mode instead, with bodies and without. With --short, the detector also draws boxes
-that the image's edge cuts off.
+that the image's edge cuts off. The third line feeds drives of two laps to live sessions. It takes the map before the end of
+the session, and the pose of each keyframe when the session had just mapped it.
 
 The nearest peer, gtsam-quadrics, has wheels for Python 3.10 and numpy below 1.24 only. The benchmark says whether it can be
 imported here, and compares nothing with it otherwise.
@@ -26,6 +28,12 @@ from mapping.body_drives import drive, scores
 from objslam.config import load_settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera, undistort
+from objslam.core.geometry import inverse
+from objslam.core.snapshot import Snapshot
+from objslam.core.types import Log
+from objslam.evaluation.evaluate import evaluate
+from objslam.live.adapters.replay import events
+from objslam.live.session.session import Session
 from objslam.simulation.outlines import looking_at, outline_box
 from objslam.triangulation.bodies.edges import BoxEdges, tangent_planes
 from objslam.triangulation.bodies.ellipsoid import from_axes, half_axes, heading
@@ -46,7 +54,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--drives", type=int, default=0, help="drives between large objects, in place of single bodies")
     parser.add_argument("--short", type=float, help="draw cut off boxes, up to this share of their size short")
+    parser.add_argument("--live", type=int, default=0, help="drives of two laps between large objects, in live sessions")
     options = parser.parse_args()
+    if options.live:
+        live(options.live)
+        return
     if options.drives:
         drives(options.drives, options.short)
         return
@@ -79,6 +91,43 @@ def drives(number: int, short: float | None) -> None:
         )
     sizes, overlaps = ([one[key] for one in found] for key in ("size_error_median", "iou_median"))
     print(f"  sizes off by {np.median(sizes):.1%}, 3D overlap {np.median(overlaps):.2f} (medians)")
+
+
+def live(number: int) -> None:
+    """Feed drives to sessions with bodies and without, and print medians over the drives."""
+    logs = [drive(seed, frames=400, laps=2) for seed in range(number)]
+    for name, change in (("points", "bodies.use=false"), ("bodies", "bodies.use=true")):
+        begin, found = time.process_time(), []
+        for log in logs:
+            path, snapshot = session_scores(log, change)
+            found.append((path, evaluate(snapshot.map, log.truth, snapshot.path, align="se2", radius=1.0).to_dict()))
+        seconds = (time.process_time() - begin) / number
+        middle = {key: float(np.median([one[key] for _, one in found])) for key in ("position_rmse", "ate")}
+        print(
+            f"{name}: objects {sum(one['matched'] for _, one in found)} of {sum(len(log.truth.objects) for log in logs)}, "
+            f"RMSE {middle['position_rmse']:.3f} m, ATE {middle['ate']:.3f} m, poses of the second lap when mapped "
+            f"{np.median([path for path, _ in found]):.3f} m (medians of {number} drives), inside 95 %: "
+            f"{np.mean([one['inside_95_3d'] for _, one in found]):.1%}, {seconds:.2f} s of CPU for a drive",
+            flush=True,
+        )
+
+
+def session_scores(log: Log, change: str) -> tuple[float, Snapshot]:
+    """Return the RMSE, m, of the poses of the second lap when they were mapped, and the last snapshot of a session."""
+    settings = load_settings(None, ("calibration.use=false", "output.recording=false", change))
+    session = Session(settings, patient=True).start()
+    off: list[float] = []
+    frames, truth = log.cameras[0].detections.frame_stamps, log.truth.trajectory
+    m = session._mapper.state
+    for _, frame, push in events(log):
+        push(session)
+        if frame and session.wait() and len(m.keyframes) and m.keyframes.stamp[-1] > frames[len(frames) // 2]:
+            pose = m.graph.pose(int(m.keyframes.id[-1])) @ inverse(m.keyframes.base_T_camera[-1])
+            true = truth.poses[np.searchsorted(truth.stamps, m.keyframes.stamp[-1] - 1e-6)]
+            off.append(float(((pose[:2, 3] - true[:2, 3]) ** 2).sum()))
+    snapshot = session.snapshot()
+    session.abort()
+    return float(np.sqrt(np.mean(off))), snapshot
 
 
 def scene(count: int, per: int, arc: tuple[float, float], rng: np.random.Generator) -> tuple[Floats, Floats, Floats, Floats]:

@@ -33,6 +33,14 @@ class Request(Protocol[Answer_co]):
         """Return the answer."""
 
 
+def solved(request: Request[Answer]) -> Answer | None:
+    """Solve a request in this process. Return None if it fails, as a `Worker` does."""
+    try:
+        return request.solve()
+    except Exception:  # noqa: BLE001 - a request that fails must not end the session
+        return None
+
+
 class Worker(Generic[Answer]):
     """A process that solves one request after another. It starts with the first request, and starts again after a
     failure."""

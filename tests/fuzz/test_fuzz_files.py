@@ -28,6 +28,7 @@ from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.log import read_journal
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import (
+    BodiesMessage,
     CalibrationMessage,
     CameraMessage,
     FrameMessage,
@@ -58,6 +59,7 @@ MESSAGES = [
     FRAMES,
     replace(FRAMES, whole=True, stamp=3.0),
     CalibrationMessage(3, CALIBRATION),
+    BodiesMessage(3, np.array([4]), np.array([2]), np.ones((1, 3)), np.zeros(1), np.eye(4)[None]),
 ]
 
 

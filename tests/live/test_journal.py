@@ -26,6 +26,7 @@ from objslam.sources.journal.log import read_journal
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.record_format import MAGICS
 from objslam.sources.journal.records import (
+    BodiesMessage,
     CalibrationMessage,
     CameraMessage,
     FrameMessage,
@@ -70,11 +71,23 @@ def calibrations(count):
     return st.builds(Calibration, st.tuples(*[NAMES] * count), values, roots.map(lambda root: root @ root.T), values)
 
 
+def bodies(count):
+    """Of each shape, and of none."""
+    sides = npst.arrays(np.float64, (count, 3), elements=st.floats(1e-3, 1e3))
+    roots = npst.arrays(np.float64, (count, 4, 4), elements=st.floats(-1e3, 1e3))
+    spread = roots.map(lambda root: root @ np.swapaxes(root, 1, 2)).map(lambda one: (one + np.swapaxes(one, 1, 2)) / 2)
+    ids = st.just(3 * np.arange(count))
+    shapes = npst.arrays(np.int64, count, elements=st.integers(0, 3))
+    yaws = npst.arrays(np.float64, count, elements=st.floats(-4, 4))
+    return st.builds(BodiesMessage, st.integers(0, 10**9), ids, shapes, sides, yaws, spread)
+
+
 MESSAGES = st.one_of(
     st.builds(PoseMessage, st.sampled_from(["odometry", "localization"]), FINITE, POSES),
     st.builds(MountMessage, FINITE, NAMES, POSES),
     st.builds(NoteMessage, FINITE, POSES),
     st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations)),
+    st.integers(0, 4).flatmap(bodies),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
     st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),
     st.just(CameraMessage(replace(make_camera("depth"), depth_noise=RangeNoise(0.01, 0.005, 0.02)))),
@@ -123,6 +136,10 @@ TWICE = (2 * np.eye(4)).ravel().tolist()
         struct.pack("<c13d", b"O", 1.0, *TWICE[:12]),
         struct.pack("<cd12dH", b"M", 1.0, *TWICE[:12], 5) + b"front",
         struct.pack("<cd12dH", b"M", 1.0, *FLAT[:12], 2) + b"\xff\xff",
+        record(b"B", 3, [0], [9], [[1, 1, 1]], [0.0], [np.eye(4).tolist()]),
+        record(b"B", 3, [0], [2], [[1, 0, 1]], [0.0], [np.eye(4).tolist()]),
+        record(b"B", 3, [0], [2], [[1, 1, 1]], [0.0], [(-np.eye(4)).tolist()]),
+        record(b"B", 3, [0, 1], [2], [[1, 1, 1]], [0.0], [np.eye(4).tolist()]),
         record(b"N", 0.0, TWICE),
         record(b"N", np.nan, FLAT),
         record(b"N", 10**400, FLAT),

@@ -6,12 +6,16 @@ from functools import partial
 
 import numpy as np
 import pytest
+from driving import feed
 from mapping.body_drives import drive
 from waiting import wait_for
 
 from objslam.config import load_settings
-from objslam.live.adapters.replay import ReplayAdapter
-from objslam.live.session.body_estimation import BodyRequest
+from objslam.core.geometry import lift_se2
+from objslam.evaluation.evaluate import evaluate
+from objslam.live.adapters.replay import ReplayAdapter, events
+from objslam.live.bodies.description import BodyEstimator
+from objslam.live.bodies.request import BodyRequest
 from objslam.live.session.session import Session
 from objslam.live.worker import Worker
 
@@ -60,7 +64,7 @@ def test_a_snapshot_has_the_bodies_of_its_objects(log, monkeypatch):
 def test_a_process_that_fails_leaves_points_and_is_not_asked_again(log, monkeypatch):
     asked = []
     monkeypatch.setattr(Worker, "_run", lambda self: asked.append(len(self._waiting)))
-    monkeypatch.setattr("objslam.live.session.body_estimation._REST", 0.0)
+    monkeypatch.setattr("objslam.live.bodies.description._REST", 0.0)
     session = session_of(log)
     for _ in range(20):
         assert not sized(session, 1)
@@ -100,3 +104,79 @@ def test_one_process_answers_all_requests_until_one_fails(log, monkeypatch):
             assert found is None
     worker.close()
     assert processes[0] == processes[1] == processes[2] != processes[3]
+
+
+@pytest.fixture(scope="module")
+def laps():
+    """Two laps between large objects, so that the robot sees them again after they have bodies."""
+    return drive(2, frames=400, laps=2)
+
+
+@pytest.fixture(scope="module")
+def turned(laps):
+    """A session that has mapped these laps."""
+    session = session_of(laps)
+    yield session
+    session.abort()
+
+
+def path_error(session, log):
+    """The error, m, of the path of a running session, in its own frame, which begins at the truth."""
+    path = session.snapshot().path
+    true = log.truth.trajectory.poses[np.searchsorted(log.truth.trajectory.stamps, path.stamps - 1e-6)]
+    return float(np.sqrt(np.mean(np.sum((path.poses[:, :2, 3] - true[:, :2, 3]) ** 2, axis=1))))
+
+
+def object_error(session, log):
+    """The errors, m, of the centres of the objects, after an alignment."""
+    snapshot = session.snapshot()
+    return evaluate(snapshot.map, log.truth, snapshot.path, align="se2", radius=1.0).to_dict()["position_rmse"]
+
+
+def test_bearings_to_the_centres_of_bodies_bend_neither_map_nor_path(laps, turned, monkeypatch):
+    m = turned._mapper.state
+    assert (m.landmarks.shape > 0).sum() >= 4
+    assert m.counters.accepted()["turns to the centres of bodies"] >= 3
+    monkeypatch.setattr("objslam.live.bodies.centring._FIRST", 0)
+    monkeypatch.setattr(BodyEstimator, "update", lambda self, m, covariances: None)
+    points = session_of(laps)
+    assert not (points._mapper.state.landmarks.shape > 0).any()
+    assert path_error(turned, laps) < 0.7 * path_error(points, laps)
+    assert object_error(turned, laps) < 0.7 * object_error(points, laps)
+    points.abort()
+
+
+def test_a_resumed_session_turns_the_same_bearings(laps, tmp_path):
+    settings = load_settings(None, ("calibration.use=false",))
+    pushes = list(events(laps))
+    whole = feed(Session(settings, tmp_path / "whole", patient=True).start(), laps, 0, 440)
+    killed = feed(Session(settings, tmp_path / "killed", patient=True).start(), laps, 0, 360)
+    state = killed._mapper.state
+    assert (state.landmarks.shape > 0).any()
+    killed.abort()
+    again = Session(settings, tmp_path / "killed", resume=True, patient=True).start()
+    for name in ("shape", "half", "yaw", "position"):
+        np.testing.assert_allclose(getattr(again._mapper.state.landmarks, name), getattr(state.landmarks, name), atol=1e-9)
+    feed(again, laps, 360, pushes=pushes[360:440])
+    one, other = again._mapper.state, whole._mapper.state
+    assert one.counters.accepted() == other.counters.accepted()
+    np.testing.assert_allclose(one.rays.to_centre, other.rays.to_centre, atol=1e-6)
+    np.testing.assert_allclose(one.landmarks.position, other.landmarks.position, atol=1e-6)
+    again.abort()
+    whole.abort()
+
+
+def test_a_map_that_turns_takes_its_bodies_along(turned):
+    """After a move of the whole map, the same bearings point to the same centres."""
+    turned.abort()
+    m = turned._mapper.state
+    at = np.flatnonzero(m.rays.used & (m.rays.owner >= 0))
+    m.graph.refresh()
+    m.read_positions()
+    before, noise = m.to_centres(at)
+    assert (before != 0).any()
+    m.graph.drop_absolute()
+    m.move(lift_se2(np.array([1.0, -2.0, 0.8])))
+    after, same = m.to_centres(at)
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    np.testing.assert_allclose(same, noise, atol=1e-9)

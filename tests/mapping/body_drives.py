@@ -16,15 +16,15 @@ FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.8], [0, 0, 0, 1]
 """A camera that looks ahead, 0.8 m above the floor."""
 
 
-def drive(seed, frames=200, objects=8, short=None):
-    """A lap on an ellipse inside a ring of objects of 0.7 to 1.6 m, with boxes of 2 px noise and drifting odometry.
+def drive(seed, frames=200, objects=8, short=None, laps=1):
+    """Laps on an ellipse inside a ring of objects of 0.7 to 1.6 m, with boxes of 2 px noise and drifting odometry.
 
     short: by which share of its size the detector ends a box short of the image's edge that cuts it off. Without it, there
     are no cut off boxes.
     """
     rng = np.random.default_rng(seed)
     camera = Camera("front", 640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]), base_T_camera=FORWARD)
-    turn = np.linspace(0, 2 * np.pi, frames)
+    turn = np.linspace(0, 2 * np.pi * laps, frames)
     place = np.column_stack([2.5 * np.cos(turn), 2.0 * np.sin(turn)])
     yaw = np.unwrap(np.arctan2(*np.gradient(place, axis=0).T[::-1])) + 0.5 * np.sin(5 * turn)
     true, stamps = lift_se2(np.column_stack([place, yaw])), 0.2 * np.arange(frames)

@@ -6,7 +6,6 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
 from objslam.core.geometry import inverse
 from objslam.core.types import Keyframes, Log
-from objslam.errors import SolveError
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.frontend.shared_errors import SharedErrors
@@ -15,12 +14,6 @@ from objslam.graph.factors.priors import anchor
 from objslam.live.calibration.collected import as_measured, offline_rays, recorded_log
 from objslam.live.mapper.localization import chain_keyframes
 from objslam.live.mapper.state import MapState
-
-_AT_ONCE = 400
-"""The most keyframes of a graph that is solved at once after its correction. A larger graph is rebuilt in slices, between
-frames. A larger number delays the next frame for longer."""
-_ITERATIONS = 8
-"""The most iterations of the solve after a correction. More iterations delay the next frame for longer."""
 
 
 def recalibrate(m: MapState, calibration: Calibration) -> None:
@@ -49,7 +42,7 @@ def recalibrate(m: MapState, calibration: Calibration) -> None:
         at = np.searchsorted(m.rays.number, track.numbers())
         track.remeasure(m.rays.direction[at], m.rays.range[at], m.rays.range_sigma[at], spread, m.graph)
     m.landmarks.drift[:] = drift[: len(m.landmarks)]
-    _solve(m)
+    m.solve_corrected()
 
 
 def _remeasure_keyframes(m: MapState) -> None:
@@ -149,20 +142,3 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
     if rays_changed and len(used):
         m.graph.drop_rays(rays.number[used])
         m.graph.add_rays(m.bearings(used))
-
-
-def _solve(m: MapState) -> None:
-    """Solve the graph with the corrected measurements. If it is large or the solve fails, rebuild it in slices.
-
-    Only the next full solve tests for outliers, because until then the rays of one object may look like the rays of two
-    objects.
-    """
-    m.schedule.relinearise_soon()
-    if len(m.keyframes) <= _AT_ONCE:
-        try:
-            m.graph.solve(_ITERATIONS)
-            m.read_positions()
-            return
-        except SolveError:
-            m.counters.accept("solves given up")
-    m.rebuild_in_slices()

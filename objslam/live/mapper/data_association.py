@@ -5,7 +5,7 @@ import numpy as np
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.core.arrays import Floats
 from objslam.live.mapper.frame_association import FrameRays, best_of_label, match, match_by_label
-from objslam.live.mapper.landmark_table import predict_landmarks
+from objslam.live.mapper.landmark_table import at_box_centres, predict_landmarks, to_centres
 from objslam.live.mapper.landmark_update import LandmarkUpdate
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
@@ -23,6 +23,7 @@ def associate(
     `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
+    camera = int(m.keyframes.camera[-1])
     if m.by_label and settings.method == "auto" and len(set(rays.label.tolist())) < count:
         m.tell_apart_within_labels()
     numbers = m.next_id.ray + np.arange(count)
@@ -32,7 +33,8 @@ def associate(
     tracks: dict[int, Track] = {}  # The tracks of the frame's rays, by the index of the ray.
     if m.by_label:
         best = best_of_label(rays)
-        row[best], missed = match_by_label(rays.take(best), map_T_camera, landmarks, uncertainty, settings.gate)
+        predicted = at_box_centres(predict_landmarks(landmarks, []), landmarks, m.cameras, camera, map_T_camera)
+        row[best], missed = match_by_label(rays.take(best), map_T_camera, predicted, uncertainty, settings.gate)
         lost = missed >= 0
         landmarks.rejected[missed[lost]] += 1
         owner[best[lost]] = landmarks.id[missed[lost]]
@@ -41,6 +43,7 @@ def associate(
     else:
         if predicted is None:
             predicted = predict_landmarks(landmarks, m.tracks)
+        predicted = at_box_centres(predicted, landmarks, m.cameras, camera, map_T_camera)
         row = match(rays, map_T_camera, predicted, uncertainty, len(m.labels), settings.gate, m.landmark_of_track, m.novelty)
         of_track = row >= predicted.landmarks
         m.novelty += _NOVELTY_WEIGHT * (float((of_track | (row < 0)).mean()) - m.novelty)
@@ -49,7 +52,12 @@ def associate(
         row[of_track] = -1
     matched = np.flatnonzero(row >= 0)
     owner[matched], used[matched] = landmarks.id[row[matched]], True
-    m.rays.add(number=numbers, keyframe=np.full(count, k), owner=owner, used=used, **vars(rays))
+    added, noise = np.zeros((count, 3)), np.zeros(count)
+    poses = np.broadcast_to(map_T_camera, (len(matched), 4, 4))
+    added[matched], noise[matched] = to_centres(landmarks, row[matched], m.cameras, np.full(len(matched), camera), poses)
+    m.rays.add(
+        number=numbers, keyframe=np.full(count, k), owner=owner, used=used, to_centre=added, centre_sigma=noise, **vars(rays)
+    )
     stamp = float(m.keyframes.stamp[-1])
     for i in free.tolist():
         label = int(rays.label[i])
@@ -65,4 +73,4 @@ def associate(
     if len(matched):
         m.graph.add_rays(m.bearings(len(m.rays.number) - count + matched))
     m.graph.update()
-    return LandmarkUpdate(rays, matched, row[matched], list(tracks.values()))
+    return LandmarkUpdate(rays.turned(added, noise), matched, row[matched], list(tracks.values()))

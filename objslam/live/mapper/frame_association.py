@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from objslam.association.landmarks import Landmarks, PredictedLandmarks
 from objslam.association.observations import Observations
 from objslam.association.refinement import RANGE_LOSS
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.live.mapper.landmark_table import LandmarkTable, covariances, noise
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
 
 _VIEW = np.cos(np.radians(40.0))  # The cosine of the largest angle from a box to a candidate. A larger angle costs time.
@@ -47,6 +46,12 @@ class FrameRays:
     def take(self, rays: Ints) -> FrameRays:
         """Return the rays with these indices (m,)."""
         return FrameRays(**{name: value[rays] for name, value in vars(self).items()})
+
+    def turned(self, added: Floats, sigma: Floats) -> FrameRays:
+        """Return the rays with `added` (n, 3) added to their directions. sigma: (n,) rad, the noise of `added`."""
+        direction = self.direction + added
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return replace(self, direction=direction, sigma=np.hypot(self.sigma, sigma))
 
 
 def match(
@@ -98,25 +103,26 @@ def match(
 
 
 def match_by_label(
-    rays: FrameRays, map_T_camera: Floats, landmarks: LandmarkTable, uncertainty: PoseUncertainty, gate: float
+    rays: FrameRays, map_T_camera: Floats, predicted: PredictedLandmarks, uncertainty: PoseUncertainty, gate: float
 ) -> tuple[Ints, Ints]:
     """Match each ray to the landmark of its label, and return the row (n,) of this landmark in one of two arrays.
 
     The first array holds the row if the ray is inside the gate, the second array if the ray is outside. All other entries
-    are -1.
+    are -1. predicted: landmarks only.
     """
-    rows = np.flatnonzero(np.isin(landmarks.label, rays.label))
+    label = predicted.label
+    rows = np.flatnonzero(np.isin(label, rays.label))
     hit, missed = (np.full(len(rays.label), -1, dtype=np.int64) for _ in range(2))
     if not len(rows):
         return hit, missed
-    position = landmarks.position[rows]
-    moved = uncertainty.of_landmarks(position - map_T_camera[:3, 3], landmarks.drift[rows], map_T_camera)
-    accepts = landmarks.label[rows][:, None] == np.arange(int(max(rays.label.max(), landmarks.label.max())) + 1)
-    places = Landmarks(position, covariances(landmarks, rows) + moved, noise(landmarks, rows), accepts)
+    position = predicted.position[rows]
+    moved = uncertainty.of_landmarks(position - map_T_camera[:3, 3], predicted.drift[rows], map_T_camera)
+    accepts = label[rows][:, None] == np.arange(int(max(rays.label.max(), label.max())) + 1)
+    places = Landmarks(position, predicted.covariance[rows] + moved, predicted.noise[rows], accepts)
     edges = gated_edges(in_map(rays, map_T_camera), places, _BY_LABEL * gate_limit(gate))
     hit[edges.ray] = rows[edges.landmark]
     for i in np.flatnonzero(hit < 0).tolist():
-        missed[i] = next(iter(rows[landmarks.label[rows] == rays.label[i]]), -1)
+        missed[i] = next(iter(rows[label[rows] == rays.label[i]]), -1)
     return hit, missed
 
 

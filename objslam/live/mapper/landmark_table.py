@@ -1,12 +1,20 @@
-"""The table of landmarks, with their covariances, their noise, and the landmarks that a camera should see."""
+"""The table of landmarks, with their covariances, their noise, and the landmarks that a camera should see.
+
+The centre of a box is not the image of the centre of its object. For large objects nearby, this error would bend the path of
+the session. So the landmark of such an object is the centre of its body. The boxes of a frame are matched with the centres
+of predicted boxes. The bearings of matched boxes are then turned to the centres of bodies.
+"""
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.bodies.body import SHAPES
+from objslam.core.bodies.box_centres import beside_centres_sigma, image_axes
 from objslam.core.camera import Camera
 from objslam.core.camera import in_view as in_image
 from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_PROMISE
@@ -20,6 +28,7 @@ _NEAREST = 0.3
 """The distance (m) below which an object does not fit into the image and is not expected to be seen. A larger distance
 expects fewer landmarks."""
 _FURTHER = 1.1  # A landmark is expected up to this factor times its `far`. A larger factor counts more misses.
+_CUBOID = SHAPES.index("cuboid")
 _NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has this id, and -1 means no landmark.
 
 
@@ -30,6 +39,9 @@ class LandmarkTable(GrowingTable):
     stamps, s, of the first and last observation. label: number. seen: number of frames that showed the landmark. expected:
     number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared normalised
     residuals of its rays, clipped. rejected: number of its rays outside the gate.
+
+    shape: of the body to whose centre the bearings point, as an index into `SHAPES`. 0 means that they point to the centres
+    of boxes. half, yaw: m and rad, the half axes and the heading of this body. shape_covariance: of these four numbers.
     """
 
     id: Ints = column(np.int64)
@@ -44,6 +56,10 @@ class LandmarkTable(GrowingTable):
     far: Floats = column(np.float64)
     squared: Floats = column(np.float64)
     rejected: Ints = column(np.int64)
+    shape: Ints = column(np.int64)
+    half: Floats = column(np.float64, 3)
+    yaw: Floats = column(np.float64)
+    shape_covariance: Floats = column(np.float64, 4, 4)
 
 
 def noise(landmarks: LandmarkTable, rows: Ints) -> Floats:
@@ -97,3 +113,59 @@ def predict_landmarks(landmarks: LandmarkTable, tracks: Sequence[Track]) -> Pred
         noise=np.concatenate([noise(landmarks, every), np.ones(more)]),
         far=float(landmarks.far.max(initial=0.0)),
     )
+
+
+def box_centres(
+    landmarks: LandmarkTable, rows: Ints, cameras: Sequence[Camera], camera: Ints, map_T_camera: Floats
+) -> tuple[Floats, Floats]:
+    """Return points (n, 3), m, on the rays through the centres of the boxes of landmarks, and their noise (n,), m.
+
+    The noise is that of the bodies. rows: (n,) of the landmarks. camera: (n,) the number of the camera of each.
+    map_T_camera: (n, 4, 4).
+    """
+    points, sigma = landmarks.position[rows], np.zeros(len(rows))
+    some = np.flatnonzero(landmarks.shape[rows] > 0)
+    if len(some):
+        at, to = rows[some], points[some] - map_T_camera[some, :3, 3]
+        fisheye = np.array([c.fisheye for c in cameras])[camera[some]]
+        axes = image_axes(map_T_camera[some, :3, :3], to, fisheye)
+        cuboid = landmarks.shape[at] == _CUBOID
+        body = landmarks.half[at], landmarks.yaw[at], cuboid, landmarks.shape_covariance[at]
+        beside, sigma[some] = beside_centres_sigma(axes, to, *body)
+        points[some] += beside
+    return points, sigma
+
+
+def at_box_centres(
+    predicted: PredictedLandmarks,
+    landmarks: LandmarkTable,
+    cameras: Sequence[Camera],
+    camera: int,
+    map_T_camera: Floats,
+) -> PredictedLandmarks:
+    """Return the candidates for the boxes of a frame, with bodies where the centres of their boxes would be.
+
+    camera: its number. map_T_camera: (4, 4).
+    """
+    rows = np.flatnonzero(landmarks.shape > 0)
+    if not len(rows):
+        return predicted
+    poses = np.broadcast_to(map_T_camera, (len(rows), 4, 4))
+    position, covariance = predicted.position.copy(), predicted.covariance.copy()
+    position[rows], sigma = box_centres(landmarks, rows, cameras, np.full(len(rows), camera), poses)
+    covariance[rows] += sigma[:, None, None] ** 2 * np.eye(3)
+    return replace(predicted, position=position, covariance=covariance)
+
+
+def to_centres(
+    landmarks: LandmarkTable, rows: Ints, cameras: Sequence[Camera], camera: Ints, map_T_camera: Floats
+) -> tuple[Floats, Floats]:
+    """Return what to add (n, 3) to unit bearings through centres of boxes, so that they point to the centres of bodies.
+
+    The vectors are in the camera frame. The second array (n,) is their noise, rad. The arguments are those of `box_centres`.
+    """
+    points, sigma = box_centres(landmarks, rows, cameras, camera, map_T_camera)
+    to, beside = (at - map_T_camera[:, :3, 3] for at in (landmarks.position[rows], points))
+    away = np.linalg.norm(to, axis=1)
+    added = to / away[:, None] - beside / np.linalg.norm(beside, axis=1, keepdims=True)
+    return np.einsum("nji,nj->ni", map_T_camera[:, :3, :3], added), sigma / away

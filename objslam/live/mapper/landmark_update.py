@@ -21,8 +21,8 @@ _TRACKS = 4096  # The detector tracks whose landmark is stored. A larger number 
 class LandmarkUpdate:
     """The observations of the newest keyframe, which are in the graph already.
 
-    rays: all rays of its frame. matched: (m,) the indices of rays with a landmark. rows: (m,) the rows of their landmarks
-    in the table. tracks: all tracks with a ray of the frame.
+    rays: all rays of its frame, those of bodies turned to their centres. matched: (m,) the indices of rays with a landmark.
+    rows: (m,) the rows of their landmarks in the table. tracks: all tracks with a ray of the frame.
     """
 
     rays: FrameRays
@@ -78,6 +78,8 @@ def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
     if landmarks.last[drop] > landmarks.last[keep]:
         landmarks.last[keep], landmarks.drift[keep] = landmarks.last[drop], landmarks.drift[drop]
     landmarks.far[keep] = max(landmarks.far[keep], landmarks.far[drop])
+    if rays.to_centre[mine].any() or landmarks.shape[keep]:
+        rays.to_centre[mine], rays.centre_sigma[mine] = m.to_centres(mine)
     m.graph.add_rays(m.bearings(mine[rays.used[mine]]))
 
 

@@ -135,6 +135,7 @@ def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
     landmarks, k, rays = m.landmarks, m.keyframes, m.rays
     m.graph.refresh()
     saved = m.graph.save()
+    turned = rays.to_centre.copy(), rays.centre_sigma.copy()
     table = landmarks.copy(), rays.owner.copy(), m.pairs.together.copy(), m.pairs.apart.copy()
     _expect_around(m, now, old)
     order = m.time_order()
@@ -150,6 +151,7 @@ def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
     points = np.einsum("nij,nj->ni", carried[:, :3, :3], landmarks.position) + carried[:, :3, 3]
     m.graph.set_estimate(k.id[order], bent, landmarks.id, points)
     landmarks.position[:] = points
+    landmarks.yaw[:] += np.arctan2(carried[:, 1, 0], carried[:, 0, 0])
     mine = np.flatnonzero(np.isin(rays.owner, landmarks.id[np.concatenate([now, old])]) & rays.used)
     _merge(m, now, old, rebuild=False)
     if any(_holds(m, mine) for _ in _settled(m)):
@@ -160,6 +162,7 @@ def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
         return
     m.counters.accept("loops not closed after all")
     m.landmarks, rays.owner[:], m.pairs.together, m.pairs.apart = table
+    rays.to_centre[:], rays.centre_sigma[:] = turned
     m.graph.restore(saved)
     m.read_positions()
 

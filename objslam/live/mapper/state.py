@@ -12,14 +12,20 @@ from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
 from objslam.core.noise import range_noise
 from objslam.core.types import Keyframes
+from objslam.errors import SolveError
 from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
 from objslam.live.mapper.course import Course
-from objslam.live.mapper.landmark_table import LandmarkTable
+from objslam.live.mapper.landmark_table import LandmarkTable, to_centres
 from objslam.live.mapper.tables import KeyframeTable, RayTable
 from objslam.live.mapper.tracks import Track
 
+_AT_ONCE = 400
+"""The most keyframes of a graph that is solved at once after a correction of its measurements. A larger graph is rebuilt in
+slices, between frames. A larger number delays the next frame for longer."""
+_ITERATIONS = 8
+"""The most iterations of the solve after a correction. More iterations delay the next frame for longer."""
 _RELINEARISATIONS = 3  # The relinearisations after a large change. More let the map settle further, and take time.
 
 
@@ -172,16 +178,34 @@ class MapState:
         if np.isfinite(sigma).any():
             _, bias = range_noise(rays.range[at], self.camera_of_rays(at), self.sent_cameras, self.settings)
             sigma = np.sqrt(sigma**2 + (self.landmarks.seen[self.rows_of(rays.owner[at])] + 1) * bias**2)
-        columns = {name: getattr(rays, name)[at] for name in ("number", "keyframe", "direction", "sigma", "range")}
-        return Bearings(**columns, landmark=rays.owner[at], range_sigma=sigma)
+        direction, noise = self.to_landmarks(at)
+        columns = {name: getattr(rays, name)[at] for name in ("number", "keyframe", "range")}
+        return Bearings(**columns, direction=direction, sigma=noise, landmark=rays.owner[at], range_sigma=sigma)
+
+    def to_landmarks(self, at: Ints) -> tuple[Floats, Floats]:
+        """Return the directions (n, 3) of the rays in rows (n,) to their landmarks, in the camera frame, and their noise
+        (n,), rad."""
+        rays = self.rays
+        direction = rays.direction[at] + rays.to_centre[at]
+        return direction / np.linalg.norm(direction, axis=1, keepdims=True), np.hypot(rays.sigma[at], rays.centre_sigma[at])
+
+    def to_centres(self, at: Ints) -> tuple[Floats, Floats]:
+        """Return what to add (n, 3) to the directions of the rays in rows (n,), so that they point to the centres of bodies.
+
+        The second array (n,) is its noise, rad. The poses are those at the last refresh of the graph.
+        """
+        ids, index = np.unique(self.rays.keyframe[at], return_inverse=True)
+        rows, camera = self.rows_of(self.rays.owner[at]), self.camera_of_rays(at)
+        return to_centres(self.landmarks, rows, self.cameras, camera, self.graph.poses(ids)[index])
 
     def sight(self, at: Ints) -> Observations:
         """Return the rays in rows (n,) in map, from the camera poses at the graph's last refresh."""
         rays = self.rays
         ids, index = np.unique(rays.keyframe[at], return_inverse=True)
         poses = self.graph.poses(ids)[index]
-        ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], rays.direction[at])
-        return Observations.of_lines(poses[:, :3, 3], ahead, rays.sigma[at], rays.range[at], rays.range_sigma[at])
+        direction, sigma = self.to_landmarks(at)
+        ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], direction)
+        return Observations.of_lines(poses[:, :3, 3], ahead, sigma, rays.range[at], rays.range_sigma[at])
 
     def read_positions(self) -> None:
         """Copy the current positions of all landmarks from the graph."""
@@ -192,12 +216,29 @@ class MapState:
         self.graph.rebuild_in_slices(self.keyframes.id[self.time_order()])
         self.read_positions()
 
+    def solve_corrected(self) -> None:
+        """Solve the graph after a correction of its measurements. If it is large or the solve fails, rebuild it in slices.
+
+        Only the next full solve tests for outliers, because until then the rays of one object may look like the rays of two
+        objects.
+        """
+        self.schedule.relinearise_soon()
+        if len(self.keyframes) <= _AT_ONCE:
+            try:
+                self.graph.solve(_ITERATIONS)
+                self.read_positions()
+                return
+            except SolveError:
+                self.counters.accept("solves given up")
+        self.rebuild_in_slices()
+
     def move(self, new_T_old: Floats) -> None:
         """Move the whole map by a pose (4, 4). The caller must first remove the factors of absolute poses."""
         self.graph.move(new_T_old)
         turn, landmarks = new_T_old[:3, :3], self.landmarks
         landmarks.position[:] = landmarks.position @ turn.T + new_T_old[:3, 3]
         landmarks.information[:] = turn @ landmarks.information @ turn.T
+        landmarks.yaw[:] += np.arctan2(turn[1, 0], turn[0, 0])
         self.move_tracks(new_T_old, -np.inf)
 
     def move_tracks(self, new_T_old: Floats, since: float) -> None:

@@ -43,7 +43,7 @@ class GrowingTable:
         return self._length
 
     def add(self, **rows: ArrayLike) -> None:
-        """Append rows (n, ...), given for every column."""
+        """Append rows (n, ...). The first column must be given. A column that is not given is 0 in the new rows."""
         begin = self._length
         end = begin + len(np.asarray(rows[next(iter(self._room))]))
         for name, room in self._room.items():
@@ -51,7 +51,7 @@ class GrowingTable:
                 larger = np.zeros((max(end, 2 * len(room)), *room.shape[1:]), dtype=room.dtype)
                 larger[:begin] = room[:begin]
                 self._room[name] = room = larger
-            room[begin:end] = rows[name]
+            room[begin:end] = rows.get(name, 0)
         self._length = end
         self._show()
 
@@ -182,6 +182,8 @@ class RayTable(GrowingTable):
     """The rays of the keyframes, one for each box, with columns as in `types.Rays`.
 
     number: the id of the ray, increasing. owner: the id of its landmark, or -1. used: whether the graph has its factor.
+    direction: through the centre of the box. to_centre: added to it in the graph, so that it points to the centre of a body,
+    with the standard deviation `centre_sigma`, rad.
     """
 
     number: Ints = column(np.int64)
@@ -196,3 +198,5 @@ class RayTable(GrowingTable):
     track: Ints = column(np.int64)
     owner: Ints = column(np.int64)
     used: Bools = column(np.bool_)
+    to_centre: Floats = column(np.float64, 3)
+    centre_sigma: Floats = column(np.float64)

@@ -67,6 +67,7 @@ def add_landmark(m: MapState, at: Ints, fit: PointFit, obs: Observations, seen: 
         squared=[float((normalised_residuals(inner, fit.position) ** 2).clip(max=CLIPPED_RAY**2).sum())],
         rejected=[0],
     )
+    m.rays.to_centre[at] = m.rays.centre_sigma[at] = 0.0  # They may have belonged to a landmark with a body.
     m.graph.add_landmark(j, fit.position)
     m.graph.add_rays(m.bearings(at[fit.inlier]))
 

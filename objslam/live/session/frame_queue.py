@@ -2,14 +2,16 @@
 
 import bisect
 import time
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.snapshot import RARE_POSES, TOO_SLOW
-from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
+from objslam.live.rounds import Rounds
 from objslam.live.session.map_locator import MapLocator
 from objslam.sources.journal.records import FrameMessage, Message
 
@@ -28,13 +30,13 @@ class FrameQueue:
         settings: Settings,
         counters: Counters,
         mapper: Mapper,
-        calibrator: Calibrator,
+        rounds: Sequence[Rounds[Any, Any]],
         locator: MapLocator,
         patient: bool,
     ) -> None:
         self._limit, self._most = settings.live.max_lag, settings.live.max_frames_waiting
         self._counters, self._mapper, self._patient = counters, mapper, patient
-        self._calibrator, self._locator = calibrator, locator
+        self._rounds, self._locator = rounds, locator
         # Of each frame: the corrected stamp, s, its number in the order of arrival, the message, the time of arrival, s.
         self._waiting: list[tuple[float, int, FrameMessage, float]] = []
         self._frames = 0
@@ -71,7 +73,8 @@ class FrameQueue:
                     self._counters.updated(self.lag)
                 self._mapper.look_after(update)
                 self._locator.after_keyframe()
-                if self._calibrator.after_keyframe():
+                corrections = [each.after_keyframe() for each in self._rounds]
+                if any(corrections):
                     corrected = self._mapper.corrected_stamp
                     self._waiting = sorted((corrected(f), number, f, arrived) for _, number, f, arrived in self._waiting)
         if worked:

@@ -17,10 +17,11 @@ from objslam.core.snapshot import TOO_SLOW, Snapshot
 from objslam.core.types import Trajectory
 from objslam.errors import OutputError, one_line
 from objslam.io.threads import start_thread
+from objslam.live.bodies.centring import BodyCentring
+from objslam.live.bodies.description import BodyEstimator
 from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
-from objslam.live.session.body_estimation import BodyEstimator
 from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import FrameQueue
 from objslam.live.session.intake import Intake
@@ -28,8 +29,8 @@ from objslam.live.session.map_locator import MapLocator
 from objslam.live.session.snapshots import Describer, take_snapshot
 from objslam.mapping.localization import PriorMap
 from objslam.sources.journal.journal import Journal
-from objslam.sources.journal.reader import calibrations, messages
-from objslam.sources.journal.records import CalibrationMessage, FrameMessage, Message, NoteMessage
+from objslam.sources.journal.reader import corrections, messages
+from objslam.sources.journal.records import Correction, FrameMessage, Message, NoteMessage
 
 _MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
 _IDLE = 0.05
@@ -65,8 +66,10 @@ class Session(Intake):
         super().__init__(settings, Counters(), self._enqueue)
         self._mapper = Mapper(settings, self.counters)
         self._calibrator = Calibrator(settings, self.counters, self._mapper, self._record, name, patient)
+        self._centring = BodyCentring(settings, self.counters, self._mapper, self._record, patient)
         self._known, self._locator = known, MapLocator(known, self._mapper, self.counters)
-        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, self._calibrator, self._locator, patient)
+        rounds = (self._calibrator, self._centring)
+        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, rounds, self._locator, patient)
         self._name, self._journal_file, self._resume, self._patient = name, journal, resume, patient
         live = settings.live
         self._journal = None
@@ -161,6 +164,7 @@ class Session(Intake):
         if self._thread.is_alive():
             self._thread.join()
         self._calibrator.close()
+        self._centring.close()
         self._bodies.close()
         if self._journal is not None:
             try:
@@ -201,14 +205,14 @@ class Session(Intake):
         """Whether another message of some kind would push a frame out of the queue, or be refused."""
         return self._frames >= self._settings.live.max_frames_waiting or self._others >= _MOST_POSES
 
-    def _record(self, message: CalibrationMessage) -> bool:
-        """Write a calibration into the journal, and return whether the session may use it."""
+    def _record(self, message: Correction) -> bool:
+        """Write a correction into the journal, and return whether the session may use it."""
         with self._changed:
             try:
                 if self._journal is not None:
                     self._journal.write(message)
             except OutputError as error:
-                self.counters.drop(f"calibrations that could not be written to the journal: {error.message}")
+                self.counters.drop(f"corrections of the map that could not be written to the journal: {error.message}")
                 return False
         return True
 
@@ -223,12 +227,15 @@ class Session(Intake):
     def _replay_journal(self) -> None:
         if not self._journal_file or not self._resume:
             return
-        self._calibrator.expect(calibrations(self._journal_file))
+        calibrations, bodies = corrections(self._journal_file)
+        self._calibrator.expect(calibrations)
+        self._centring.expect(bodies)
         for message in messages(self._journal_file, self.counters.ledger):
-            if not isinstance(message, CalibrationMessage):
+            if not isinstance(message, Correction):
                 self.recall(message)
                 self._frames_waiting.take(message, time.perf_counter(), measured=False)
         self._calibrator.begin()
+        self._centring.begin()
 
     def _work(self) -> None:
         self._guard(self._serve)

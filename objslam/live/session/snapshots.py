@@ -11,10 +11,10 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.snapshot import CameraFrame, Snapshot
 from objslam.core.types import Trajectory
 from objslam.graph.maps.live_prior_map import covariance_in_map, map_T_graph
+from objslam.live.bodies.description import BodyEstimator
 from objslam.live.mapper.landmark_table import covariances
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
-from objslam.live.session.body_estimation import BodyEstimator
 from objslam.live.session.landmark_description import describe_landmark, describe_track
 
 _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
@@ -67,7 +67,8 @@ class Describer:
             self._covariances = {j: self._covariances[j] for j in resolved if j in self._covariances}
             if not whole:
                 self._bodies.update(m, self._covariances)
-            objects = [self._bodies.described(o) for o in objects]
+            turned = set(landmarks.id[landmarks.shape > 0].tolist())
+            objects = [self._bodies.described(o, o.id in turned) for o in objects]
         first = int(landmarks.id.max(initial=-1)) + 1
         waiting = [track for track in m.tracks if len(track.rays) >= m.settings.live.min_rays]
         now = {track.id: self._wait(m, track, whole, end) for track in waiting}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats
 from objslam.core.statistics import grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.mapping.bodies.fitting import with_bodies
@@ -50,9 +50,9 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     if state.errors is not None:
         keyframes, rays = without_errors(state.errors, estimate)
     shift = with_bodies(Solution(keyframes, rays, association, estimate, ()), state.cameras, state.settings).to_centre
-    held = association.object >= 0
-    if shift is None or not _any_object((np.linalg.norm(shift, axis=1) / rays.sigma)[held], association.object[held]):
+    if shift is None or not worth_turning(shift, rays.sigma, association).any():
         return estimate, None
+    held = association.object >= 0
     state = replace(state, settings=settings)
     solved = _solve(state, keyframes, rays, association, estimate, shift)
     lost = estimate.solved & ~solved.solved
@@ -102,6 +102,11 @@ def to_centres(rays: Rays, added: Floats) -> Rays:
     return replace(rays, direction=direction / np.linalg.norm(direction, axis=1, keepdims=True))
 
 
-def _any_object(deviation: Floats, object: Ints) -> bool:
-    """Return whether the median deviation (R,) of the rays of any object is worth another solve."""
-    return bool((grouped_median(deviation, object, int(object.max()) + 1) > _WORTH).any())
+def worth_turning(shift: Floats, sigma: Floats, association: Association) -> Bools:
+    """Return for which objects (N,) the bearings to the centre of the body are worth another solve (`_WORTH`).
+
+    shift: (R, 3) to add to the directions of the rays. sigma: (R,) rad, their noise.
+    """
+    held = association.object >= 0
+    deviation = (np.linalg.norm(shift, axis=1) / sigma)[held]
+    return np.asarray(grouped_median(deviation, association.object[held], association.count) > _WORTH)

@@ -10,9 +10,11 @@ from typing import Literal
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.bodies.body import SHAPES
 from objslam.core.calibration import Calibration
 from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
 from objslam.core.validity import (
+    MAX_POSITION,
     box_rules,
     camera_fault,
     covariance_fault,
@@ -34,6 +36,8 @@ _STOP_KIND = b"E"
 _LONGEST_REASON = 200  # The most letters of a reason that are shown. A larger number shows more of it.
 CALIBRATION_KIND = b"S"
 """The first byte of a calibration message."""
+BODIES_KIND = b"B"
+"""The first byte of a message about bodies."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,26 @@ class CalibrationMessage:
     calibration: Calibration
 
 
-Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage | CalibrationMessage
+@dataclass(frozen=True)
+class BodiesMessage:
+    """The bodies of n landmarks, to whose centres a session turns its bearings.
+
+    keyframe: the number of keyframes in the map before the correction. ids: (n,) of the landmarks. shape: (n,) index into
+    `SHAPES`, 0 for a landmark whose bearings stay at the centres of its boxes. half: (n, 3) m, the half axes along the yaw,
+    across it and upwards. yaw: (n,) rad in the map of the session. covariance: (n, 4, 4) of the half axes and the yaw.
+    """
+
+    keyframe: int
+    ids: Ints
+    shape: Ints
+    half: Floats
+    yaw: Floats
+    covariance: Floats
+
+
+Correction = CalibrationMessage | BodiesMessage
+"""What a session found itself, and then corrected in its map."""
+Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage | Correction
 
 
 def encode_stop(reason: str) -> bytes:
@@ -158,6 +181,9 @@ def encode(message: Message) -> bytes:
         found = message.calibration
         numbers = [array.tolist() for array in (found.values, found.covariance, found.prior)]
         return CALIBRATION_KIND + json.dumps([message.keyframe, found.names, *numbers]).encode()
+    if isinstance(message, BodiesMessage):
+        arrays = (message.ids, message.shape, message.half, message.yaw, message.covariance)
+        return BODIES_KIND + json.dumps([message.keyframe, *(array.tolist() for array in arrays)]).encode()
     if isinstance(message, CameraMessage):
         c = message.camera
         data = [c.name, c.width, c.height, c.matrix.ravel().tolist(), c.distortion_model, c.distortion.tolist()]
@@ -209,6 +235,20 @@ def _read_calibration(data: bytes) -> CalibrationMessage:
     return CalibrationMessage(_integer(keyframe), found)
 
 
+def _read_bodies(data: bytes) -> BodiesMessage:
+    keyframe, ids, shape, half, yaw, covariance = json.loads(data[1:])
+    n = len(ids)
+    shapes, sides = np.array([_integer(one) for one in shape], dtype=np.int64).reshape(n), _array(half, (n, 3))
+    spread = _array(covariance, (n, 4, 4))
+    if (shapes >= len(SHAPES)).any() or (sides[shapes > 0] <= 0).any() or (np.abs(sides) >= MAX_POSITION).any():
+        raise ValueError("a body of an unknown shape, or of an impossible size")
+    fault = covariance_fault(spread)
+    if fault is not None:
+        raise ValueError(f"the covariance of a body {fault}")
+    numbers = np.array([_integer(one) for one in ids], dtype=np.int64)
+    return BodiesMessage(_integer(keyframe), numbers, shapes, sides, _array(yaw, (n,)), spread)
+
+
 def _read_camera(data: bytes) -> CameraMessage:
     name, width, height, matrix, model, distortion, base_T_camera, scale, *more = json.loads(data[1:])
     known = next((one for one in COEFFICIENTS if one == model), None)
@@ -245,6 +285,7 @@ _READERS: dict[bytes, Callable[[bytes], Message]] = {
     _MOUNT_KIND: _read_mount,
     _NOTE_KIND: _read_note,
     CALIBRATION_KIND: _read_calibration,
+    BODIES_KIND: _read_bodies,
     _CAMERA_KIND: _read_camera,
     _FRAME_KIND: _read_frame,
 }

@@ -1,0 +1,3 @@
+"""Bodies of the landmarks of a running session. They describe the objects of a snapshot. Bearings are turned to their
+centres.
+"""

@@ -1,0 +1,126 @@
+"""Slow work on a whole map of a running session, in rounds: a process beside the session works, then its answer corrects
+the map."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from objslam.live.worker import Request, Worker, solved
+from objslam.sources.journal.records import Correction
+
+if TYPE_CHECKING:
+    from objslam.live.mapper.mapper import Mapper
+
+Answer = TypeVar("Answer")
+Told = TypeVar("Told", bound=Correction)
+
+
+class Rounds(ABC, Generic[Answer, Told]):
+    """Decides after each keyframe whether a round begins, or corrects the map.
+
+    A round begins when the number of keyframes has grown by `growth` since the last one began. So the time of all rounds is
+    proportional to the number of keyframes. The map is corrected when the number has grown by `delay` since the round began.
+    If the process is done by then, the map does not depend on the machine's speed. If it is late, a `patient` session waits
+    for it, and any other session goes on. The journal receives each correction with its keyframe, so that a resumed session
+    makes it there.
+    """
+
+    growth: float
+    delay: float
+    quick: bool
+    """Whether a round takes less time than the start of a process. Then a patient session works itself, and any other
+    session keeps the process."""
+
+    def __init__(self, mapper: Mapper, record: Callable[[Told], bool], first: int, patient: bool) -> None:
+        """Prepare for a session. record: writes a correction to the journal, and returns whether it may be made.
+
+        first: the number of keyframes at the first round, 0 for none. patient: whether the session may wait for the process.
+        """
+        self._mapper, self._record, self._patient = mapper, record, patient
+        self._next = first or math.inf
+        # The number of keyframes when a round began, and its request. Once the process has the request, it is dropped to
+        # save memory.
+        self._asked: tuple[int, Request[Answer] | None] | None = None
+        self._worker: Worker[Answer] = Worker()
+        self._known: deque[Told] = deque()
+        self._replaying = False
+
+    def expect(self, known: Iterable[Told]) -> None:
+        """Make the corrections of a journal, each at its keyframe. Start no new rounds until `begin`."""
+        self._known, self._replaying = deque(known), True
+
+    def begin(self) -> None:
+        """Continue after the journal of a resumed session. Repeat a round that had begun but not corrected the map."""
+        self._replaying = False
+        if self._asked is not None and self._asked[1] is not None and not self._here:
+            self._worker.ask(self._asked[1])
+            self._asked = self._asked[0], None
+
+    def after_keyframe(self) -> bool:
+        """Start or end a round if it is due, and return whether the map was corrected."""
+        number, changed = self._mapper.state.next_id.keyframe, False
+        while self._known and self._known[0].keyframe <= number:
+            self._correct(self._known.popleft())
+            self._asked, changed = None, True
+        if self._asked is not None and not self._replaying:
+            changed |= self._finish(number)
+        if number >= self._next:
+            self._next = math.ceil(self.growth * number)
+            if self._asked is None or self._replaying:
+                self._ask(number)
+        return changed
+
+    def close(self) -> None:
+        """End the process."""
+        self._worker.close()
+
+    @property
+    def _here(self) -> bool:
+        """Whether the session works itself."""
+        return self.quick and self._patient
+
+    def _ask(self, number: int) -> None:
+        request = self._request()
+        if request is None:
+            return
+        self._asked = number, request if self._replaying or self._here else None
+        if self._asked[1] is None:
+            self._worker.ask(request)
+
+    def _finish(self, number: int) -> bool:
+        """Correct the map by the answer of the process if it is due. Return whether the map was corrected."""
+        worker, m = self._worker, self._mapper.state
+        assert self._asked is not None
+        due = number >= self._asked[0] * (1 + self.delay) and not m.graph.is_rebuilding
+        if not due or not (self._patient or worker.done):
+            return False
+        request, self._asked = self._asked[1], None
+        answer = worker.result() if request is None else solved(request)
+        if not self.quick:
+            worker.close()  # Rounds are rare, and the process takes memory.
+        found = self._correction(number, answer)
+        if found is None or not self._record(found):
+            return False
+        self._correct(found)
+        return True
+
+    def _correct(self, correction: Told) -> None:
+        self._take_up(correction)
+        self._mapper.map_has_moved()
+
+    @abstractmethod
+    def _request(self) -> Request[Answer] | None:
+        """Return the work of a round that begins now, None if there is nothing to do."""
+
+    @abstractmethod
+    def _correction(self, number: int, answer: Answer | None) -> Told | None:
+        """Return the correction at keyframe `number` by an answer, None if the map stays. The answer is None if the process
+        failed."""
+
+    @abstractmethod
+    def _take_up(self, correction: Told) -> None:
+        """Correct the map. The new map depends only on the old map and the correction."""
