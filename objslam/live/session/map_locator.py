@@ -151,6 +151,7 @@ class MapLocator:
             m.rebuild_in_slices()
         m.schedule.relinearise_soon()
         m.graph.refresh()
+        m.read_positions()
         tracks = [track for track in m.tracks if not track.by_label]
         for track in tracks:
             track.realign(m.graph)
@@ -162,17 +163,17 @@ class MapLocator:
 def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
     """Return the resolved landmarks in these rows, and their covariances (n, 3, 3), m^2, in the graph.
 
-    The covariances are relative to the newest keyframe, because earlier drift moves all landmarks alike.
+    The covariances are relative to the newest keyframe, because earlier drift moves all landmarks alike. The state stays as
+    it is, because a search that finds nothing must not change the map.
     """
     newest = int(m.keyframes.id[m.keyframes.stamp.argmax()])
     m.graph.refresh()
-    m.read_positions()
-    turn = m.graph.pose(newest)[:3, :3]
+    turn, places = m.graph.pose(newest)[:3, :3], m.graph.points(m.landmarks.id[rows])
     described: list[tuple[MapObject, Floats]] = []
-    for row in rows.tolist():
+    for row, place in zip(rows.tolist(), places, strict=True):
         covariance = turn @ m.graph.seen_covariance(int(m.landmarks.id[row]), newest) @ turn.T
         if np.isfinite(covariance).all():
-            described.append((describe_landmark(m, row, m.landmarks.position[row], covariance), covariance))
+            described.append((describe_landmark(m, row, place, covariance), covariance))
     resolved = [(one, covariance) for one, covariance in described if one.status == "ok"]
     return ObjectMap(tuple(one for one, _ in resolved)), np.array([c for _, c in resolved]).reshape(-1, 3, 3)
 
