@@ -7,14 +7,14 @@ import pytest
 
 from objslam.association.observations import Observations
 from objslam.config import load_settings
-from objslam.core.geometry import adjoint, inverse, make_pose
+from objslam.core.geometry import adjoint, exp_se3, inverse, make_pose
 from objslam.live.counters import Counters
 from objslam.live.mapper.frame_association import FrameRays, match
 from objslam.live.mapper.landmark_table import LandmarkTable, predict_landmarks
 from objslam.live.mapper.maintenance import _one, _second_objects
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.track_promotion import prune_tracks, try_promote
-from objslam.live.mapper.tracks import Track
+from objslam.live.mapper.tracks import Track, update_positions
 
 AHEAD = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 SIGMA = 0.004
@@ -117,6 +117,23 @@ def test_a_track_becomes_a_landmark_as_soon_as_it_is_sure(width, count, born):
     if met is not None:
         off = met.position - [5.0, 0.2, 0.3]
         assert off @ np.linalg.solve(met.covariance, off) < 25
+
+
+def test_the_place_of_a_track_is_honest_where_frames_were_predicted_badly():
+    """The graph corrects a pose when its frame has a localisation, or boxes of landmarks."""
+    graph, rng, squared = Still(), np.random.default_rng(0), list[float]()
+    for _ in range(20):
+        one = Track(0, 0, False, 0.0, 0.0, np.zeros((6, 6)))
+        for k in range(0, 60, 5):
+            true, noise = graph.pose(k), rng.normal(0, SIGMA, 3)
+            local = true[:3, :3].T @ (np.array([4.0, 0.2, 0.3]) - true[:3, 3]) / 4.0 + noise
+            predicted = true @ exp_se3(np.array([0, rng.normal(0, 5 * SIGMA), 0, 0, 0, 0]))
+            one.extend((k, k, local / np.linalg.norm(local), SIGMA, np.nan, np.nan), predicted, 0.0, one.drift)
+            update_positions([one], graph)
+        off = one.position - [4.0, 0.2, 0.3]
+        squared.append(off @ np.linalg.solve(one.covariance, off))
+    assert np.mean(squared) < 5  # 3, for as many variables
+    assert max(squared) < 16.27
 
 
 def test_landmarks_are_one_where_they_are_near_and_few():

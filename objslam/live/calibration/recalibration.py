@@ -40,7 +40,7 @@ def recalibrate(m: MapState, calibration: Calibration) -> None:
     _replace_factors(m, rays_changed)
     for track, spread in zip(m.tracks, drift[len(m.landmarks) :], strict=True):
         at = np.searchsorted(m.rays.number, track.numbers())
-        track.remeasure(m.rays.direction[at], m.rays.range[at], m.rays.range_sigma[at], spread, m.graph)
+        track.remeasure(m.rays.direction[at], m.rays.range[at], m.rays.range_sigma[at], spread)
     m.landmarks.drift[:] = drift[: len(m.landmarks)]
     m.solve_corrected()
 

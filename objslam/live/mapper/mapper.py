@@ -110,7 +110,7 @@ class Mapper:
         m = self.state
         update_landmarks(m, update)
         rest = promote_tracks(m, update.tracks)
-        update_positions([track for track in rest if not track.by_label])
+        update_positions([track for track in rest if not track.by_label], m.graph)
         maintain(m)
         if not m.by_label:
             prune_tracks(m)

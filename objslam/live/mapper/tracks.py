@@ -28,7 +28,7 @@ class Track:
 
     label: the number of its label. by_label: whether its rays were grouped by label alone. first, last: stamps, s, of its
     first and last observation. drift: (6, 6) odometry drift at the last observation. position, covariance: (3,) m and (3, 3)
-    m^2 in map, from the camera poses at the time of each ray. spread: rad, the widest angle between a ray and the first ray.
+    m^2 in map, from the camera poses at its last observation. spread: rad, the widest angle between a ray and the first ray.
     tried, tried_spread: the number of rays and the spread at the last attempt to make a landmark.
     """
 
@@ -45,7 +45,6 @@ class Track:
     spread: float = 0.0
     tried_spread: float = 0.0
     _ahead: Floats | None = None
-    _lines: list[Floats] = field(default_factory=list)
 
     def numbers(self) -> Ints:
         """Return the numbers of its rays."""
@@ -58,24 +57,18 @@ class Track:
         if len(self.rays) > _LONGEST:
             half = len(self.rays) // 2
             self.rays = self.rays[:half:2] + self.rays[half:]
-        _, _, direction, sigma, range_, range_sigma = ray
+        _, _, direction, _, range_, _ = ray
         origin, n = map_T_camera[:3, 3], map_T_camera[:3, :3] @ direction
         if self._ahead is None:
             self._ahead = n
             self.position = origin + (range_ if np.isfinite(range_) else _DEPTH) * n
         self.spread = max(self.spread, math.acos(min(1.0, float(n @ self._ahead))))
-        self._lines = [*self._lines[1 - _RECENT :], np.array([*origin, *n, sigma, range_, range_sigma])]
 
     def sight(self, graph: IncrementalGraph) -> Observations:
         """Return its rays in map at the current poses of the graph."""
-        _, keyframe, direction, sigma, range_, range_sigma = zip(*self.rays, strict=True)
-        poses = np.array([graph.pose(k) for k in keyframe])
-        ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], np.array(direction))
-        return Observations.of_lines(poses[:, :3, 3], ahead, np.array(sigma), np.array(range_), np.array(range_sigma))
+        return _in_map(self.rays, graph)
 
-    def remeasure(
-        self, directions: Floats, ranges: Floats, range_sigmas: Floats, drift: Floats, graph: IncrementalGraph
-    ) -> None:
+    def remeasure(self, directions: Floats, ranges: Floats, range_sigmas: Floats, drift: Floats) -> None:
         """Replace directions (n, 3), ranges (n,) and their sigmas (n,), and drift (6, 6), after a calibration."""
         self.rays = [
             (number, k, direction, sigma, float(reach), float(range_sigma))
@@ -84,33 +77,37 @@ class Track:
             )
         ]
         self.drift = drift
-        self.realign(graph)
-
-    def realign(self, graph: IncrementalGraph) -> None:
-        """Place its rays at the current camera poses of the graph."""
-        obs = self.sight(graph)
-        lines = np.column_stack([obs.origin, obs.direction, obs.sigma, obs.range, obs.range_sigma])
-        self._lines = list(lines[-_RECENT:])
 
     def move(self, new_T_old: Floats) -> None:
-        """Move its position, covariance and rays in map by a pose (4, 4)."""
+        """Move its position and covariance in map by a pose (4, 4)."""
         turn = new_T_old[:3, :3]
         self.position = turn @ self.position + new_T_old[:3, 3]
         self.covariance = turn @ self.covariance @ turn.T
         self._ahead = None if self._ahead is None else turn @ self._ahead
-        for line in self._lines:
-            line[:3], line[3:6] = turn @ line[:3] + new_T_old[:3, 3], turn @ line[3:6]
 
 
-def update_positions(tracks: Sequence[Track]) -> None:
-    """Triangulate the newest rays of all tracks in one batch, with their previous positions as weak priors."""
+def update_positions(tracks: Sequence[Track], graph: IncrementalGraph) -> None:
+    """Triangulate the newest rays of all tracks in one batch, with their previous positions as weak priors.
+
+    The rays begin at the current camera poses of the graph. The predicted pose of a frame may be wrong by more than the
+    noise of a ray, and later measurements correct it. Rays from the predicted poses would not meet.
+    """
     if not tracks:
         return
-    number = np.array([len(t._lines) for t in tracks])
-    lines = np.concatenate([np.array(t._lines) for t in tracks])
-    obs = Observations.of_lines(lines[:, :3], lines[:, 3:6], lines[:, 6], lines[:, 7], lines[:, 8])
+    newest = [track.rays[-_RECENT:] for track in tracks]
+    number = np.array([len(rays) for rays in newest])
+    obs = _in_map([ray for rays in newest for ray in rays], graph)
     away = obs.direction[np.cumsum(number) - 1]
     damping = away[:, :, None] * away[:, None, :] / _DEPTH_SIGMA**2 + _DAMPING * np.eye(3)
     positions, covariances = refine_damped(obs, number, np.array([t.position for t in tracks]), damping, _STEPS)
     for track, position, covariance in zip(tracks, positions, covariances, strict=True):
         track.position, track.covariance = position, covariance
+
+
+def _in_map(rays: Sequence[TrackRay], graph: IncrementalGraph) -> Observations:
+    """Return rays in map at the current camera poses of the graph."""
+    _, keyframe, direction, sigma, range_, range_sigma = zip(*rays, strict=True)
+    ids, index = np.unique(keyframe, return_inverse=True)
+    poses = np.array([graph.pose(k) for k in ids.tolist()])[index]
+    ahead = np.einsum("rij,rj->ri", poses[:, :3, :3], np.array(direction))
+    return Observations.of_lines(poses[:, :3, 3], ahead, np.array(sigma), np.array(range_), np.array(range_sigma))

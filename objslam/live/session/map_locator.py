@@ -152,10 +152,7 @@ class MapLocator:
         m.schedule.relinearise_soon()
         m.graph.refresh()
         m.read_positions()
-        tracks = [track for track in m.tracks if not track.by_label]
-        for track in tracks:
-            track.realign(m.graph)
-        update_positions(tracks)
+        update_positions([track for track in m.tracks if not track.by_label], m.graph)
         self._mapper.map_has_moved()
         return True
 
