@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from objslam.core.bodies.box_centres import beside_centres, beside_centres_sigma, image_axes
+from objslam.core.bodies.box_centres import beside_centres, image_axes
 from objslam.core.camera import Camera, project, undistort
 from objslam.core.geometry import make_pose
 from objslam.core.rotation import rotation_from_vector
@@ -30,7 +30,7 @@ def points(camera, poses, centre, half, yaw, cuboid):
     """Directions (n, 3) to the centres of the boxes in the camera frame, by the functions under test."""
     to, fisheye = centre - poses[:, :3, 3], np.full(len(yaw), camera.fisheye)
     axes = image_axes(poses[:, :3, :3], to, fisheye)
-    found = to + beside_centres(axes, to, half, yaw, np.full(len(yaw), cuboid))
+    found = to + beside_centres(axes, to, half, yaw, np.full(len(yaw), cuboid), np.zeros((len(yaw), 4, 4)))[0]
     return np.einsum("nji,nj->ni", poses[:, :3, :3], found / np.linalg.norm(found, axis=1, keepdims=True))
 
 
@@ -65,8 +65,9 @@ def test_the_box_of_a_cuboid_goes_around_its_corners():
 @pytest.mark.parametrize("cuboid", [False, True])
 def test_a_body_around_the_camera_has_no_box(cuboid):
     poses, _, half, yaw = views(5)
-    near = beside_centres(poses[:, :3, :3], 0.5 * half, half, yaw, np.full(5, cuboid))
+    near, sigma = beside_centres(poses[:, :3, :3], 0.5 * half, half, yaw, np.full(5, cuboid), np.ones((5, 4, 4)))
     np.testing.assert_array_equal(near, 0.0)
+    np.testing.assert_array_equal(sigma, 0.0)
 
 
 @pytest.mark.parametrize("cuboid", [False, True])
@@ -75,12 +76,11 @@ def test_the_noise_is_that_of_sizes_and_yaw(cuboid):
     poses, centre, half, yaw = views(6)
     root = 0.003 * rng.normal(size=(6, 4, 4))
     spread, to, kind = root @ np.swapaxes(root, 1, 2), centre - poses[:, :3, 3], np.full(6, cuboid)
-    found, sigma = beside_centres_sigma(poses[:, :3, :3], to, half, yaw, kind, spread)
-    np.testing.assert_array_equal(found, beside_centres(poses[:, :3, :3], to, half, yaw, kind))
+    found, sigma = beside_centres(poses[:, :3, :3], to, half, yaw, kind, spread)
     drawn = []
     for _ in range(1500):
         off = np.einsum("nij,nj->ni", root, rng.normal(size=(6, 4)))
-        drawn.append(beside_centres(poses[:, :3, :3], to, half + off[:, :3], yaw + off[:, 3], kind))
+        drawn.append(beside_centres(poses[:, :3, :3], to, half + off[:, :3], yaw + off[:, 3], kind, spread)[0])
     away = np.array(drawn) - found
     along = to / np.linalg.norm(to, axis=1, keepdims=True)
     away -= (away * along).sum(axis=2, keepdims=True) * along

@@ -8,63 +8,68 @@ from objslam.core.arrays import Bools, Floats
 
 _CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 """The corners (8, 3) of a cuboid, in half axes."""
-_STEP = 1e-3
-"""The step of the differences, as a share of a half axis, or rad of yaw. A larger step is less exact."""
 _NEAREST = 0.1
 """The least depth of the nearest part of a body, as a share of the depth of its centre. A larger share gives fewer bodies
 that nearly touch the camera a box."""
 
 
-def beside_centres(axes: Floats, to: Floats, half: Floats, yaw: Floats, cuboid: Bools) -> Floats:
+def beside_centres(
+    axes: Floats, to: Floats, half: Floats, yaw: Floats, cuboid: Bools, covariance: Floats
+) -> tuple[Floats, Floats]:
     """Return vectors (n, 3), m in map, from the centres of bodies to points on the rays through the centres of their boxes.
 
     Let a camera with the axes x, y, z see an ellipsoid with the centre c and the matrix M of squared half axes. The left and
     the right edge of its box are planes with the normal n = x - u z that touch it: (n . c)^2 = n^T M n (Hartley and
     Zisserman 2004, section 8.3). The mean of the two solutions u is that of the point c - M z / (z . c). The box of a cuboid
-    goes around the images of its corners.
+    goes around the images of its corners. The vector is 0 for a body that reaches behind its camera.
 
+    The second array (n,) has the standard deviations, m, of these vectors along an axis of the image, to first order.
     axes: (n, 3, 3) the axes of the images in map, as columns: map_R_camera for a pinhole image. to: (n, 3) m, from the
     cameras to the centres. half: (n, 3) m, the half axes along the yaw, across it and upwards. yaw: (n,) rad. cuboid: (n,)
-    False for an ellipsoid. The vector is 0 for a body that reaches behind its camera.
+    False for an ellipsoid. covariance: (n, 4, 4) of half axes, m, and yaw, rad.
     """
-    centre = np.einsum("nji,nj->ni", axes, to)
-    cos, sin, turn = np.cos(yaw), np.sin(yaw), np.zeros((len(yaw), 3, 3))
-    turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = cos, -sin, sin, cos, 1.0
-    root = np.swapaxes(axes, 1, 2) @ turn * half[:, None, :]  # M = root root^T, in the frame of the image.
-    depth = centre[:, 2]
+    centre = (to[:, None] @ axes)[:, 0]
+    cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    body = np.stack(  # The axes of the body in the frame of the image, as columns.
+        [cos * axes[:, 0] + sin * axes[:, 1], cos * axes[:, 1] - sin * axes[:, 0], axes[:, 2]], axis=2
+    )
+    depth, root = centre[:, 2], body * half[:, None]  # M = root root^T, in the frame of the image.
     reach = np.where(cuboid, np.abs(root[:, 2]).sum(axis=1), np.sqrt((root[:, 2] ** 2).sum(axis=1)))
     ahead = depth - reach > _NEAREST * np.abs(depth)
-    safe = np.where(ahead, depth, 1.0)
-    found = -(root @ root[:, 2, :, None])[:, :, 0] / safe[:, None]
+    by_depth = (ahead / np.where(ahead, depth, 1.0))[:, None, None]
+    slope = np.empty((len(yaw), 3, 4))  # The derivatives of the vectors in the frame of the image.
+    slope[:, :, :3] = root * body[:, 2, None] * (-2 * by_depth)
+    found = (slope[:, :, :3] @ half[:, :, None])[:, :, 0] / 2
+    crossed = body[:, :, 0] * body[:, 2, 1, None] + body[:, :, 1] * body[:, 2, 0, None]
+    slope[:, :, 3] = crossed * ((half[:, 1] ** 2 - half[:, 0] ** 2)[:, None] * by_depth[:, 0])
     some = np.flatnonzero(cuboid & ahead)
     if len(some):
-        corner = centre[some, None] + _CORNERS @ np.swapaxes(root[some], 1, 2)
-        image = corner[..., :2] / corner[..., 2:]
-        middle = (image.min(axis=1) + image.max(axis=1)) / 2
-        found[some, :2] = depth[some, None] * middle - centre[some, :2]
-        found[some, 2] = 0.0
-    return np.einsum("nij,nj->ni", axes, np.where(ahead[:, None], found, 0.0))
+        found[some], slope[some] = _of_cuboids(centre[some], body[some], half[some])
+    along = (centre / np.maximum(np.sqrt((centre * centre).sum(axis=1)), 1e-12)[:, None])[:, :, None]
+    slope -= along * (along * slope).sum(axis=1, keepdims=True)
+    variance = ((slope @ covariance) * slope).sum(axis=(1, 2)) / 2
+    return (axes @ found[:, :, None])[:, :, 0], np.sqrt(np.maximum(variance, 0.0))
 
 
-def beside_centres_sigma(
-    axes: Floats, to: Floats, half: Floats, yaw: Floats, cuboid: Bools, covariance: Floats
-) -> tuple[Floats, Floats]:
-    """Return `beside_centres` (n, 3), m, and the standard deviations (n,), m, of these vectors along an axis of the image.
+def _of_cuboids(centre: Floats, body: Floats, half: Floats) -> tuple[Floats, Floats]:
+    """Return the vectors (n, 3) of `beside_centres` for cuboids, and their derivatives (n, 3, 4), in the frame of the image.
 
-    covariance: (n, 4, 4) of half axes, m, and yaw, rad.
+    centre: (n, 3) m. body: (n, 3, 3) the axes of the cuboids, as columns. half: (n, 3) m.
     """
-    n = len(yaw)
-    step = np.concatenate([_STEP * half, np.full((n, 1), _STEP)], axis=1)
-    moved = np.tile(np.concatenate([half, yaw[:, None]], axis=1), (5, 1, 1))
-    moved[range(1, 5), :, range(4)] += step.T
-    flat = moved.reshape(-1, 4)
-    views = np.tile(axes, (5, 1, 1)), np.tile(to, (5, 1))
-    found = beside_centres(*views, flat[:, :3], flat[:, 3], np.tile(cuboid, 5)).reshape(5, n, 3)
-    by = (found[1:] - found[0]) / step.T[..., None]
-    along = to / np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-12)
-    by -= (by * along).sum(axis=2, keepdims=True) * along
-    variance = np.einsum("ani,nab,bni->n", by, covariance, by) / 2
-    return found[0], np.sqrt(np.maximum(variance, 0.0))
+    corner = centre[:, None] + _CORNERS @ np.swapaxes(body * half[:, None], 1, 2)
+    image = corner[:, :, :2] / corner[:, :, 2:]
+    # The corner at each edge of the box: (n, 2, 2), left and top before right and bottom.
+    edge = np.stack([image.argmin(axis=1), image.argmax(axis=1)], axis=1)
+    at = np.take_along_axis(image, edge, axis=1)
+    depth = corner[np.arange(len(centre))[:, None, None], edge, 2]
+    found, slope = np.zeros((len(centre), 3)), np.zeros((len(centre), 3, 4))
+    found[:, :2] = centre[:, 2:] * at.mean(axis=1) - centre[:, :2]
+    by_corner = (body[:, None, :2] - at[..., None] * body[:, None, 2:]) / depth[..., None]
+    sign, turned = _CORNERS[edge], np.stack([by_corner[..., 1], -by_corner[..., 0]], axis=-1)
+    by_yaw = (sign[..., :2] * half[:, None, None, :2] * turned).sum(axis=3)
+    slope[:, :2, :3] = centre[:, 2, None, None] * (sign * by_corner).mean(axis=1)
+    slope[:, :2, 3] = centre[:, 2:] * by_yaw.mean(axis=1)
+    return found, slope
 
 
 def image_axes(map_R_camera: Floats, to: Floats, fisheye: Bools) -> Floats:

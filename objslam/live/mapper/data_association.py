@@ -5,7 +5,7 @@ import numpy as np
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.core.arrays import Floats
 from objslam.live.mapper.frame_association import FrameRays, best_of_label, match, match_by_label
-from objslam.live.mapper.landmark_table import at_box_centres, predict_landmarks, to_centres
+from objslam.live.mapper.landmark_table import at_box_centres, box_centres, predict_landmarks, to_centres
 from objslam.live.mapper.landmark_update import LandmarkUpdate
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
@@ -23,9 +23,9 @@ def associate(
     `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
-    camera = int(m.keyframes.camera[-1])
     if m.by_label and settings.method == "auto" and len(set(rays.label.tolist())) < count:
         m.tell_apart_within_labels()
+    beside, spread = _box_centres(m, rays, map_T_camera)
     numbers = m.next_id.ray + np.arange(count)
     m.next_id.ray += count
     row, owner, used = np.full(count, -1), np.full(count, -1), np.zeros(count, dtype=bool)
@@ -33,7 +33,7 @@ def associate(
     tracks: dict[int, Track] = {}  # The tracks of the frame's rays, by the index of the ray.
     if m.by_label:
         best = best_of_label(rays)
-        predicted = at_box_centres(predict_landmarks(landmarks, []), landmarks, m.cameras, camera, map_T_camera)
+        predicted = at_box_centres(predict_landmarks(landmarks, []), beside, spread)
         row[best], missed = match_by_label(rays.take(best), map_T_camera, predicted, uncertainty, settings.gate)
         lost = missed >= 0
         landmarks.rejected[missed[lost]] += 1
@@ -43,7 +43,7 @@ def associate(
     else:
         if predicted is None:
             predicted = predict_landmarks(landmarks, m.tracks)
-        predicted = at_box_centres(predicted, landmarks, m.cameras, camera, map_T_camera)
+        predicted = at_box_centres(predicted, beside, spread)
         row = match(rays, map_T_camera, predicted, uncertainty, len(m.labels), settings.gate, m.landmark_of_track, m.novelty)
         of_track = row >= predicted.landmarks
         m.novelty += _NOVELTY_WEIGHT * (float((of_track | (row < 0)).mean()) - m.novelty)
@@ -52,9 +52,13 @@ def associate(
         row[of_track] = -1
     matched = np.flatnonzero(row >= 0)
     owner[matched], used[matched] = landmarks.id[row[matched]], True
-    added, noise = np.zeros((count, 3)), np.zeros(count)
-    poses = np.broadcast_to(map_T_camera, (len(matched), 4, 4))
-    added[matched], noise[matched] = to_centres(landmarks, row[matched], m.cameras, np.full(len(matched), camera), poses)
+    added, noise, turned = np.zeros((count, 3)), np.zeros(count), rays
+    large = matched[beside[row[matched]].any(axis=1)]
+    if len(large):
+        at = row[large]
+        to = landmarks.position[at] - map_T_camera[:3, 3]
+        added[large], noise[large] = to_centres(to, beside[at], spread[at], map_T_camera[:3, :3])
+        turned = rays.turned(added, noise)
     m.rays.add(
         number=numbers, keyframe=np.full(count, k), owner=owner, used=used, to_centre=added, centre_sigma=noise, **vars(rays)
     )
@@ -73,4 +77,22 @@ def associate(
     if len(matched):
         m.graph.add_rays(m.bearings(len(m.rays.number) - count + matched))
     m.graph.update()
-    return LandmarkUpdate(rays.turned(added, noise), matched, row[matched], list(tracks.values()))
+    return LandmarkUpdate(turned, matched, row[matched], list(tracks.values()))
+
+
+def _box_centres(m: MapState, rays: FrameRays, map_T_camera: Floats) -> tuple[Floats, Floats]:
+    """Return `box_centres` (N, 3) and (N,) of all landmarks for the newest keyframe, whose camera pose is (4, 4).
+
+    A landmark that none of its rays may show has the vector 0: it has another label, or is behind the camera.
+    """
+    landmarks, number = m.landmarks, m.keyframes.camera[-1:]
+    beside, sigma = np.zeros((len(landmarks), 3)), np.zeros(len(landmarks))
+    rows = np.flatnonzero(landmarks.shape)
+    if len(rows):
+        rows = rows[np.isin(landmarks.label[rows], rays.label)]
+    if len(rows) and not m.cameras[number[0]].fisheye:
+        rows = rows[(landmarks.position[rows] - map_T_camera[:3, 3]) @ map_T_camera[:3, 2] > 0]
+    if len(rows):
+        poses = np.broadcast_to(map_T_camera, (len(rows), 4, 4))
+        beside[rows], sigma[rows] = box_centres(landmarks, rows, m.cameras, np.repeat(number, len(rows)), poses)
+    return beside, sigma

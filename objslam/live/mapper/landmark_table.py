@@ -14,7 +14,7 @@ import numpy as np
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES
-from objslam.core.bodies.box_centres import beside_centres_sigma, image_axes
+from objslam.core.bodies.box_centres import beside_centres, image_axes
 from objslam.core.camera import Camera
 from objslam.core.camera import in_view as in_image
 from objslam.core.statistics import NOISE_FACTORS, POOLED_WITH_PROMISE
@@ -118,54 +118,45 @@ def predict_landmarks(landmarks: LandmarkTable, tracks: Sequence[Track]) -> Pred
 def box_centres(
     landmarks: LandmarkTable, rows: Ints, cameras: Sequence[Camera], camera: Ints, map_T_camera: Floats
 ) -> tuple[Floats, Floats]:
-    """Return points (n, 3), m, on the rays through the centres of the boxes of landmarks, and their noise (n,), m.
+    """Return vectors (n, 3), m, from landmarks to points on the rays through the centres of their boxes, and their noise
+    (n,), m.
 
-    The noise is that of the bodies. rows: (n,) of the landmarks. camera: (n,) the number of the camera of each.
-    map_T_camera: (n, 4, 4).
+    The noise is that of the bodies. A landmark without a body has the vector 0. rows: (n,) of the landmarks. camera: (n,)
+    the number of the camera of each. map_T_camera: (n, 4, 4).
     """
-    points, sigma = landmarks.position[rows], np.zeros(len(rows))
-    some = np.flatnonzero(landmarks.shape[rows] > 0)
+    beside, sigma = np.zeros((len(rows), 3)), np.zeros(len(rows))
+    some = np.flatnonzero(landmarks.shape[rows])
     if len(some):
-        at, to = rows[some], points[some] - map_T_camera[some, :3, 3]
+        at = rows[some]
+        to = landmarks.position[at] - map_T_camera[some, :3, 3]
         fisheye = np.array([c.fisheye for c in cameras])[camera[some]]
         axes = image_axes(map_T_camera[some, :3, :3], to, fisheye)
         cuboid = landmarks.shape[at] == _CUBOID
         body = landmarks.half[at], landmarks.yaw[at], cuboid, landmarks.shape_covariance[at]
-        beside, sigma[some] = beside_centres_sigma(axes, to, *body)
-        points[some] += beside
-    return points, sigma
+        beside[some], sigma[some] = beside_centres(axes, to, *body)
+    return beside, sigma
 
 
-def at_box_centres(
-    predicted: PredictedLandmarks,
-    landmarks: LandmarkTable,
-    cameras: Sequence[Camera],
-    camera: int,
-    map_T_camera: Floats,
-) -> PredictedLandmarks:
-    """Return the candidates for the boxes of a frame, with bodies where the centres of their boxes would be.
+def at_box_centres(predicted: PredictedLandmarks, beside: Floats, sigma: Floats) -> PredictedLandmarks:
+    """Return the candidates for the boxes of a frame, with landmarks where the centres of their boxes would be.
 
-    camera: its number. map_T_camera: (4, 4).
+    beside: (N, 3) m and sigma: (N,) m, of all landmarks, as `box_centres` returns them.
     """
-    rows = np.flatnonzero(landmarks.shape > 0)
-    if not len(rows):
+    some = np.flatnonzero(beside.any(axis=1))
+    if not len(some):
         return predicted
-    poses = np.broadcast_to(map_T_camera, (len(rows), 4, 4))
     position, covariance = predicted.position.copy(), predicted.covariance.copy()
-    position[rows], sigma = box_centres(landmarks, rows, cameras, np.full(len(rows), camera), poses)
-    covariance[rows] += sigma[:, None, None] ** 2 * np.eye(3)
+    position[some] += beside[some]
+    covariance[some] += (sigma[some] ** 2)[:, None, None] * np.eye(3)
     return replace(predicted, position=position, covariance=covariance)
 
 
-def to_centres(
-    landmarks: LandmarkTable, rows: Ints, cameras: Sequence[Camera], camera: Ints, map_T_camera: Floats
-) -> tuple[Floats, Floats]:
+def to_centres(to: Floats, beside: Floats, sigma: Floats, map_R_camera: Floats) -> tuple[Floats, Floats]:
     """Return what to add (n, 3) to unit bearings through centres of boxes, so that they point to the centres of bodies.
 
-    The vectors are in the camera frame. The second array (n,) is their noise, rad. The arguments are those of `box_centres`.
+    The vectors are in the camera frame. The second array (n,) is their noise, rad. to: (n, 3) m, from the camera to each
+    landmark. beside: (n, 3) m and sigma: (n,) m, as `box_centres` returns them. map_R_camera: (n, 3, 3) or (3, 3).
     """
-    points, sigma = box_centres(landmarks, rows, cameras, camera, map_T_camera)
-    to, beside = (at - map_T_camera[:, :3, 3] for at in (landmarks.position[rows], points))
-    away = np.linalg.norm(to, axis=1)
-    added = to / away[:, None] - beside / np.linalg.norm(beside, axis=1, keepdims=True)
-    return np.einsum("nji,nj->ni", map_T_camera[:, :3, :3], added), sigma / away
+    away, shown = np.sqrt((to * to).sum(axis=1)), to + beside
+    added = to / away[:, None] - shown / np.sqrt((shown * shown).sum(axis=1))[:, None]
+    return (added[:, None] @ map_R_camera)[:, 0], sigma / away

@@ -17,7 +17,7 @@ from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
 from objslam.live.mapper.course import Course
-from objslam.live.mapper.landmark_table import LandmarkTable, to_centres
+from objslam.live.mapper.landmark_table import LandmarkTable, box_centres, to_centres
 from objslam.live.mapper.tables import KeyframeTable, RayTable
 from objslam.live.mapper.tracks import Track
 
@@ -195,8 +195,9 @@ class MapState:
         The second array (n,) is its noise, rad. The poses are those at the last refresh of the graph.
         """
         ids, index = np.unique(self.rays.keyframe[at], return_inverse=True)
-        rows, camera = self.rows_of(self.rays.owner[at]), self.camera_of_rays(at)
-        return to_centres(self.landmarks, rows, self.cameras, camera, self.graph.poses(ids)[index])
+        rows, poses = self.rows_of(self.rays.owner[at]), self.graph.poses(ids)[index]
+        beside, sigma = box_centres(self.landmarks, rows, self.cameras, self.camera_of_rays(at), poses)
+        return to_centres(self.landmarks.position[rows] - poses[:, :3, 3], beside, sigma, poses[:, :3, :3])
 
     def sight(self, at: Ints) -> Observations:
         """Return the rays in rows (n,) in map, from the camera poses at the graph's last refresh."""
