@@ -13,6 +13,10 @@ from objslam.live.mapper.tracks import Track
 
 _NOVELTY_WEIGHT = 0.02  # The weight of one frame in MapState.novelty. A larger weight adapts sooner, with more noise.
 
+_NEAR_BOX = np.cos(np.radians(20.0))
+"""The cosine of the largest angle from a box to a landmark whose body is seen there. A smaller angle saves time. Where a
+pose is so uncertain that a box farther away may match, bodies do not matter."""
+
 
 def associate(
     m: MapState, rays: FrameRays, map_T_camera: Floats, uncertainty: PoseUncertainty, predicted: PredictedLandmarks | None
@@ -83,16 +87,18 @@ def associate(
 def _box_centres(m: MapState, rays: FrameRays, map_T_camera: Floats) -> tuple[Floats, Floats]:
     """Return `box_centres` (N, 3) and (N,) of all landmarks for the newest keyframe, whose camera pose is (4, 4).
 
-    A landmark that none of its rays may show has the vector 0: it has another label, or is behind the camera.
+    A landmark that is far from the boxes of its label (`_NEAR_BOX`) has the vector 0.
     """
-    landmarks, number = m.landmarks, m.keyframes.camera[-1:]
+    landmarks = m.landmarks
     beside, sigma = np.zeros((len(landmarks), 3)), np.zeros(len(landmarks))
-    rows = np.flatnonzero(landmarks.shape)
+    rows = landmarks.shape.nonzero()[0]
     if len(rows):
-        rows = rows[np.isin(landmarks.label[rows], rays.label)]
-    if len(rows) and not m.cameras[number[0]].fisheye:
-        rows = rows[(landmarks.position[rows] - map_T_camera[:3, 3]) @ map_T_camera[:3, 2] > 0]
+        to, turn = landmarks.position[rows] - map_T_camera[:3, 3], map_T_camera[:3, :3]
+        along = (to @ turn) @ rays.direction.T
+        near = (landmarks.label[rows][:, None] == rays.label) & (along > _NEAR_BOX * np.sqrt((to * to).sum(axis=1))[:, None])
+        rows = rows[near.any(axis=1)]
     if len(rows):
+        camera = np.repeat(m.keyframes.camera[-1:], len(rows))
         poses = np.broadcast_to(map_T_camera, (len(rows), 4, 4))
-        beside[rows], sigma[rows] = box_centres(landmarks, rows, m.cameras, np.repeat(number, len(rows)), poses)
+        beside[rows], sigma[rows] = box_centres(landmarks, rows, m.cameras, camera, poses)
     return beside, sigma

@@ -142,9 +142,9 @@ def at_box_centres(predicted: PredictedLandmarks, beside: Floats, sigma: Floats)
 
     beside: (N, 3) m and sigma: (N,) m, of all landmarks, as `box_centres` returns them.
     """
-    some = np.flatnonzero(beside.any(axis=1))
-    if not len(some):
+    if not beside.any():
         return predicted
+    some = np.flatnonzero(beside.any(axis=1))
     position, covariance = predicted.position.copy(), predicted.covariance.copy()
     position[some] += beside[some]
     covariance[some] += (sigma[some] ** 2)[:, None, None] * np.eye(3)
