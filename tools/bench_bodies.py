@@ -116,6 +116,7 @@ def session_scores(log: Log, change: str) -> tuple[float, Snapshot]:
     """Return the RMSE, m, of the poses of the second lap when they were mapped, and the last snapshot of a session."""
     settings = load_settings(None, ("calibration.use=false", "output.recording=false", change))
     session = Session(settings, patient=True).start()
+    session.push_camera(log.cameras[0].camera)
     off: list[float] = []
     frames, truth = log.cameras[0].detections.frame_stamps, log.truth.trajectory
     m = session._mapper.state
