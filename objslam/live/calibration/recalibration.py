@@ -42,6 +42,7 @@ def recalibrate(m: MapState, calibration: Calibration) -> None:
         at = np.searchsorted(m.rays.number, track.numbers())
         track.remeasure(m.rays.direction[at], m.rays.range[at], m.rays.range_sigma[at], spread)
     m.landmarks.drift[:] = drift[: len(m.landmarks)]
+    m.schedule.relinearise_soon()
     m.solve_corrected()
 
 

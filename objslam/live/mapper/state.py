@@ -223,7 +223,6 @@ class MapState:
         Only the next full solve tests for outliers, because until then the rays of one object may look like the rays of two
         objects.
         """
-        self.schedule.relinearise_soon()
         if len(self.keyframes) <= _AT_ONCE:
             try:
                 self.graph.solve(_ITERATIONS)
