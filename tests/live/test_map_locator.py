@@ -164,13 +164,17 @@ def test_objects_that_the_map_lacks_get_ids_after_its_own(first, known):
         assert np.linalg.norm(end[o.id].position - o.position) < 0.2
 
 
-def test_the_frame_follows_a_late_localisation(first, known):
-    """The session was found by odometry alone. Then a localisation moves its own frame, and its place in the map stays."""
+@pytest.mark.parametrize("settings", [SETTINGS, load_settings(None, (*ALL, "calibration.use=false"))])
+def test_the_frame_follows_a_late_localisation(first, known, settings):
+    """The session was found by odometry alone. Then a localisation moves its own frame, and its place in the map stays.
+
+    Without bodies, and with bearings to their centres.
+    """
     log = another_day(first, PoseNoise(xy=0.02, yaw=0.01))
     half = log.localization.stamps > log.localization.stamps.mean()
     turned = lift_se2(np.array([-5.0, 2.0, 1.0]))
     late = Trajectory(log.localization.stamps[half], turned @ log.localization.poses[half])
-    session = drive(replace(log, localization=late), known)
+    session = drive(replace(log, localization=late), known, settings)
     snapshot = session.snapshot()
     assert snapshot.counters["moves into the frame of the prior map"] == 1
     assert snapshot.in_map.objects >= 10
