@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.bodies.body import SHAPES
 from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import undistort
 from objslam.core.statistics import NORMAL_MEDIAN
@@ -21,8 +20,7 @@ from objslam.frontend.bearings import cut_edges
 from objslam.mapping.bodies.box_views import BoxViews
 from objslam.mapping.solution import Solution
 from objslam.triangulation.bodies.edges import BoxEdges
-from objslam.triangulation.bodies.residuals import edge_gaps, residuals
-from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+from objslam.triangulation.bodies.residuals import residuals_of_shapes, touched_points
 from objslam.triangulation.bodies.shared import spread_of
 from objslam.triangulation.bodies.solve import Bodies
 
@@ -157,8 +155,7 @@ def _edges(cut: CutBoxes, keyframe: Ints, box: Ints, body: Ints, bodies: Bodies,
         bound[mine] = cut_edges(rays.box[mine], boxes.cameras[i], boxes.settings)
     views = replace(boxes, rays=rays, body=body, bound=bound)
     rough = views.edges()
-    kinds = [edge_gaps(rough, bodies.values, kind)[2] for kind in (CUBOID, ELLIPSOID)]
-    touched = np.where(_is_cuboid(rough, bodies)[:, None, None], *kinds)
+    touched = touched_points(rough, bodies.values, bodies.shape)
     return replace(views, bound=bound | _touches_outside(views, touched)).edges(touched)
 
 
@@ -173,17 +170,12 @@ def _touches_outside(views: BoxViews, touched: Floats) -> Bools:
     return before | after | (depth <= 0)
 
 
-def _is_cuboid(edges: BoxEdges, bodies: Bodies) -> Bools:
-    return bodies.shape[edges.body] == SHAPES.index("cuboid")
-
-
 def _deviations(edges: BoxEdges, bodies: Bodies) -> tuple[Floats, Floats]:
     """Return by how much boxes differ from the predicted boxes of their bodies (B, 4), and which differences (B, 4) count.
 
     The differences are in standard deviations of boxes and bodies together.
     """
-    cuboid = _is_cuboid(edges, bodies)
-    kinds = (vars(residuals(edges, bodies.values, kind)).values() for kind in (CUBOID, ELLIPSOID))
-    value, by, use = (np.where(cuboid.reshape(-1, *[1] * (a.ndim - 1)), a, b)[:, :4] for a, b in zip(*kinds, strict=True))
+    found = residuals_of_shapes(edges, bodies.values, bodies.shape)
+    value, by, use = found.value[:, :4], found.by[:, :4], found.use[:, :4]
     own = np.einsum("bri,bij,brj->br", by, bodies.covariance[edges.body], by)
     return value / np.sqrt(own + spread_of(edges, bodies.factors, bodies.share)[:, :4] ** 2), use
