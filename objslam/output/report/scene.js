@@ -112,12 +112,30 @@
       pen.globalAlpha = fill; pen.fillStyle = shade(o.colour); pen.fill();
       pen.globalAlpha = 0.8; pen.strokeStyle = shade(o.colour); pen.lineWidth = width; pen.stroke(); pen.globalAlpha = 1;
     };
-    // A cuboid by its twelve edges, another body by its outline.
-    const drawBody = (o, p) => {
-      if (!o.cuboid) return outline(o, o.body, p, 0, 2);
+    // A cuboid by its twelve edges.
+    const traceCuboid = o => {
       const corner = bits => project(...o.at.map((x, i) => o.body.reduce((sum, a, k) => sum + (bits >> k & 1 ? a[i] : -a[i]), x)));
-      pen.beginPath(); pen.strokeStyle = shade(o.colour); pen.lineWidth = 2;
       for (let bits = 0; bits < 8; bits++) for (const bit of [1, 2, 4]) if (!(bits & bit)) segment(corner(bits), corner(bits | bit));
+    };
+    // An upright cylinder by its two rims, and the two lines where planes through the view point touch its side.
+    const traceCylinder = o => {
+      const [along, across, up] = o.body, parts = 48;
+      const rim = (turn, end) => project(...o.at.map((x, i) => x + Math.cos(turn) * along[i] + Math.sin(turn) * across[i] + end * up[i]));
+      for (const end of [-1, 1]) for (let k = 0; k < parts; k++) segment(rim(2 * Math.PI * k / parts, end), rim(2 * Math.PI * (k + 1) / parts, end));
+      // The view point in units of the half axes, in which the section is the unit circle.
+      const [x, y] = [along, across].map(a => a.reduce((sum, part, i) => sum + part * (frame.eye[i] - o.at[i]), 0) / a.reduce((sum, part) => sum + part * part, 0));
+      const away = Math.hypot(x, y);
+      if (!(away > 1)) return;
+      for (const side of [-1, 1]) {
+        const turn = Math.atan2(y, x) + side * Math.acos(1 / away);
+        segment(rim(turn, -1), rim(turn, 1));
+      }
+    };
+    // Cuboids and cylinders by their edges, an ellipsoid by its outline.
+    const drawBody = (o, p) => {
+      if (o.shape === "ellipsoid") return outline(o, o.body, p, 0, 2);
+      pen.beginPath(); pen.strokeStyle = shade(o.colour); pen.lineWidth = 2;
+      if (o.shape === "cuboid") traceCuboid(o); else traceCylinder(o);
       pen.stroke();
     };
     const drawObjects = () => {
