@@ -39,7 +39,7 @@ _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
 exceeds its width by more than the second number times the standard deviation of their difference. Three sigmas of 15 degrees
 reach the direction in which a square has its sides in place of its corners. Without the second number, a bottle of TUM
 fr3_office was a square. A larger first and a smaller second number draw more round things as turned squares."""
-_OUTLINE_POINTS = 96  # A round body is drawn with this many points, which labels avoid. With fewer, labels get between them.
+_OUTLINE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _MOST, _FENCE = 0.9, (2.0, 0.15, 1.0)
 """A picture shows an object if its distance from the path is at most the largest of three distances: a multiple of the
 distance within which the first share of the objects lies, a share of the diagonal of the path's bounding box, and a length,
