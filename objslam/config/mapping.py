@@ -141,7 +141,7 @@ class Triangulation(Section):
 
 
 class Bodies(Section):
-    """Configure the bodies of objects: upright ellipsoids that fit the edges of their boxes."""
+    """Configure the bodies of objects: upright ellipsoids, cuboids and cylinders that fit the edges of their boxes."""
 
     use: bool = True
     """Give each object a body if its boxes show one. Its position is then the centre of the body. Otherwise, the position

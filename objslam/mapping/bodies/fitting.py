@@ -1,4 +1,4 @@
-"""Give the objects of a solution bodies: upright spheres, ellipsoids and cuboids that fit the edges of their boxes."""
+"""Give the objects of a solution bodies: upright shapes that fit the edges of their boxes."""
 
 from __future__ import annotations
 

@@ -13,10 +13,10 @@ from objslam.io.rays_parquet import RaysTable
 from objslam.output.plot.style import (
     REJECTED_BELOW,
     captions,
+    drawn_shape,
     ellipsoid,
     evenly,
     frame_objects,
-    has_corners,
     label_colours,
     sample,
 )
@@ -59,7 +59,7 @@ def scene_data(
                 "at": positions[i].round(3).tolist(),
                 "axes": _half_axes(objects, i, turn),
                 "body": _body(objects, i, turn),
-                "cuboid": (body := objects[i].body) is not None and has_corners(body),
+                "shape": "point" if (body := objects[i].body) is None else drawn_shape(body),
             }
             for i in shown
         ],

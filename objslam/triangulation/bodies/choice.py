@@ -1,4 +1,4 @@
-"""The choice between a point, a sphere, an ellipsoid and a cuboid by their evidence (Laplace's method; MacKay 1992).
+"""The choice between a point, a sphere, an ellipsoid, a cuboid and a cylinder by their evidence (Laplace; MacKay 1992).
 
 A point explains the place of a box, but not its size, so each size is equally probable. A body explains both. But it has
 more parameters, and the wider their priors are, the lower is its evidence (Occam's factor).
