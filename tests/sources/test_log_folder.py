@@ -55,7 +55,8 @@ def log(tmp_path):
     for image in images:
         image.write_bytes(image.name.encode())
     cup = TruthObject(3, "cup", np.array([0.1, 0.2, 1 / 3]))
-    desk = TruthObject(4, "desk", np.array([1.0, 2, 1 / 3]), np.array([1.2, 0.6, 2 / 3]), 0.3, np.array([0.0, 0.0, 0.6, 0.8]))
+    size, turn = np.array([1.2, 0.6, 2 / 3]), np.array([0.0, 0.0, 0.6, 0.8])
+    desk = TruthObject(4, "desk", np.array([1.0, 2, 1 / 3]), size, 0.3, turn)
     truth = Truth((cup, desk), _trajectory(3))
     return Log("made", (_camera_log("front", images),), _trajectory(1), _trajectory(2), truth)
 
