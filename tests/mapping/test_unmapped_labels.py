@@ -114,6 +114,7 @@ def test_a_thing_with_cut_off_boxes_only_is_named_with_its_place_beside_others_o
     assert result.summary["doubts"]["boxes"] == 1
     assert [repr(truth.label) in reason for reason in result.summary["assessment"]["reasons"]] == [False, True]
     assert result.summary["assessment"]["level"] == "good"
+    assert result.summary["cut_off"] == {truth.label: sum(result.summary["dropped"].values())}
 
 
 def test_a_label_with_cut_off_boxes_only_has_a_place_too() -> None:
