@@ -22,6 +22,7 @@ _TITLES: dict[DoubtKind, str] = {
     "pair": "objects that may be one",
     "split": "objects that may be two",
     "unresolved": "objects without a position",
+    "unsure": "objects with a wide sigma",
     "boxes": "boxes that became no object",
     "label": "labels without an object",
 }
