@@ -208,7 +208,7 @@ def advice_on_tags(objects: Sequence[MapObject], given: Tags) -> str:
 
 
 def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
-    """Return a table of objects, without empty columns.
+    """Return a table of objects by label and id, without empty columns.
 
     The `_SPARE` columns that the screen has no room for are left out, so that no number is cut.
     """
@@ -223,7 +223,7 @@ def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
         for name in names:
             words = name in ("label", "status")
             table.add_column(name, justify="left" if words else "right", overflow="fold")
-        for o in objects:
+        for o in sorted(objects, key=lambda o: (o.label, o.id)):
             table.add_row(*(_COLUMNS[name](o) for name in names), style="dim" if o.status != "ok" else "")
         if Measurement.get(screen, screen.options.update(max_width=_WIDE), table).maximum <= screen.width:
             break

@@ -55,6 +55,15 @@ def test_a_table_of_80_columns_leaves_out_parallax_and_not_sigma():
     assert "0.500" in shown(80)
 
 
+def test_a_table_is_in_the_order_of_labels_and_ids():
+    """The map of a live session has its objects in the order in which they were found."""
+    names = [(7, "plant"), (2, "cup"), (9, "book"), (1, "plant"), (10, "cup")]
+    screen = Console(file=io.StringIO(), width=120)
+    screen.print(objects_table([thing(number, label, (0.0, 0.0, 0.0)) for number, label in names], screen))
+    rows = re.findall(r"│ +(\d+) │ (\w+)", screen.file.getvalue())
+    assert rows == [("9", "book"), ("2", "cup"), ("10", "cup"), ("1", "plant"), ("7", "plant")]
+
+
 def test_a_table_has_no_empty_column():
     assert "size m" not in shown(200)
     assert "sigma m" in shown(200)

@@ -120,7 +120,8 @@ def live(
         session.start()
         if resume:
             taken = session.counters.accepted()
-            say(f"continued {out / NAME}: {', '.join(f'{kind} {n}' for kind, n in taken.items())}", stderr=True)
+            held = ", ".join(f"{kind} {n}" for kind, n in taken.items()) or "none"
+            say(f"continued the session in {out / NAME}. Messages taken before: {held}", stderr=True)
         latest = LatestObjects(out)
         broken = drive(session, feed, latest, interval, quiet)
         result = finish(session, feed, out, latest, truth, broken, quiet)
