@@ -21,4 +21,9 @@ def main(folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    if len(sys.argv) != 2:
+        raise SystemExit(__doc__)
+    try:
+        main(*sys.argv[1:])
+    except objslam.ObjslamError as error:  # One line: what, where, what to do.
+        raise SystemExit(str(error)) from None

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from objslam.api.camera import Camera
     from objslam.api.inputs import Detections, Log, Trajectory
     from objslam.api.mapping import read, run
     from objslam.api.result import Result
     from objslam.api.session import Session
     from objslam.api.sites import diff, merge, register
     from objslam.config import Settings
-    from objslam.core.camera import Camera
     from objslam.core.object_map import MapObject
     from objslam.errors import ObjslamError
     from objslam.results.object_map import ObjectMap
@@ -44,7 +44,7 @@ _HOMES = {
     **dict.fromkeys(("read", "run"), "objslam.api.mapping"),
     **dict.fromkeys(("diff", "merge", "register"), "objslam.api.sites"),
     **{"Result": "objslam.api.result", "Session": "objslam.api.session", "Settings": "objslam.config"},
-    **{"Camera": "objslam.core.camera", "MapObject": "objslam.core.object_map"},
+    **{"Camera": "objslam.api.camera", "MapObject": "objslam.core.object_map"},
     **{"ObjslamError": "objslam.errors", "ObjectMap": "objslam.results.object_map"},
 }
 """The module of each name that is imported at its first use, so that the command line starts fast."""

@@ -3,12 +3,14 @@
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
 
 import pytest
 from commands import Call
 from hypothesis import HealthCheck, settings
 
+from objslam.cli import console
 from objslam.detection import onnx_model
 
 settings.register_profile(
@@ -32,6 +34,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def few_gigabytes() -> None:
     """Damaged models may fill the pool of memory that all models of a process share, and it is made once."""
     onnx_model._MOST_MEMORY = 1 << 30
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_progress() -> None:
+    """How long a command takes, and so what it says while it works, is no part of a test. Tests of it set another time."""
+    console._EVERY = threading.TIMEOUT_MAX
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -210,7 +210,7 @@ def report(seed: int, true: Floats, points: Floats, bodies: Bodies, distance: Fl
     sides = np.abs(bodies.axes[:, 3:6] / half_axes(true) - 1)
     yaw = np.degrees(np.abs((bodies.axes[:, 6] - heading(true) + np.pi / 2) % np.pi - np.pi / 2))
     off = bodies.values[:, :3] - true[:, :3]
-    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(bodies.covariance[:, :3, :3]), off)
+    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(bodies.centre_covariance), off)
     print(f"  half axes off by {100 * np.median(sides):.1f} % (median), yaw by {np.median(yaw):.1f} deg (median)")
     print(f"  centres inside the 95 % ellipsoid: {100 * (squared <= CHI2_95).mean():.1f} %")
 

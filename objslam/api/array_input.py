@@ -1,30 +1,13 @@
 """Conversion of a user's arrays to the arrays of the data types. A wrong value raises a ValueError that names the row."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2, pose_from_quaternion
-from objslam.core.validity import camera_fault, rigid_poses, valid_pose_rows, valid_stamps
-
-
-def as_camera(camera: Camera) -> Camera:
-    """Return a camera whose matrix, distortion and base_T_camera are arrays. ValueError names what is wrong with it."""
-    given: dict[str, Any] = {
-        name: np.asarray(getattr(camera, name), dtype=np.float64) for name in ("matrix", "distortion", "base_T_camera")
-    }
-    for name, shape in (("matrix", (3, 3)), ("base_T_camera", (4, 4))):
-        if given[name].shape != shape:
-            raise ValueError(f"camera {camera.name!r}: {name} is {shape}, got the shape {given[name].shape}")
-    found = replace(camera, **given)
-    if (fault := camera_fault(found)) is not None:
-        raise ValueError(f"camera {camera.name!r} {fault}")
-    return found
+from objslam.core.validity import rigid_poses, valid_pose_rows, valid_stamps
 
 
 def as_poses(values: ArrayLike) -> Floats:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from objslam.api.array_input import as_boxes, as_camera, as_poses, as_stamps, per_box
+from objslam.api.array_input import as_boxes, as_poses, as_stamps, per_box
+from objslam.api.camera import as_camera
 from objslam.core import types
 from objslam.core.appearance.features import MAX_FEATURES, unit_vectors
 from objslam.core.arrays import Floats32

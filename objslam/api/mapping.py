@@ -56,7 +56,7 @@ def run(
     *,
     detector: str | PathLike[str] | None = None,
     embed: str | PathLike[str] | None = None,
-    map: ObjectMap | str | PathLike[str] | None = None,
+    map: Result | ObjectMap | str | PathLike[str] | None = None,
     progress: Progress = lambda stage, done, total: None,
     **changes: Any,
 ) -> Result:
@@ -68,8 +68,9 @@ def run(
             name of ready settings such as "odometry".
         detector: an ONNX model that finds the boxes in the log's images. They replace the boxes of the log.
         embed: an ONNX image encoder that makes an appearance vector of each box, from the log's images.
-        map: the map of another day, or its file or result folder. If the drive is found in this map, the result is in the
-            frame of the map, and the objects of the map count as priors. `Result.localised` says whether it was found.
+        map: the map of another day, as a `Result`, an `ObjectMap`, or its file or result folder. If the drive is found in
+            this map, the result is in the frame of the map, and the objects of the map count as priors. `Result.localised`
+            says whether it was found.
         progress: is called with the stage's name, the work done, and the total work, 0 if the total is unknown.
         changes: more changes, which override `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
     Raises:
@@ -89,10 +90,13 @@ def run(
     return Result.of(mapped, log, detected=model is not None or encoder is not None)
 
 
-def prior_map(given: ObjectMap | str | PathLike[str]) -> PriorMap:
-    """Return the map of another day, from an `ObjectMap`, a file or a result folder. OutputError if it cannot be read."""
+def prior_map(given: Result | ObjectMap | str | PathLike[str]) -> PriorMap:
+    """Return the map of another day, from a `Result`, an `ObjectMap`, a file or a result folder. OutputError if it cannot be
+    read."""
     from objslam.mapping.localization import PriorMap
 
+    if isinstance(given, Result):
+        return PriorMap("the given result", given.objects, given.summary.get("up", "z"))
     if isinstance(given, object_map.ObjectMap):
         return PriorMap("the given map", given)
     return PriorMap(str(given), ObjectMap.load(given), load_up(Path(given)))

@@ -37,8 +37,8 @@ class Session(LiveSession):
     that a killed program loses nothing. resume: whether to continue an existing journal. name: the name of the log in the
     result. patient: for data that do not come from a running robot. A push then waits while the session has too much to do,
     and the session waits for calibrations, so that nothing is dropped for lack of time. Push in the order of the stamps.
-    map: the map of another day, or its file or result folder. Once the session is found in this map, `snapshot().in_map`
-    says so, and snapshots and result are in the frame of the map.
+    map: the map of another day, as a `Result`, an `ObjectMap`, or its file or result folder. Once the session is found in
+    this map, `snapshot().in_map` says so, and snapshots and result are in the frame of the map.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Session(LiveSession):
         resume: bool = False,
         name: str = "live",
         patient: bool = False,
-        map: ObjectMap | str | PathLike[str] | None = None,
+        map: Result | ObjectMap | str | PathLike[str] | None = None,
         **changes: Any,
     ) -> None:
         chosen = settings_of(settings, {**changes, "mode": "joint"})

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from objslam.cli.console import console, progress_bar, report, say
+from objslam.cli.console import SpeakingLedger, console, progress_bar, report, say
 from objslam.cli.options import Config, Set, settings_of, with_options
 from objslam.sources import SourceOptions
 
@@ -39,7 +39,6 @@ def calibrate(
     """
     from objslam.cli.run import calibration_table
     from objslam.core.calibration import combine
-    from objslam.core.diagnostics import Ledger
     from objslam.errors import ConfigError, LogError, ObjslamError
     from objslam.io.atomic_files import write_file
     from objslam.io.calibration_yaml import dump_calibration, load_calibration
@@ -53,9 +52,9 @@ def calibrate(
     found: list[Calibration] = []
     failed: list[ObjslamError] = []
     for number, log in enumerate(logs, start=1):
-        ledger = Ledger()
+        ledger = SpeakingLedger()
         try:
-            with progress_bar() as show:
+            with progress_bar(ledger) as show:
                 found.append(_calibrate(log, options, settings, ledger, _of_several(show, number, len(logs))))
         except ObjslamError as error:
             if len(logs) == 1:

@@ -1,38 +1,79 @@
-"""Terminal output of the commands: lines, warnings, tables and a progress bar."""
+"""Terminal output of the commands: lines, warnings, tables and progress."""
 
 from __future__ import annotations
 
 import functools
 import os
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
+from objslam.core.diagnostics import Ledger
 from objslam.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from objslam.core.diagnostics import Ledger
 
 _NEIGHBOURS = 3  # The most names of other files in a warning. A larger number makes the line longer.
+Show = Callable[[str, int, int], None]
+"""A function of the stage's name, the number of finished items, and the total number of items, 0 if unknown."""
+
+_EVERY = 10.0
+"""The time (s) between two looks at a command that works, and before the first. Each look prints new warnings and, if stderr
+is not a terminal, a line of progress. A larger value prints fewer lines. It is the interval of the status line of
+`objslam live`. A command of a few seconds prints no progress, and one that fails at once prints one line."""
+
+
+@dataclass
+class SpeakingLedger(Ledger):
+    """A ledger that can print its warnings while a command works. So a user need not wait for the end of a run to hear that
+    the input is wrong. told: how many of the warnings are printed already."""
+
+    told: int = 0
+
+    def speak(self) -> None:
+        """Print the warnings that are not printed yet."""
+        new = self.warnings[self.told :]
+        self.told += len(new)
+        _say_warnings(new)
+
+
+def report(ledger: Ledger) -> None:
+    """Print each drop and warning of a ledger as one line on stderr, without the warnings that are printed already."""
+    lines = ledger.lines()
+    told = ledger.told if isinstance(ledger, SpeakingLedger) else 0
+    drops = len(lines) - len(ledger.warnings)
+    _say_warnings(lines[:drops] + lines[drops + told :])
+
+
+def _say_warnings(lines: list[str]) -> None:
+    for line in lines:
+        say(f"warning: {line}", stderr=True)
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Show a progress bar if stderr is a terminal. Yield a function that updates the bar.
+def progress_bar(ledger: SpeakingLedger | None = None, *, quiet: bool = False) -> Iterator[Show]:
+    """Show the progress on stderr: as a bar on a terminal, else as a plain line now and then. Print warnings meanwhile.
 
-    It takes the stage name, the number of finished items, and the total number of items, 0 if unknown. The bar shows the
-    time since the stage began, and how many items it finishes in a second.
+    Yield a function that updates it. It takes the stage name, the number of finished items, and the total number of items, 0
+    if unknown. The bar shows the time since the stage began, and how many items it finishes in a second. quiet: whether to
+    print no lines of progress. ledger: its new warnings are printed every `_EVERY` seconds, also with `quiet`.
     """
-    screen = console(stderr=True)
-    if not screen.is_terminal:
-        yield lambda stage, done, total: None
-        return
+    with _bar() if console(stderr=True).is_terminal else _lines(quiet) as (show, tell), _now_and_then(ledger, tell):
+        yield show
+
+
+@contextmanager
+def _bar() -> Iterator[tuple[Show, Callable[[], None]]]:
+    """Yield a function that updates a bar, and one that does nothing, because a bar tells the time itself."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -52,7 +93,7 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
             return Text(f"{task.speed:.1f}/s" if task.speed else "")
 
     columns = (SpinnerColumn(), words, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), Rate())
-    with Progress(*columns, console=screen, transient=True) as bar:
+    with Progress(*columns, console=console(stderr=True), transient=True) as bar:
         shown = "reading"
         task = bar.add_task(shown, total=None)
 
@@ -63,13 +104,47 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
                 shown, task = stage, bar.add_task(printable(stage), total=total or None)
             bar.update(task, completed=done, total=total or None)
 
-        yield show
+        yield show, lambda: None
 
 
-def report(ledger: Ledger) -> None:
-    """Print each drop and warning of a ledger as one line on stderr."""
-    for line in ledger.lines():
-        say(f"warning: {line}", stderr=True)
+@contextmanager
+def _lines(quiet: bool) -> Iterator[tuple[Show, Callable[[], None]]]:
+    """Yield a function that takes the newest stage, and one that prints it unless `quiet`."""
+    begin, newest = time.monotonic(), ("reading", 0, 0)
+
+    def show(stage: str, done: int, total: int) -> None:
+        nonlocal newest
+        newest = stage, done, total
+
+    def tell() -> None:
+        stage, done, total = newest
+        count = f" {done} of {total}" if total else ""
+        say(f"working for {time.monotonic() - begin:.0f} s: {stage}{count}", stderr=True)
+
+    yield show, (lambda: None) if quiet else tell
+
+
+@contextmanager
+def _now_and_then(ledger: SpeakingLedger | None, tell: Callable[[], None]) -> Iterator[None]:
+    """Print the new warnings and call `tell` every `_EVERY` seconds.
+
+    A thread does so, because a stage may last for minutes without a call of the function that shows it.
+    """
+
+    def work() -> None:
+        while not ended.wait(_EVERY):
+            if ledger is not None:
+                ledger.speak()
+            tell()
+
+    ended = threading.Event()
+    thread = threading.Thread(target=work, name="objslam progress", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def warn_of_neighbours(out: Path) -> None:

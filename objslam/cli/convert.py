@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from objslam.cli.console import report, say
+from objslam.cli.console import progress_bar, report, say
 from objslam.cli.options import with_options
 from objslam.sources import SourceOptions
 
@@ -25,6 +25,8 @@ def convert(
     from objslam.sources import convert
 
     ledger = Ledger()
-    convert(source, log, ledger, options, overwrite=overwrite)
+    with progress_bar() as show:
+        show("converting", 0, 0)
+        convert(source, log, ledger, options, overwrite=overwrite)
     report(ledger)
     say(f"wrote {log}")

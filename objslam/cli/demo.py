@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import objslam
-from objslam.cli.console import progress_bar, put, say
+from objslam.cli.console import SpeakingLedger, progress_bar, put, say
 from objslam.cli.evaluate import print_evaluation
 from objslam.cli.options import settings_of
 from objslam.cli.run import run_log
@@ -26,7 +26,6 @@ def demo(
 
     The drive is rendered as RGB-D images of a room with seven objects, which the detector shipped with objslam knows.
     """
-    from objslam.core.diagnostics import Ledger
     from objslam.errors import OutputError
     from objslam.output.result_folder import prepare_output
     from objslam.simulation import preset, simulate
@@ -52,7 +51,7 @@ def demo(
             render_drive(RenderSettings(), seed, log, overwrite=True, progress=partial(show, "rendering"))
     say(f"wrote the simulated drive: {log}")
     for mode, poses in (("fixed", "localization"), ("joint", "odometry")):
-        ledger = Ledger()
+        ledger = SpeakingLedger()
         # The default of 3 px is too large: the median error of the box centres of the shipped detector is 0.9 px.
         changes = [f"poses.use={poses}", *(["rays.pixel_sigma=1.5"] if model else [])]
         settings = settings_of(mode, None, changes)

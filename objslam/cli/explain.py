@@ -12,7 +12,7 @@ from objslam.cli.console import console, put, say
 from objslam.cli.options import Json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from rich.table import Table
 
@@ -22,6 +22,7 @@ _TITLES: dict[DoubtKind, str] = {
     "pair": "objects that may be one",
     "split": "objects that may be two",
     "unresolved": "objects without a position",
+    "unsure": "objects with a wide sigma",
     "boxes": "boxes that became no object",
     "label": "labels without an object",
 }
@@ -40,7 +41,9 @@ def explain(
     doubts = load_doubts(out)
     if doubts is None:
         raise OutputError(f"this result has no {DOUBTS}", where=str(out), hint="an older version wrote it: run it again")
-    if label is not None and label not in (known := _labels(out, doubts)):
+    summary = load_summary(out)
+    cut: dict[str, int] = summary.get("cut_off", {})
+    if label is not None and label not in (known := _labels(out, doubts, cut)):
         there = f"there are {', '.join(known)}" if known else "there are none"
         raise ConfigError(f"no object, box or doubt has the label {label}", where=str(out), hint=there)
     chosen = [one for one in doubts if label is None or one.label == label]
@@ -52,17 +55,24 @@ def explain(
     for kind, title in _TITLES.items():
         if mine := [one for one in chosen if one.kind == kind]:
             console().print(doubts_table(mine, title))
-    if label is None and (left := load_summary(out).get("counts", {}).get("rays_unexplained")):
+    if label in cut:
+        say(
+            f"the image's edge cuts off {cut[label]} boxes of {label}, so they give no rays (rays.border, rays.border_share)"
+        )
+    if label is None and (left := summary.get("counts", {}).get("rays_unexplained")):
         grouped = sum(len(one.rays) for one in chosen if one.kind == "boxes")
         say(f"{left} boxes became no object: {grouped} in these groups, and {left - grouped} scattered")
 
 
-def _labels(out: Path, doubts: Sequence[Doubt]) -> list[str]:
-    """Return the labels of the result's objects, boxes and doubts, in the order of the alphabet."""
+def _labels(out: Path, doubts: Sequence[Doubt], cut: Iterable[str]) -> list[str]:
+    """Return the labels of the result's objects, boxes and doubts, in the order of the alphabet.
+
+    cut: the labels of the boxes that are cut off.
+    """
     from objslam.results.read import load_map, load_rays
 
     boxes = load_rays(out).label.tolist()
-    return sorted({*(o.label for o in load_map(out)), *boxes, *(one.label for one in doubts)})
+    return sorted({*(o.label for o in load_map(out)), *boxes, *cut, *(one.label for one in doubts)})
 
 
 def doubts_table(doubts: Sequence[Doubt], title: str) -> Table:

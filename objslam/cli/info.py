@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from objslam.cli.console import put, report, say, width
+from objslam.cli.console import progress_bar, put, report, say, width
 from objslam.cli.options import Json, with_options
 from objslam.sources import Source, SourceOptions, choose, read
 
@@ -42,13 +42,15 @@ def info(
 
     kind = choose(source, options.format)
     if kind.name == "ros":
-        bag = describe(source, options)
-        whole = options.begin is None and options.end is None
-        part = None if whole else contents(read(source, Ledger(), options))
+        with progress_bar():
+            bag = describe(source, options)
+            whole = options.begin is None and options.end is None
+            part = None if whole else contents(read(source, Ledger(), options))
         put(dump_json(asdict(bag) | ({} if part is None else {"part": asdict(part)}))) if json else _show_bag(bag, part)
         return
     ledger = Ledger()
-    log = read(source, ledger, options)
+    with progress_bar():
+        log = read(source, ledger, options)
     for finding in (check_stamps(log), *check_boxes(log, ledger)):
         if finding is not None:
             ledger.warn(finding.message)

@@ -25,7 +25,7 @@ def report_result(
     from objslam.output.report import write_report
     from objslam.results.files import dump_json
 
-    with progress_bar() as show:
+    with progress_bar(quiet=quiet) as show:
         file = write_report(out, log=log, crops=crops, progress=show)
     if json and not quiet:
         put(dump_json({"wrote": str(file)}))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from objslam.cli.console import console, progress_bar, put, report, say, warn_of_neighbours
+from objslam.cli.console import SpeakingLedger, console, progress_bar, put, report, say, warn_of_neighbours
 from objslam.cli.options import (
     CalibrationFile,
     Config,
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from objslam.config import Settings
     from objslam.config.tags import Tags
-    from objslam.core.diagnostics import Ledger
     from objslam.core.object_map import MapObject
     from objslam.core.result import RunResult
     from objslam.core.types import Log
@@ -92,16 +91,17 @@ def run(
     With --map, the exit code is 3 if the drive is not found in that map.
     """
     from objslam.api.mapping import prior_map
-    from objslam.core.diagnostics import Ledger
     from objslam.output.result_folder import output_folder
 
     settings = settings_of(mode, config, set_, calibration, options.class_names)
-    ledger = Ledger()
+    ledger = SpeakingLedger()
     with output_folder(out):
         warn_of_neighbours(out)
         tell = _say_nothing if quiet else _say_json if json else say_result
         known = None if map_ is None else prior_map(map_)
-        result = run_log(read(log, ledger, options), settings, ledger, out, detector, tell, known, embed)
+        with progress_bar(ledger, quiet=quiet):
+            given = read(log, ledger, options)
+        result = run_log(given, settings, ledger, out, detector, tell, known, embed)
     if known is not None and not result.summary["localisation"]["localised"]:
         raise typer.Exit(NOT_LOCALISED)
 
@@ -109,7 +109,7 @@ def run(
 def run_log(
     log: Log,
     settings: Settings,
-    ledger: Ledger,
+    ledger: SpeakingLedger,
     out: Path,
     detector: Path | None = None,
     tell: Callable[[RunResult, str, Path, tuple[str, ...]], None] | None = None,
@@ -126,7 +126,7 @@ def run_log(
     from objslam.api.mapping import map_log
     from objslam.output.result_folder import write_result
 
-    with progress_bar() as show:
+    with progress_bar(ledger, quiet=tell is _say_nothing) as show:
         result, log = map_log(log, settings, ledger, detector, show, known, embed)
         show("writing", 0, 0)
         begin = time.perf_counter()
@@ -208,7 +208,7 @@ def advice_on_tags(objects: Sequence[MapObject], given: Tags) -> str:
 
 
 def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
-    """Return a table of objects, without empty columns.
+    """Return a table of objects by label and id, without empty columns.
 
     The `_SPARE` columns that the screen has no room for are left out, so that no number is cut.
     """
@@ -223,7 +223,7 @@ def objects_table(objects: Sequence[MapObject], screen: Console) -> Table:
         for name in names:
             words = name in ("label", "status")
             table.add_column(name, justify="left" if words else "right", overflow="fold")
-        for o in objects:
+        for o in sorted(objects, key=lambda o: (o.label, o.id)):
             table.add_row(*(_COLUMNS[name](o) for name in names), style="dim" if o.status != "ok" else "")
         if Measurement.get(screen, screen.options.update(max_width=_WIDE), table).maximum <= screen.width:
             break

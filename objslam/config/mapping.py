@@ -137,11 +137,14 @@ class Triangulation(Section):
     """Minimum parallax in degrees between the rays of an object. An object with less parallax is unresolved."""
     max_rel_sigma: Positive = 0.5
     """Maximum standard deviation of a position as a share of its distance from the cameras. A less certain
-    object is unresolved."""
+    object is unresolved: twice this deviation then reaches the camera, and the covariance does not describe it."""
+    sure_sigma: Positive = 0.5
+    """Standard deviation in m above which `explain` and the verdict name an object as unsure. Its status stays ok. Beyond
+    0.5 m, `objslam eval` by default counts an object as missed. A larger value names fewer objects."""
 
 
 class Bodies(Section):
-    """Configure the bodies of objects: upright ellipsoids that fit the edges of their boxes."""
+    """Configure the bodies of objects: upright ellipsoids, cuboids and cylinders that fit the edges of their boxes."""
 
     use: bool = True
     """Give each object a body if its boxes show one. Its position is then the centre of the body. Otherwise, the position

@@ -14,10 +14,10 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.trace import Round
 from objslam.core.types import Association, Images, Keyframes, Rays, Trajectory
 
-DoubtKind = Literal["pair", "split", "unresolved", "boxes", "label"]
-DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "unresolved", "boxes", "label")
-"""The kinds of doubts: two objects that may be one, an object that may be two, an object without a position, and boxes that
-became no object."""
+DoubtKind = Literal["pair", "split", "unresolved", "unsure", "boxes", "label"]
+DOUBT_KINDS: tuple[DoubtKind, ...] = ("pair", "split", "unresolved", "unsure", "boxes", "label")
+"""The kinds of doubts: two objects that may be one, an object that may be two, an object without a position, an object
+with a wide sigma, boxes that became no object, and a label without an object."""
 
 
 @dataclass(frozen=True, eq=False)

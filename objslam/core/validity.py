@@ -157,10 +157,8 @@ def camera_fault(camera: Camera) -> str | None:
     The pose of the camera is only checked. `rigid_pose` returns the exact pose.
     """
     matrix = camera.matrix
-    if matrix.shape != (3, 3) or not (np.abs(matrix) < MAX_PIXEL).all():
-        return "without a calibration"
-    if matrix[1, 0] != 0 or not np.array_equal(matrix[2], [0, 0, 1]) or min(matrix[0, 0], matrix[1, 1]) < 1 / MAX_PIXEL:
-        return "without a calibration"
+    if (fault := _matrix_fault(matrix)) is not None:
+        return fault
     if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
         return "without a size"
     distortion, counts = camera.distortion, COEFFICIENTS.get(camera.distortion_model, ())
@@ -177,6 +175,18 @@ def camera_fault(camera: Camera) -> str | None:
         return "whose depth scale is not above zero"
     if camera.depth_noise is not None and not _possible(camera.depth_noise):
         return "whose depth noise is not a finite sigma above zero, and sigma_per_m and bias of at least zero"
+    return None
+
+
+def _matrix_fault(matrix: Floats) -> str | None:
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
+        return "without a calibration: its matrix is not (3, 3), not finite, or zero"
+    if not (np.abs(matrix) < MAX_PIXEL).all():
+        return f"whose matrix has a number of {MAX_PIXEL:g} px or more"
+    if matrix[1, 0] != 0 or not np.array_equal(matrix[2], [0, 0, 1]):
+        return "whose matrix is not fx 0 cx, 0 fy cy, 0 0 1"
+    if min(matrix[0, 0], matrix[1, 1]) < 1 / MAX_PIXEL:
+        return f"whose focal length ({matrix[0, 0]:g}, {matrix[1, 1]:g}) px is not above zero"
     return None
 
 

@@ -23,7 +23,8 @@ class BodyMatch:
     """A body against a true body, after the alignment.
 
     size_error: (3,) length, width and height, as shares of the true sizes. yaw_error: rad in [0, pi/2], None if the true
-    object is about square or has no yaw. iou: the intersection over union of the two upright boxes, None without a true yaw.
+    object is about square or has no yaw. iou: the intersection over union of the upright boxes around the two
+    bodies, because a true object has no shape. None without a true yaw.
     """
 
     size_error: Floats

@@ -148,6 +148,14 @@ def _shared(objects: list[MapObject], estimate: Estimate) -> Floats | None:
     return shared_covariance(some.positions, some.covariances, estimate.correlated[known])
 
 
+def _cut_off(rays: Rays) -> dict[str, int]:
+    """Return the number of boxes of each label that the image's edge cuts off, without labels that have none."""
+    if rays.cut is None:
+        return {}
+    number = np.bincount(rays.cut.label, minlength=len(rays.label_names))
+    return {name: int(n) for name, n in zip(rays.label_names, number, strict=True) if n}
+
+
 def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
     if association.label_weights is None:
         return None
@@ -193,6 +201,7 @@ def summarise(
         "unexplained_share": {
             label: round(float(n / of), 4) for label, n, of in zip(rays.label_names, left, total, strict=True) if n
         },
+        "cut_off": _cut_off(rays),
         "doubted_labels": list(solution.doubted),
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),

@@ -64,9 +64,9 @@ def run(
     diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
         if settings.checks.use:
-            diagnosis = diagnose(expected, settings, ledger)
-            if not diagnosis.refutable:
-                say(diagnosis, ledger)
+            diagnosis = diagnose(expected, settings, ledger, progress)
+            if settings.mode == "fixed" or not diagnosis.refutable:
+                say(diagnosis, ledger)  # No solve will refute the findings, so a user need not wait for one.
         if diagnosis.certain and settings.mode == "joint":
             ledger.warn("the poses stay as they are, because no solve corrects wrong input")
             diagnosis = diagnosis.proven()  # No joint solve will test the other findings.
@@ -85,10 +85,13 @@ def run(
             "no box gives a usable ray", where=log.name, hint="; ".join(ledger.lines()) or "the detections are empty"
         )
     cameras = tuple(c.camera for c in log.cameras)
-    with _stage("solve", seconds, progress):
-        errors = shared_errors(log, *seen_something(frames, rays), settings)
+    of_solve = _doubting(progress, diagnosis) if settings.mode == "joint" else progress
+    with _stage("solve", seconds, of_solve):
+        # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.
+        spoilt = diagnosis.spoilt and settings.mode == "fixed"
+        errors = None if spoilt else shared_errors(log, *seen_something(frames, rays), settings)
         try:
-            solution = solve(frames, rays, cameras, settings, ledger, progress, errors=errors)
+            solution = solve(frames, rays, cameras, settings, ledger, of_solve, errors=errors)
         except SolveError:
             say(diagnosis, ledger)
             raise
@@ -197,6 +200,14 @@ def with_mode_of(log: Log, settings: Settings) -> Settings:
     if settings.mode != "auto":
         return settings
     return settings.model_copy(update={"mode": "joint" if log.localization is None else "fixed"})
+
+
+def _doubting(progress: Progress, diagnosis: Diagnosis) -> Progress:
+    """Return a progress function that also names the findings about the input, if the joint solve may refute them."""
+    if not diagnosis.refutable:
+        return progress
+    names = ", ".join(finding.name for finding in diagnosis.findings)
+    return lambda stage, done, total: progress(f"{stage} (wrong input? {names})", done, total)
 
 
 @contextmanager

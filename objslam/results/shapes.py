@@ -84,6 +84,7 @@ class Summary(_Shape):
     assessment: _Assessment | None = None
     localisation: _Localisation | None = None
     doubts: dict[str, _Integer] = {}
+    cut_off: dict[str, _Integer] = {}
     sessions: list[_SiteSession] = []
 
 

@@ -1,6 +1,5 @@
 """Read and write log folders, the format on disk that holds everything in a `Log`."""
 
-import json
 import os
 import shutil
 import tempfile
@@ -17,7 +16,7 @@ from objslam.io.camera_yaml import read_camera, write_camera, write_mounts
 from objslam.io.detections_jsonl import read_detections, write_detections
 from objslam.io.folders import OLD, no_empty_folders, remove_leftovers, temporary_name
 from objslam.io.image_list import read_images, write_images
-from objslam.io.objects_json import FORMAT, read_truth_objects
+from objslam.io.objects_json import dump_truth_objects, read_truth_objects
 from objslam.io.text import reading
 from objslam.io.tum_trajectory import read_trajectory, write_trajectory
 from objslam.sources.no_camera import NoCamera
@@ -250,9 +249,7 @@ def _write_content(log: Log, folder: Path, final: Path) -> None:
             write_trajectory(trajectory, folder / name)
     if truth.objects:
         (folder / TRUTH).mkdir(exist_ok=True)
-        entries = [{"id": o.id, "label": o.label, "position": o.position.tolist()} for o in truth.objects]
-        text = json.dumps({"format": FORMAT, "frame": "map", "objects": entries}, indent=1, allow_nan=False) + "\n"
-        (folder / TRUTH / TRUTH_OBJECTS).write_text(text, encoding="utf-8")
+        (folder / TRUTH / TRUTH_OBJECTS).write_text(dump_truth_objects(truth.objects), encoding="utf-8")
 
 
 def _link_images(images: Images, kind: str, folder: Path, final: Path) -> Images:

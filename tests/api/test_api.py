@@ -8,6 +8,7 @@ import logging
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from small_log import THINGS, small_log
 from waiting import LIMIT
 
 import objslam
+from objslam.api.mapping import prior_map
 from objslam.association.registration import object_maps
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -353,3 +355,13 @@ def test_a_map_is_a_sequence_that_can_be_read(result: objslam.Result) -> None:
     assert "cup" in repr(objects)
     assert len(repr(objslam.ObjectMap(objects.objects * 10)).splitlines()) == 22
     assert "... and 20 more" in repr(objslam.ObjectMap(objects.objects * 10))
+
+
+def test_a_result_is_the_map_of_another_day_as_its_folder_is(result: objslam.Result, tmp_path: Path) -> None:
+    result.save(tmp_path / "map")
+    summary = {**result.summary, "up": "y"}
+    (tmp_path / "map" / "summary.json").write_text(json.dumps({"up": "y"}))
+    given, loaded = prior_map(replace(result, summary=summary)), prior_map(tmp_path / "map")
+    assert given.up == loaded.up == "y"
+    assert np.allclose(given.objects.positions, loaded.objects.positions, equal_nan=True)
+    objslam.Session(map=result).abort()

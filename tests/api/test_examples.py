@@ -120,3 +120,15 @@ def test_the_notebook_runs_from_top_to_bottom(folder: Path, tmp_path: Path, caps
     assert said.count("m in x, y, z;") == 4
     assert "nearest to the origin: plant" in said
     assert not any(cell.get("outputs") for cell in notebook["cells"])  # A stale output would say what is not so.
+
+
+WITH_ARGUMENTS = sorted(one for one in EXAMPLES.glob("*.py") if "sys.argv" in one.read_text())
+
+
+@pytest.mark.parametrize("script", WITH_ARGUMENTS, ids=lambda script: script.stem)
+def test_wrong_arguments_end_in_a_line_and_no_traceback(script: Path, play: Play, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=f"{script.stem}.py"):
+        play(script.stem)
+    many = script.read_text().split("len(sys.argv) != ")[1][0]
+    with pytest.raises(SystemExit, match="nowhere"):
+        play(script.stem, *[tmp_path / "nowhere"] * (int(many) - 1))

@@ -105,3 +105,15 @@ def test_a_table_fits_80_columns_and_loses_no_word() -> None:
     lines = screen.file.getvalue().splitlines()
     assert max(map(len, lines)) <= 80
     assert " ".join(" ".join(line.split("│")[2] for line in lines if line.startswith("│")).split()) == f"{TEXT} {TEXT}"
+
+
+def test_cut_off_boxes_of_a_label_are_counted_also_if_it_has_no_other_boxes(explain: Any, tmp_path: Path) -> None:
+    file = tmp_path / "out" / "summary.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "cut_off": {"sofa": 2, "mug": 9}}))
+    assert explain("out", "--label", "sofa")[:2] == (
+        0,
+        "no doubts about sofa\nthe image's edge cuts off 2 boxes of sofa, so they give no rays (rays.border, "
+        "rays.border_share)\n",
+    )
+    assert "cuts off 9 boxes of mug" in explain("out", "--label", "mug")[1]
+    assert "cuts off" not in explain("out")[1]

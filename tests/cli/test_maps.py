@@ -19,6 +19,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.mapping.localization import moved_log
 from objslam.mapping.pipeline import run
+from objslam.output.plot.changes_plot import changes_figure
+from objslam.output.report.scene import hexadecimal
 from objslam.output.result_folder import write_result
 from objslam.simulation import preset, simulate
 
@@ -122,6 +124,12 @@ def reported(call, monkeypatch, capsys, folder, site):
     states = {o.id: o.life.state for o in (*site, *site.gone)}
     assert {int(line[0]): line[3] for line in lines if line[0].isdigit()} == states
     assert sum(str(folder.parent) in line[0] or "days" in line[0] for line in lines) == 2
+    scene = json.loads(re.search(r'id="scene-data">(.*?)</script>', page, re.DOTALL)[1])
+    figure = changes_figure([(o.life.state, o) for o in (*site, *site.gone)], "")
+    of_picture = {one.name.split(" (")[0]: hexadecimal(one.colour) for one in figure.shapes if getattr(one, "name", "")}
+    assert {o["id"]: o["colour"] for o in scene["objects"]} == {o.id: of_picture[states[o.id]] for o in site}
+    assert all(f'background:{colour}"></span>{state}</span>' in page for state, colour in of_picture.items())
+    assert page.index("<details>") < page.index('<figure class="map') < page.index("</details>")
     summary = folder / "summary.json"
     text = summary.read_text()
     summary.write_text(re.sub(r'"yaw_deg": [^,\n]+', '"yaw_deg": "east"', text))

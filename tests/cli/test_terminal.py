@@ -9,8 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rich.console import Console
+from waiting import wait_for
 
 from objslam.cli import console as terminal
+from objslam.cli.console import SpeakingLedger, progress_bar, report
 from objslam.cli.info import _table
 from objslam.cli.live_command import status
 from objslam.cli.live_command.status import status_line
@@ -51,6 +53,15 @@ def test_a_table_of_80_columns_leaves_out_parallax_and_not_sigma():
     assert "41.2" in shown(120)
     assert "41.2" not in shown(80)
     assert "0.500" in shown(80)
+
+
+def test_a_table_is_in_the_order_of_labels_and_ids():
+    """The map of a live session has its objects in the order in which they were found."""
+    names = [(7, "plant"), (2, "cup"), (9, "book"), (1, "plant"), (10, "cup")]
+    screen = Console(file=io.StringIO(), width=120)
+    screen.print(objects_table([thing(number, label, (0.0, 0.0, 0.0)) for number, label in names], screen))
+    rows = re.findall(r"│ +(\d+) │ (\w+)", screen.file.getvalue())
+    assert rows == [("9", "book"), ("2", "cup"), ("10", "cup"), ("1", "plant"), ("7", "plant")]
 
 
 def test_a_table_has_no_empty_column():
@@ -145,7 +156,7 @@ def test_tags_of_unknown_size_say_how_a_size_helps(given, told):
 
 
 def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before():
-    with terminal_in_place_of_stderr(100) as tty, terminal.progress_bar() as show:
+    with terminal_in_place_of_stderr(100) as tty, progress_bar() as show:
         show("detecting", 220, 220)
         show("solving", 0, 0)
         mark = len(tty.getvalue())
@@ -155,7 +166,7 @@ def test_the_bar_of_a_stage_forgets_the_count_of_the_stage_before():
 
 
 def test_the_bar_of_a_stage_shows_its_count_from_the_start_and_its_rate():
-    with terminal_in_place_of_stderr(100) as tty, terminal.progress_bar() as show:
+    with terminal_in_place_of_stderr(100) as tty, progress_bar() as show:
         mark = len(tty.getvalue())
         for done in range(221):
             show("detecting", done, 220)
@@ -267,3 +278,60 @@ def test_the_longest_topics_lose_their_types_too(monkeypatch):
     assert len(lines) == 2
     assert max(map(len, lines)) <= 80
     assert "image_raw/compressed  rgb" in lines[1]
+
+
+def test_a_pipe_gets_a_plain_line_of_progress_now_and_then(monkeypatch):
+    monkeypatch.setattr("objslam.cli.console._EVERY", 0.001)
+    with terminal_in_place_of_stderr("", io.StringIO()) as screen:
+        with progress_bar() as show:
+            wait_for(lambda: "reading" in screen.getvalue())
+            show("association, round 3", 0, 0)
+            wait_for(lambda: "s: association, round 3\n" in screen.getvalue())
+            show("detecting", 7, 220)
+            wait_for(lambda: "s: detecting 7 of 220\n" in screen.getvalue())
+        ended = screen.getvalue()
+    assert all(re.fullmatch(r"working for \d+ s: [a-z0-9, ]+", line) for line in ended.splitlines())
+
+
+def test_a_quiet_command_and_a_short_one_print_no_progress_into_a_pipe(monkeypatch):
+    ledger = SpeakingLedger()
+    with terminal_in_place_of_stderr("", io.StringIO()) as screen:
+        with progress_bar() as show:
+            show("solve", 0, 0)
+        monkeypatch.setattr("objslam.cli.console._EVERY", 0.001)
+        with progress_bar(ledger, quiet=True) as show:
+            show("solve", 0, 0)
+            ledger.warn("first")
+            wait_for(lambda: ledger.told == 1)
+            ledger.warn("second")
+            wait_for(lambda: ledger.told == 2)
+        assert screen.getvalue() == "warning: first\nwarning: second\n"
+
+
+@pytest.mark.parametrize("kind", [Tty, io.StringIO])
+def test_a_warning_is_printed_while_a_command_works_and_only_once(monkeypatch, kind):
+    monkeypatch.setattr("objslam.cli.console._EVERY", 0.001)
+    with terminal_in_place_of_stderr(100, kind()) as screen:
+        ledger = SpeakingLedger()
+        with progress_bar(ledger) as show:
+            show("solve", 0, 0)
+            ledger.warn("the camera is upside down")
+            wait_for(lambda: "warning: the camera is upside down\n" in screen.getvalue())
+        ledger.drop("boxes below rays.min_score", 2)
+        ledger.warn("the camera is upside down")
+        ledger.warn("the map is empty")
+        mark = len(screen.getvalue())
+        report(ledger)
+        assert screen.getvalue()[mark:].splitlines() == [
+            "warning: dropped 2: boxes below rays.min_score",
+            "warning: the map is empty",
+        ]
+
+
+def test_the_lines_of_a_ledger_that_does_not_speak_are_printed_in_the_end():
+    with terminal_in_place_of_stderr("", io.StringIO()) as screen:
+        ledger = Ledger()
+        ledger.warn("the camera is upside down")
+        ledger.drop("boxes below rays.min_score", 2)
+        report(ledger)
+        assert [line.removeprefix("warning: ") for line in screen.getvalue().splitlines()] == ledger.lines()

@@ -153,7 +153,7 @@ def test_lists_are_as_good_as_arrays():
         ({"name": ["front"]}, "without a name"),
         ({"name": "a\nb"}, "without a name"),
         ({"matrix": "matrix"}, "without a calibration"),
-        ({"matrix": np.diag([500.0, 500.0, 0.0])}, "without a calibration"),
+        ({"matrix": np.diag([500.0, 500.0, 0.0])}, "whose matrix is not fx 0 cx, 0 fy cy, 0 0 1"),
         ({"width": None}, "without a size"),
         ({"height": np.nan}, "without a size"),
         ({"height": 480.5}, "without a size"),

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from quick import NOTHING_DRAWN
 from scipy.spatial.transform import Rotation
 from small_log import small_log
 
@@ -107,6 +108,32 @@ def test_a_mistake_is_named_and_spoils_the_map(name, mode):
     said = " ".join(finding.message for finding in found)
     assert all(words in said for words in NAMED[name]), said
     assert any(finding.spoils for finding in found)
+
+
+def test_wrong_input_at_fixed_poses_is_named_before_the_solve_and_no_shared_errors_are_sought():
+    """The camera is upside down. No solve corrects that, so a user need not wait for one to hear of it."""
+    log, ledger, heard = MISTAKES["image upside down"](drive("fixed")), Ledger(), {}
+    result = pipeline.run(
+        log, load_settings(None, NOTHING_DRAWN), ledger, lambda stage, *_: heard.setdefault(stage, list(ledger.warnings))
+    )
+    assert any("upside down" in line for line in heard["solve"])
+    assert result.summary["wrong_input"]
+    assert result.calibration is None
+    assert "what-ifs about the input" in heard
+
+
+class Heard(Exception):
+    """Ends a run at the stage that a test waits for."""
+
+
+def test_a_joint_run_says_what_its_solve_tests():
+    def hear(stage: str, done: int, total: int) -> None:
+        if "(wrong input? " in stage:
+            raise Heard(stage)
+
+    log = MISTAKES["image mirrored"](drive("joint"))
+    with pytest.raises(Heard, match=r"^solve \(wrong input\? image "):
+        pipeline.run(log, load_settings(None, (*NOTHING_DRAWN, "mode=joint")), Ledger(), hear)
 
 
 @pytest.mark.parametrize("name", SIZED)

@@ -104,7 +104,7 @@ def test_a_path_that_drifts_is_named_where_a_thing_seems_to_move(every, blames_d
         reason=number + REASONS.index("moves"), label=number, miss=[0.02], sigma=[0.01], way=[0.23], odds=[-0.7]
     )
     result = SimpleNamespace(rays=SimpleNamespace(label_names=("mug",)), keyframes=SimpleNamespace(localized_every=every))
-    told = words._reason(result, groups, 0, number)
+    told = words.why_no_object(result, groups, 0, number)
     assert "moves by 23 cm" in told
     assert ("the path drifted" in told) == blames_drift
 

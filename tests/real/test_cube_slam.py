@@ -8,6 +8,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.mapping import pipeline
 from objslam.sources import SourceOptions, read
 
+CHI2_95 = 7.815  # chi-squared, 3 degrees of freedom
 CABINET = np.array([-1.520, 0.454])
 """m; the centre of the depth images fused with the true poses, seen from above."""
 
@@ -53,3 +54,11 @@ def test_the_cabinet_stands_in_its_own_surface(data_dir):
     assert (placed.position < high).all()
     assert np.linalg.norm((low + high)[:2] / 2 - CABINET) < 0.05
     assert (high - low).max() < 1.0
+    # The boxes alone give the body: its centre, its sizes and their sigmas against the surface from the floor to the top.
+    top = high[2]
+    off = placed.position - np.append((low + high)[:2] / 2, top / 2)
+    assert np.linalg.norm(off[:2]) <= 0.03
+    assert abs(off[2]) <= 0.05
+    assert off @ np.linalg.solve(placed.covariance, off) < CHI2_95
+    assert placed.body.shape == "cuboid"
+    assert np.abs(placed.body.size / np.append((high - low)[:2], top) - 1).max() < 0.2

@@ -54,7 +54,10 @@ def log(tmp_path):
     images = (folder / "a.png", folder / "b.png")
     for image in images:
         image.write_bytes(image.name.encode())
-    truth = Truth((TruthObject(3, "cup", np.array([0.1, 0.2, 1 / 3])),), _trajectory(3))
+    cup = TruthObject(3, "cup", np.array([0.1, 0.2, 1 / 3]))
+    size, turn = np.array([1.2, 0.6, 2 / 3]), np.array([0.0, 0.0, 0.6, 0.8])
+    desk = TruthObject(4, "desk", np.array([1.0, 2, 1 / 3]), size, 0.3, turn)
+    truth = Truth((cup, desk), _trajectory(3))
     return Log("made", (_camera_log("front", images),), _trajectory(1), _trajectory(2), truth)
 
 
@@ -68,7 +71,10 @@ def _assert_same(read, log):
     _same_path(read.localization, log.localization)
     _same_path(read.truth.trajectory, log.truth.trajectory)
     for a, b in zip(read.truth.objects, log.truth.objects, strict=True):
-        assert (a.id, a.label, a.position.tolist()) == (b.id, b.label, b.position.tolist())
+        assert (a.id, a.label, a.position.tolist(), a.yaw) == (b.id, b.label, b.position.tolist(), b.yaw)
+        for own, other in ((a.size, b.size), (a.tag_xyzw, b.tag_xyzw)):
+            assert (own is None) == (other is None)
+            assert own is None or np.abs(own - other).max() < 1e-12
     for a, b in zip(read.cameras, log.cameras, strict=True):
         assert (a.camera.name, a.camera.width, a.camera.depth_scale) == (b.camera.name, b.camera.width, b.camera.depth_scale)
         _same_path(a.mount, b.mount)

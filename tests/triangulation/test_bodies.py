@@ -2,16 +2,28 @@
 
 import numpy as np
 import pytest
-from triangulation.true_boxes import CAMERAS, corner_box, edges_of, looking_at, outline_box, random_bodies, views_of
+from triangulation.true_boxes import (
+    CAMERAS,
+    box_around,
+    corner_box,
+    corners_of,
+    edges_of,
+    looking_at,
+    outline_box,
+    random_bodies,
+    ring_of,
+    views_of,
+)
 
 from objslam.core.bodies.body import SHAPES
 from objslam.core.camera import project
+from objslam.triangulation.bodies.choice import shapes_disagree
 from objslam.triangulation.bodies.edges import BoxEdges, contacts
 from objslam.triangulation.bodies.ellipsoid import from_axes
 from objslam.triangulation.bodies.fit import Prior, Weights, fit
 from objslam.triangulation.bodies.prior import weak_prior
 from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals
-from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+from objslam.triangulation.bodies.shapes import CUBOID, CYLINDER, ELLIPSOID
 from objslam.triangulation.bodies.shared import covariance_of, sides_of
 from objslam.triangulation.bodies.solve import solve_bodies
 
@@ -53,7 +65,7 @@ def test_a_true_cuboid_is_found_from_its_boxes():
     assert abs(CUBOID.heading(found)[0] - yaw) < 1e-6
 
 
-@pytest.mark.parametrize("kind", [ELLIPSOID, CUBOID])
+@pytest.mark.parametrize("kind", [ELLIPSOID, CUBOID, CYLINDER])
 def test_the_derivatives_are_those_of_differences(kind):
     rng = np.random.default_rng(3)
     normal, place = rng.normal(size=(200, 4, 3)), 3 * rng.normal(size=(200, 3))
@@ -191,3 +203,60 @@ def test_from_one_side_the_depth_stays_near_its_prior_and_says_so():
     assert half.max() < 1.2
     assert half.min() > 0.05
     assert sigma[3 + depth] > 0.15 * half[depth]
+
+
+def boxes_of_outlines(camera, outlines, rng, each, arc):
+    """Boxes with a noise of 2 px of upright things on the floor, and the poses, as a robot sees them from a height of 0.7 m.
+
+    outlines: points (P, 3) of each thing around its centre.
+    """
+    boxes, poses = [], []
+    for outline in outlines:
+        centre, start = np.array([0.0, 0.0, -outline[:, 2].min()]), rng.uniform(0, 6)
+        for azimuth in start + np.linspace(0, arc, each):
+            away = rng.uniform(2, 4)
+            poses.append(looking_at(np.array([away * np.cos(azimuth), away * np.sin(azimuth), 0.7]), centre))
+            boxes.append(box_around(camera, centre + outline, poses[-1]))
+    return np.array(boxes) + rng.normal(0, 2, (len(boxes), 4)), np.array(poses)
+
+
+def test_cuboids_and_cylinders_are_told_apart():
+    rng, camera, many, each = np.random.default_rng(8), CAMERAS["pinhole"], 20, 24
+    half = rng.uniform(0.15, 0.3, (many, 3))
+    half[1::2, 1] = half[1::2, 0]
+    outlines = [ring_of(h) if i % 2 else corners_of(h, rng.uniform(0, 3)) for i, h in enumerate(half)]
+    boxes, poses = boxes_of_outlines(camera, outlines, rng, each, arc=2.0)
+    true = np.column_stack([np.zeros((many, 2)), half[:, 2]])
+    found = solved(camera, boxes, poses, true + rng.normal(0, 0.05, true.shape), np.full((many, 2), 0.25))
+    off = found.axes[:, :3] - true
+    assert [SHAPES[one] for one in found.shape] == ["cuboid", "cylinder"] * (many // 2)
+    assert np.abs(off).max() < 0.015
+    assert np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.centre_covariance), off) < 7.81) >= 0.9
+    assert np.median(np.abs(found.axes[:, 5] / half[:, 2] - 1)) < 0.02
+
+
+def test_no_shape_is_surer_than_the_choice_between_shapes():
+    """A pot is wider at its top. A cylinder and an ellipsoid fit it about equally well, at two heights."""
+    rng, camera, many, each = np.random.default_rng(8), CAMERAS["pinhole"], 30, 24
+    half = np.column_stack([np.tile(rng.uniform(0.15, 0.3, (many, 1)), 2), rng.uniform(0.15, 0.4, many)])
+    outlines = [ring_of(h) * np.repeat([[0.6, 0.6, 1.0], [1.0, 1.0, 1.0]], 40, axis=0) for h in half]
+    boxes, poses = boxes_of_outlines(camera, outlines, rng, each, arc=0.6)
+    true = np.column_stack([np.zeros((many, 2)), half[:, 2]])
+    found = solved(camera, boxes, poses, true + rng.normal(0, 0.05, true.shape), np.full((many, 2), 0.25))
+    off = found.axes[:, :3] - true
+    inside = [
+        np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(c), off) < 7.81)
+        for c in (found.covariance[:, :3, :3], found.centre_covariance)
+    ]
+    assert inside[0] < 0.8
+    assert inside[1] >= 0.9
+
+
+def test_the_spread_of_shapes_is_that_of_a_mixture():
+    """Draws of the shapes by their evidence have the second moment about the chosen shape."""
+    rng = np.random.default_rng(9)
+    evidence, axes, chosen = rng.normal(0, 1, (4, 1)), rng.normal(0, 1, (4, 1, 6)), np.array([2])
+    told = shapes_disagree(evidence, axes, chosen)[0]
+    chance = np.exp(evidence[:, 0]) / np.exp(evidence[:, 0]).sum()
+    drawn = axes[rng.choice(4, 400_000, p=chance), 0] - axes[2, 0]
+    assert np.abs(drawn.T @ drawn / len(drawn) - told).max() < 0.02

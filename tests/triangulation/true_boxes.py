@@ -27,16 +27,32 @@ CAMERAS = {
 }
 
 
-def corner_box(camera, centre, half, yaw, pose):
-    """The box around the image of a cuboid, by its corners in a pinhole."""
+def corners_of(half, yaw):
+    """The corners (8, 3) of a cuboid around the origin."""
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     cos, sin = np.cos(yaw), np.sin(yaw)
-    corners = centre + signs * half @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-    local = (corners - pose[:3, 3]) @ pose[:3, :3]
+    return signs * half @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+
+
+def ring_of(half):
+    """Points (80, 3) on the rims of an upright cylinder around the origin."""
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    rim = np.column_stack([half[0] * np.cos(angle), half[1] * np.sin(angle)])
+    return np.concatenate([np.column_stack([rim, np.full(40, z)]) for z in (-half[2], half[2])])
+
+
+def box_around(camera, points, pose):
+    """The box around the images of points (P, 3) in a pinhole, None if one is not in front of the camera."""
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
     if local[:, 2].min() < 0.05:
         return None
     pixels = project(camera, local)
     return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+
+
+def corner_box(camera, centre, half, yaw, pose):
+    """The box around the image of a cuboid, by its corners in a pinhole."""
+    return box_around(camera, centre + corners_of(half, yaw), pose)
 
 
 def random_bodies(count, rng):

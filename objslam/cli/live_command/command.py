@@ -87,7 +87,7 @@ def live(
     _say_what_is_not_used(source, options, speed, publish or publish_tf)
     known = None if map_ is None else prior_map(map_)
     # The recording is read first, because it may be the journal in OUT, which is renamed below.
-    recording = None if source in ADAPTERS else _read(Path(source), options, settings)
+    recording = None if source in ADAPTERS else _read(Path(source), options, settings, quiet)
     with output_folder(out), ExitStack() as stack:
         if not (out / NAME).exists():
             warn_of_neighbours(out)
@@ -120,7 +120,8 @@ def live(
         session.start()
         if resume:
             taken = session.counters.accepted()
-            say(f"continued {out / NAME}: {', '.join(f'{kind} {n}' for kind, n in taken.items())}", stderr=True)
+            held = ", ".join(f"{kind} {n}" for kind, n in taken.items()) or "none"
+            say(f"continued the session in {out / NAME}. Messages taken before: {held}", stderr=True)
         latest = LatestObjects(out)
         broken = drive(session, feed, latest, interval, quiet)
         result = finish(session, feed, out, latest, truth, broken, quiet)
@@ -164,7 +165,7 @@ def _is_recorded(source: str, speed: float) -> bool:
     return recorded is not None and (speed == 0 or recorded())
 
 
-def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Ledger]:
+def _read(path: Path, options: LiveOptions, settings: Settings, quiet: bool) -> tuple[Log, Ledger]:
     """Read a recording to replay. If the options name a detector, it finds the boxes. LogError if there are no boxes."""
     from objslam.api.mapping import find_boxes
     from objslam.core.diagnostics import Ledger
@@ -175,9 +176,9 @@ def _read(path: Path, options: LiveOptions, settings: Settings) -> tuple[Log, Le
         hint = f"SOURCE is {', '.join(ADAPTERS)}, a log or a bag"
         raise LogError("there is no such recording", where=str(path), hint=hint)
     ledger = Ledger()
-    log = read(path, ledger, options)
-    if options.detector is not None:
-        with progress_bar() as show:
+    with progress_bar(quiet=quiet) as show:
+        log = read(path, ledger, options)
+        if options.detector is not None:
             log = find_boxes(log, options.detector, settings, ledger, show)
     if all(camera_log.detections is None for camera_log in log.cameras):
         raise LogError("the recording has no boxes to replay", where=str(path), hint="find them with --detector MODEL.onnx")

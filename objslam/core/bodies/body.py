@@ -9,8 +9,8 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 
-Shape = Literal["point", "sphere", "ellipsoid", "cuboid"]
-SHAPES: tuple[Shape, ...] = ("point", "sphere", "ellipsoid", "cuboid")
+Shape = Literal["point", "sphere", "ellipsoid", "cuboid", "cylinder"]
+SHAPES: tuple[Shape, ...] = ("point", "sphere", "ellipsoid", "cuboid", "cylinder")
 """The shapes of objects. A point has no size."""
 UNKNOWN_YAW = float(np.pi / np.sqrt(12))
 """The standard deviation (rad) of a yaw about which nothing is known: the standard deviation of a uniform distribution over
@@ -21,9 +21,10 @@ half a turn."""
 class Body:
     """An upright body around the position of its object.
 
-    shape: `cuboid`, `ellipsoid`, or `sphere` if an ellipsoid does not fit the boxes better. size: (3,) m, the full length,
-    width and height. The length is the longer horizontal side. yaw: rad in (-pi/2, pi/2], the direction of the length in the
-    plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most `UNKNOWN_YAW`, for an unknown yaw.
+    shape: `cuboid`, `cylinder` with an elliptic section, `ellipsoid`, or `sphere` if an ellipsoid does not fit the boxes
+    better. size: (3,) m, the full length, width and height. The length is the longer horizontal side. yaw: rad in (-pi/2,
+    pi/2], the direction of the length in the plane seen from above. size_sigma: (3,) m. yaw_sigma: rad, at most
+    `UNKNOWN_YAW`, for an unknown yaw.
     """
 
     shape: Shape

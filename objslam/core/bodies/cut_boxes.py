@@ -1,6 +1,7 @@
 """The boxes of bodies that the image shows only a part of."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Self
 
 from objslam.core.arrays import Floats, Ints
 
@@ -20,3 +21,7 @@ class CutBoxes:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def take(self, index: Ints) -> Self:
+        """Return the boxes with the indices (n,)."""
+        return replace(self, **{one.name: getattr(self, one.name)[index] for one in fields(self)})

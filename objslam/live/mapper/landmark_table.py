@@ -13,7 +13,6 @@ import numpy as np
 
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.bodies.body import SHAPES
 from objslam.core.bodies.box_centres import beside_centres, image_axes
 from objslam.core.camera import Camera
 from objslam.core.camera import in_view as in_image
@@ -28,7 +27,6 @@ _NEAREST = 0.3
 """The distance (m) below which an object does not fit into the image and is not expected to be seen. A larger distance
 expects fewer landmarks."""
 _FURTHER = 1.1  # A landmark is expected up to this factor times its `far`. A larger factor counts more misses.
-_CUBOID = SHAPES.index("cuboid")
 _NO_ID = -2  # The id of every track among the predicted landmarks. No landmark has this id, and -1 means no landmark.
 
 
@@ -40,8 +38,9 @@ class LandmarkTable(GrowingTable):
     number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared normalised
     residuals of its rays, clipped. rejected: number of its rays outside the gate.
 
-    shape: of the body to whose centre the bearings point, as an index into `SHAPES`. 0 means that they point to the centres
-    of boxes. half, yaw: m and rad, the half axes and the heading of this body. shape_covariance: of these four numbers.
+    shape: of the body to whose centre the bearings point, as an index into `core.bodies.body.SHAPES`. 0 means that they
+    point to the centres of boxes. half, yaw: m and rad, the half axes and the heading of this body. shape_covariance: of
+    these four numbers.
     """
 
     id: Ints = column(np.int64)
@@ -131,8 +130,7 @@ def box_centres(
         to = landmarks.position[at] - map_T_camera[some, :3, 3]
         fisheye = np.array([c.fisheye for c in cameras])[camera[some]]
         axes = image_axes(map_T_camera[some, :3, :3], to, fisheye)
-        cuboid = landmarks.shape[at] == _CUBOID
-        body = landmarks.half[at], landmarks.yaw[at], cuboid, landmarks.shape_covariance[at]
+        body = landmarks.half[at], landmarks.yaw[at], landmarks.shape[at], landmarks.shape_covariance[at]
         beside[some], sigma[some] = beside_centres(axes, to, *body)
     return beside, sigma
 

@@ -12,17 +12,15 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.bodies.body import SHAPES
 from objslam.core.bodies.cut_boxes import CutBoxes
-from objslam.core.camera import undistort
+from objslam.core.camera import Camera, undistort
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.core.types import Keyframes, Rays
 from objslam.frontend.bearings import cut_edges
 from objslam.mapping.bodies.box_views import BoxViews
 from objslam.mapping.solution import Solution
 from objslam.triangulation.bodies.edges import BoxEdges
-from objslam.triangulation.bodies.residuals import edge_gaps, residuals
-from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+from objslam.triangulation.bodies.residuals import residuals_of_shapes, touched_points
 from objslam.triangulation.bodies.shared import spread_of
 from objslam.triangulation.bodies.solve import Bodies
 
@@ -49,8 +47,8 @@ def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solut
     cut = solution.rays.cut
     if cut is None or not len(cut):
         return None
-    cut = replace(cut, box=np.clip(cut.box, 0.0, np.tile(_sizes(cut, boxes) - 1, 2)))
-    keyframe = _keyframe_of(cut, solution.keyframes)
+    cut = clipped(cut, boxes.cameras)
+    keyframe = keyframe_of(cut, solution.keyframes)
     box, body = _candidates(cut, keyframe, bodies, boxes, objects, solution)
     if not len(box):
         return None
@@ -67,9 +65,10 @@ def cut_edges_of(bodies: Bodies, boxes: BoxViews, objects: Ints, solution: Solut
     return replace(found, **{name: noisier * getattr(found, name) for name in ("sigma", "shift", "size")})
 
 
-def _sizes(cut: CutBoxes, boxes: BoxViews) -> Ints:
-    """Return the size (C, 2), px, of the image of each box."""
-    return np.array([one.size for one in boxes.cameras])[cut.camera]
+def clipped(cut: CutBoxes, cameras: tuple[Camera, ...]) -> CutBoxes:
+    """Return the boxes without their parts outside the image."""
+    sizes = np.array([one.size for one in cameras])[cut.camera]
+    return replace(cut, box=np.clip(cut.box, 0.0, np.tile(sizes - 1, 2)))
 
 
 def _single(number: Ints) -> Bools:
@@ -78,7 +77,7 @@ def _single(number: Ints) -> Bools:
     return count[inverse.ravel()] == 1
 
 
-def _keyframe_of(cut: CutBoxes, keyframes: Keyframes) -> Ints:
+def keyframe_of(cut: CutBoxes, keyframes: Keyframes) -> Ints:
     """Return the keyframe (C,) of each box, -1 for an image that is no keyframe."""
     wide = int(max(keyframes.frame.max(), cut.frame.max())) + 1
     image, wanted = keyframes.camera * wide + keyframes.frame, cut.camera * wide + cut.frame
@@ -99,7 +98,7 @@ def _candidates(
     sees_size = np.array([c.sees_size for c in boxes.cameras])[cut.camera]
     wide = (cut.box[:, 2:] > cut.box[:, :2]).all(axis=1)
     usable = np.flatnonzero((keyframe >= 0) & sees_size & wide)
-    origin, axis, angle = _cones(cut, keyframe, usable, boxes)
+    origin, axis, angle = cones(cut.take(usable), boxes.map_T_camera[keyframe[usable]], boxes.cameras)
     none = np.zeros(0, dtype=np.int64)
     found = [(none, none)]
     for at in np.flatnonzero(bodies.shape > 0).tolist():
@@ -116,22 +115,23 @@ def _candidates(
     return box, body
 
 
-def _cones(cut: CutBoxes, keyframe: Ints, usable: Ints, boxes: BoxViews) -> tuple[Floats, Floats, Floats]:
-    """Return origins (U, 3), m, axes (U, 3) in map and half angles (U,), rad, of cones around some boxes (U,).
+def cones(cut: CutBoxes, map_T_camera: Floats, cameras: tuple[Camera, ...]) -> tuple[Floats, Floats, Floats]:
+    """Return origins (C, 3), m, axes (C, 3) in map and half angles (C,), rad, of cones around boxes.
 
-    A box where the lens model has no inverse gets a cone of the whole half space.
+    map_T_camera: (C, 4, 4) of the image of each box. A box where the lens model has no inverse gets a cone of the whole half
+    space.
     """
-    box, poses = cut.box[usable], boxes.map_T_camera[keyframe[usable]]
-    axis, angle = np.zeros((len(usable), 3)), np.full(len(usable), np.pi / 2)
+    axis, angle = np.zeros((len(cut), 3)), np.full(len(cut), np.pi / 2)
+    box = cut.box
     pixel = np.stack([(box[:, :2] + box[:, 2:]) / 2, *(box[:, [i, j]] for i in (0, 2) for j in (1, 3))], axis=1)
-    for i in np.unique(cut.camera[usable]):
-        mine = np.flatnonzero(cut.camera[usable] == i)
-        ray, valid = undistort(boxes.cameras[i], pixel[mine].reshape(-1, 2))
+    for i in np.unique(cut.camera):
+        mine = np.flatnonzero(cut.camera == i)
+        ray, valid = undistort(cameras[i], pixel[mine].reshape(-1, 2))
         ray = ray.reshape(-1, 5, 3)
         widest = np.arccos(np.clip((ray[:, 1:] * ray[:, :1]).sum(axis=2).min(axis=1), -1.0, 1.0))
         axis[mine] = ray[:, 0]
         angle[mine] = np.where(valid.reshape(-1, 5).all(axis=1), widest, np.pi / 2)
-    return poses[:, :3, 3], np.einsum("bij,bj->bi", poses[:, :3, :3], axis), angle
+    return map_T_camera[:, :3, 3], np.einsum("bij,bj->bi", map_T_camera[:, :3, :3], axis), angle
 
 
 def _edges(cut: CutBoxes, keyframe: Ints, box: Ints, body: Ints, bodies: Bodies, boxes: BoxViews) -> BoxEdges:
@@ -157,8 +157,7 @@ def _edges(cut: CutBoxes, keyframe: Ints, box: Ints, body: Ints, bodies: Bodies,
         bound[mine] = cut_edges(rays.box[mine], boxes.cameras[i], boxes.settings)
     views = replace(boxes, rays=rays, body=body, bound=bound)
     rough = views.edges()
-    kinds = [edge_gaps(rough, bodies.values, kind)[2] for kind in (CUBOID, ELLIPSOID)]
-    touched = np.where(_is_cuboid(rough, bodies)[:, None, None], *kinds)
+    touched = touched_points(rough, bodies.values, bodies.shape)
     return replace(views, bound=bound | _touches_outside(views, touched)).edges(touched)
 
 
@@ -173,17 +172,12 @@ def _touches_outside(views: BoxViews, touched: Floats) -> Bools:
     return before | after | (depth <= 0)
 
 
-def _is_cuboid(edges: BoxEdges, bodies: Bodies) -> Bools:
-    return bodies.shape[edges.body] == SHAPES.index("cuboid")
-
-
 def _deviations(edges: BoxEdges, bodies: Bodies) -> tuple[Floats, Floats]:
     """Return by how much boxes differ from the predicted boxes of their bodies (B, 4), and which differences (B, 4) count.
 
     The differences are in standard deviations of boxes and bodies together.
     """
-    cuboid = _is_cuboid(edges, bodies)
-    kinds = (vars(residuals(edges, bodies.values, kind)).values() for kind in (CUBOID, ELLIPSOID))
-    value, by, use = (np.where(cuboid.reshape(-1, *[1] * (a.ndim - 1)), a, b)[:, :4] for a, b in zip(*kinds, strict=True))
+    found = residuals_of_shapes(edges, bodies.values, bodies.shape)
+    value, by, use = found.value[:, :4], found.by[:, :4], found.use[:, :4]
     own = np.einsum("bri,bij,brj->br", by, bodies.covariance[edges.body], by)
     return value / np.sqrt(own + spread_of(edges, bodies.factors, bodies.share)[:, :4] ** 2), use

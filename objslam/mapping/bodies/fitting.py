@@ -1,4 +1,4 @@
-"""Give the objects of a solution bodies: upright spheres, ellipsoids and cuboids that fit the edges of their boxes."""
+"""Give the objects of a solution bodies: upright shapes that fit the edges of their boxes."""
 
 from __future__ import annotations
 
@@ -145,9 +145,11 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
     # A detector may draw all boxes of an object too large or beside it. This error repeats from all sides.
     covariance[:3, :3] += (found.share[0] * half.mean()) ** 2 * np.eye(3)
     covariance[[3, 6], [3, 6]] += found.share[1] ** 2
+    to_size = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # from half axes to sizes
     slope = found.slope[at].copy()
-    slope[3:6] *= 2.0  # from half axes to sizes
+    slope[:6] *= to_size[:, None]
     covariance = slope @ covariance @ slope.T
+    covariance[:6, :6] += found.between_shapes[at] * np.outer(to_size, to_size)
     covariance[:3, :3] += extra
     sigma = np.sqrt(np.diagonal(covariance))
     body = Body(SHAPES[found.shape[at]], 2 * half, float(yaw), sigma[3:6], min(float(sigma[6]), UNKNOWN_YAW))

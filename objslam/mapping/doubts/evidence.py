@@ -49,12 +49,11 @@ def evidence_of(result: RunResult) -> Evidence:
     """Return the evidence of a result. Its landmarks are the resolved objects. Frames without a box count as misses if the
     result has its views."""
     rays, settings, labels = result.rays, result.settings, len(result.rays.label_names)
-    solved = replace(result.keyframes, map_T_base=result.map_T_base)
     if settings.mode == "fixed":
         sigma, place = pose_noise(rays, result.keyframes, settings)
     else:
         sigma, place = rays.sigma, 0.0
-    frames, keyframe = _all_frames(solved, result.views)
+    frames, keyframe = all_frames(result)
     poses = frames.map_T_camera
     in_frames = replace(rays, keyframe=keyframe[rays.keyframe])
     obs, ray, order = observe(in_frames, frames, result.cameras, poses, sigma, place)
@@ -77,8 +76,12 @@ def evidence_of(result: RunResult) -> Evidence:
     return Evidence(state, known, ray, left, covariance, gate)
 
 
-def _all_frames(keyframes: Keyframes, views: Keyframes | None) -> tuple[Keyframes, Ints]:
-    """Return all camera frames of a drive, and the index (K,) of each keyframe among them."""
+def all_frames(result: RunResult) -> tuple[Keyframes, Ints]:
+    """Return all camera frames of a drive at their solved poses, and the index (K,) of each keyframe among them.
+
+    A result without views has only the keyframes.
+    """
+    keyframes, views = replace(result.keyframes, map_T_base=result.map_T_base), result.views
     own = np.arange(len(keyframes))
     if views is None or not len(views):
         return keyframes, own

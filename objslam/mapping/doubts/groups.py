@@ -44,6 +44,12 @@ _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
 """The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger
 number, fewer groups have this reason."""
+_FITTED = 6
+"""A point that moves has six parameters: its place and its velocity. It explains as many of the measured coordinates, two
+for each ray, in any case. With a larger number, fewer groups of few rays are said to move."""
+_MOVES = np.log(20.0)
+"""The least log odds of a motion over rest for a group that is said to move. Boxes of a thing at rest, seen
+under little parallax, reach 2.5 if they share an error. With larger odds, fewer groups are said to move."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +121,13 @@ def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
     return _described(evidence, groups, np.array(kinds, dtype=np.int64), np.array(owners, dtype=np.int64), settings)
 
 
+def described_group(evidence: Evidence, rays: Ints, settings: Settings) -> BoxGroups:
+    """Return one group of given rays (n,) of one label, none of which belongs to an object, with the reason why."""
+    free = replace(evidence.state, matched=np.where(evidence.left, -1, evidence.state.matched))
+    mine = np.flatnonzero(np.isin(evidence.ray, rays))
+    return _described(replace(evidence, state=free), [mine], np.array([_OPEN]), np.array([-1]), settings)
+
+
 def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints, settings: Settings) -> BoxGroups:
     """Describe groups of rays. reason: (G,) index into `REASONS`, `_OPEN` if it is not known. owner: (G,) the landmark on
     which the boxes lie, or -1."""
@@ -131,7 +144,9 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
         "moves": rest_odds(state)[known:],
     }
     thing, chance = np.sum(list(odds.values()), axis=0), chance_odds(state, evidence.gate)[known:]
-    worst = np.argmin(list(odds.values()), axis=0)
+    rest = rest_odds(state, _FITTED)[known:]
+    sure = {**odds, "moves": np.where(rest < -_MOVES, rest, 0.0)}
+    worst = np.argmin(list(sure.values()), axis=0)
     parallax = np.array([widest_angle(obs.direction[rays]) for rays in groups])
     distance = np.linalg.norm(points.position[points.group] - obs.origin[points.ray], axis=1)
     measured = obs.range[points.ray]

@@ -69,7 +69,7 @@ def _splits(result: RunResult, splits: Splits) -> Iterator[Doubt]:
             "split",
             "may be two",
             o.label,
-            f"{_name(o)} may be two: {m} of its rays meet near {_place(one)} and {n} near {_place(two)}, "
+            f"{_name(o)} may be two: {m} of its rays meet near {in_place(one)} and {n} near {in_place(two)}, "
             f"{_length(splits.gap[i])} apart as seen, where 3 sigma of a ray are {_length(3 * splits.noise[i])}{both}.",
             (o.id,),
             o.position,
@@ -109,14 +109,14 @@ def _groups(result: RunResult, groups: BoxGroups) -> Iterator[Doubt]:
             (near.id,) if near is not None and (reason == "on an object" or _is_beside(near, label, groups.away[g])) else ()
         )
         placed = reason not in ("fixed in the image", "on an object", "follow")
-        where = f" near {_place(groups.position[g])}" if placed else ""
+        where = f" near {in_place(groups.position[g])}" if placed else ""
         beside = f" It is {_length(groups.away[g])} from {_name(near)}." if placed and about and near is not None else ""
         place = near.position if reason == "on an object" and near is not None else groups.position[g] if placed else None
         yield Doubt(
             "boxes",
             reason,
             label,
-            f"{number[g]} {label} boxes{where}{_reason(result, groups, g, np.sort(rays[g]))}.{beside}",
+            f"{number[g]} {label} boxes{where}{why_no_object(result, groups, g, np.sort(rays[g]))}.{beside}",
             about,
             place,
             np.sort(rays[g]),
@@ -133,7 +133,7 @@ def _is_beside(o: MapObject, label: str, away: float) -> bool:
     return away <= (_BESIDE if o.label == label else max(o.extent or (0.0,)) / 2)
 
 
-def _reason(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> str:
+def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> str:
     """Return the end of the sentence about a group: why its boxes are no object. rays: its rows in the rays of the
     result."""
     label = result.rays.label_names[groups.label[g]]
@@ -194,7 +194,8 @@ def _name(o: MapObject) -> str:
     return f"{o.label} #{o.id}"
 
 
-def _place(position: Floats) -> str:
+def in_place(position: Floats) -> str:
+    """Return a position (3,), m, in words."""
     return f"({position[0]:.2f}, {position[1]:.2f}, {position[2]:.2f})"
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.object_map import MapObject, ObjectMap
+from objslam.core.object_map import Fate, MapObject, ObjectMap
 from objslam.errors import printable
 from objslam.mapping.sites.compare import Change, Comparison
 from objslam.output.plot.figure import Colour, Figure, Label, Line, Marks, Shape
@@ -30,16 +30,18 @@ _WHITE: Colour = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class _Look:
-    """The mark of an outcome. Its kind differs too, so that the picture is readable without colours."""
+    """The mark of an outcome. Its kind differs too, so that the picture is readable without colours. words: what the legend
+    says after the name."""
 
     colour: Colour
     kind: Literal["dot", "plus", "x", "diamond"]
     hollow: bool = False
+    words: str = ""
 
 
-_LOOKS = {
+_LOOKS: dict[str, _Look] = {
     "confirmed": _Look((0.294, 0.333, 0.388), "dot"),
-    "unconfirmed": _Look((0.463, 0.463, 0.463), "dot", hollow=True),
+    "unconfirmed": _Look((0.463, 0.463, 0.463), "dot", hollow=True, words=": only one had it in view"),
     "new": _Look((0.102, 0.498, 0.216), "plus"),
     "moved": _Look((0.043, 0.388, 0.773), "diamond"),
     "gone": _Look((0.761, 0.184, 0.184), "x"),
@@ -49,7 +51,7 @@ _LOOKS = {
 
 def draw_site(objects: ObjectMap) -> bytes:
     """Return a PNG of the map of a site, with what became of each object."""
-    items = [(_outcome(o), o) for o in (*objects.objects, *objects.gone)]
+    items = [(outcome_of(o), o) for o in (*objects.objects, *objects.gone)]
     return render(changes_figure(items, f"{len(objects)} objects"))
 
 
@@ -91,13 +93,19 @@ def changes_figure(items: Sequence[tuple[str, MapObject]], title: str, names: Se
         if outcome == "moved":
             shapes += _arrows(before[mine], points[mine], look.colour)
         face, rim = (_WHITE, look.colour) if look.hollow else (look.colour, _WHITE)
-        marks.append(Marks(points[mine], look.kind, face, rim, _MARK, f"{outcome} ({int(mine.sum())})"))
+        marks.append(Marks(points[mine], look.kind, face, rim, _MARK, f"{outcome} ({int(mine.sum())}){look.words}"))
     figure = Figure(title, ("x", "y"), low - wider, high + wider, scale, (*shapes, *marks))
     return replace(figure, labels=_labels(figure, items, points, names))
 
 
-def _outcome(o: MapObject) -> str:
+def outcome_of(o: MapObject) -> Fate:
+    """Return what became of an object of a site."""
     return "confirmed" if o.life is None else o.life.state
+
+
+def outcome_colour(outcome: Fate) -> Colour:
+    """Return the colour of an outcome in all pictures and pages of a site."""
+    return _LOOKS[outcome].colour
 
 
 def _before(o: MapObject) -> Floats:

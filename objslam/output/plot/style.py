@@ -17,6 +17,8 @@ from objslam.errors import printable
 
 RayKind = Literal["used", "rejected", "unexplained"]
 """The kind of a ray: used for its object, rejected as an outlier of its object, or unexplained by any object."""
+DrawnShape = Literal["ellipsoid", "cuboid", "cylinder"]
+"""The shapes in which pictures show bodies."""
 
 REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value. A larger value rejects more.
 _USUAL_REACH = 2.0  # Rays are drawn with this length, m, if no ray has an object.
@@ -37,7 +39,7 @@ _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
 exceeds its width by more than the second number times the standard deviation of their difference. Three sigmas of 15 degrees
 reach the direction in which a square has its sides in place of its corners. Without the second number, a bottle of TUM
 fr3_office was a square. A larger first and a smaller second number draw more round things as turned squares."""
-_OUTLINE_POINTS = 96  # A round body is drawn with this many points, which labels avoid. With fewer, labels get between them.
+_OUTLINE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _MOST, _FENCE = 0.9, (2.0, 0.15, 1.0)
 """A picture shows an object if its distance from the path is at most the largest of three distances: a multiple of the
 distance within which the first share of the objects lies, a share of the diagonal of the path's bounding box, and a length,
@@ -139,18 +141,24 @@ def ellipsoid(o: MapObject) -> tuple[Floats, Floats] | None:
     return 2.0 * np.sqrt(np.maximum(values, 0.0)), axes
 
 
-def has_corners(body: Body) -> bool:
-    """Return whether a picture shows a body with corners: a cuboid whose heading is known. Else it is round.
+def drawn_shape(body: Body) -> DrawnShape:
+    """Return the shape in which pictures show a body.
 
-    The heading is the direction of the length, so it is known only if the length is the longer side for sure.
+    A sphere is an ellipsoid. A cuboid whose heading is not known is a cylinder of its length, width and height, because its
+    corners may be anywhere around it. The heading is the direction of the length, so it is known only if the length is the
+    longer side for sure.
     """
+    if body.shape != "cuboid":
+        return "cylinder" if body.shape == "cylinder" else "ellipsoid"
     length, width, _ = body.size
     told_apart = length - width > _LONGER * np.hypot(*body.size_sigma[:2])
-    return bool(body.shape == "cuboid" and body.yaw_sigma < _KNOWN_HEADING and told_apart)
+    return "cuboid" if body.yaw_sigma < _KNOWN_HEADING and told_apart else "cylinder"
 
 
 def body_outline(o: MapObject, sigmas: float = 0.0) -> Floats | None:
     """Return the closed outline (n, 2), m, of an object's body seen from above, along z. None for a point.
+
+    It is a rectangle if the body is drawn as a cuboid (`drawn_shape`), and an ellipse otherwise.
 
     sigmas: the standard deviations that are added to its length and width. None if no length or width is left.
     """
@@ -160,7 +168,7 @@ def body_outline(o: MapObject, sigmas: float = 0.0) -> Floats | None:
     size = body.size + sigmas * body.size_sigma
     if (size[:2] <= 0).any():
         return None
-    if has_corners(body):
+    if drawn_shape(body) == "cuboid":
         corners = footprint((o.position, size, body.yaw))
         return np.concatenate([corners, corners[:1]])
     turn = np.linspace(0, 2 * np.pi, _OUTLINE_POINTS)

@@ -32,8 +32,11 @@
     const near = () => 0.02 * view.distance;
     // Look from a direction, so far away that objects and path fill the view. Those outside low and high do not count.
     const inside = p => p.every((x, i) => x >= data.low[i] - 1e-3 && x <= data.high[i] + 1e-3);
-    const whole = [...objects.map(o => o.at), ...Array.from({length: path.length / 3}, (_, i) => [...path.subarray(3 * i, 3 * i + 3)])]
-      .filter(inside);
+    // One of the eight corners of the upright box around a body. Three bits say on which side of the centre it is.
+    const corner = (o, bits) => o.at.map((x, i) => o.body.reduce((sum, a, k) => sum + (bits >> k & 1 ? a[i] : -a[i]), x));
+    const seenOf = o => o.body.length ? [0, 1, 2, 3, 4, 5, 6, 7].map(bits => corner(o, bits)) : [o.at];
+    const way = Array.from({length: path.length / 3}, (_, i) => [...path.subarray(3 * i, 3 * i + 3)]);
+    const whole = [...objects.filter(o => inside(o.at)).flatMap(seenOf), ...way.filter(inside)];
     if (!whole.length) whole.push(data.low, data.high);
     const fit = ({azimuth, height}) => {
       view = {azimuth, height, distance: 2 * size, target: [...middle]}; fitted = true;
@@ -112,12 +115,34 @@
       pen.globalAlpha = fill; pen.fillStyle = shade(o.colour); pen.fill();
       pen.globalAlpha = 0.8; pen.strokeStyle = shade(o.colour); pen.lineWidth = width; pen.stroke(); pen.globalAlpha = 1;
     };
-    // A cuboid by its twelve edges, another body by its outline.
+    // A cuboid by its twelve edges.
+    const traceCuboid = o => {
+      const at = bits => project(...corner(o, bits));
+      for (let bits = 0; bits < 8; bits++) for (const bit of [1, 2, 4]) if (!(bits & bit)) segment(at(bits), at(bits | bit));
+    };
+    // An upright cylinder by its two rims, and the two lines where planes through the view point touch its side.
+    const traceCylinder = o => {
+      const [along, across, up] = o.body, step = Math.PI / 24;
+      const rim = (turn, end) => {
+        const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
+        return project(...o.at.map((x, i) => x + cos * along[i] + sin * across[i] + end * up[i]));
+      };
+      for (const end of [-1, 1]) for (let k = 0; k < 48; k++) segment(rim(k * step, end), rim((k + 1) * step, end));
+      // The view point in units of the half axes, in which the section is the unit circle.
+      const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
+      const to = frame.eye.map((x, i) => x - o.at[i]), [x, y] = [along, across].map(a => dot(a, to) / dot(a, a));
+      const away = Math.hypot(x, y);
+      if (!(away > 1)) return;
+      for (const side of [-1, 1]) {
+        const turn = Math.atan2(y, x) + side * Math.acos(1 / away);
+        segment(rim(turn, -1), rim(turn, 1));
+      }
+    };
+    // Cuboids and cylinders by their edges, an ellipsoid by its outline.
     const drawBody = (o, p) => {
-      if (!o.cuboid) return outline(o, o.body, p, 0, 2);
-      const corner = bits => project(...o.at.map((x, i) => o.body.reduce((sum, a, k) => sum + (bits >> k & 1 ? a[i] : -a[i]), x)));
+      if (o.shape === "ellipsoid") return outline(o, o.body, p, 0, 2);
       pen.beginPath(); pen.strokeStyle = shade(o.colour); pen.lineWidth = 2;
-      for (let bits = 0; bits < 8; bits++) for (const bit of [1, 2, 4]) if (!(bits & bit)) segment(corner(bits), corner(bits | bit));
+      if (o.shape === "cuboid") traceCuboid(o); else traceCylinder(o);
       pen.stroke();
     };
     const drawObjects = () => {

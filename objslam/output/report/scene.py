@@ -1,6 +1,7 @@
 """The data of the 3D view on the page: what scene.js draws, in a frame that has z up."""
 
 import base64
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,14 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory, Truth, Up
 from objslam.frontend.up import from_above, up_vector
 from objslam.io.rays_parquet import RaysTable
+from objslam.output.plot.figure import Colour
 from objslam.output.plot.style import (
     REJECTED_BELOW,
     captions,
+    drawn_shape,
     ellipsoid,
     evenly,
     frame_objects,
-    has_corners,
     label_colours,
     sample,
 )
@@ -32,16 +34,22 @@ def upright(up: Up) -> Floats:
 
 
 def scene_data(
-    objects: ObjectMap, rays: RaysTable | None, path: Trajectory | None, truth: Truth | None, up: Up
+    objects: ObjectMap,
+    rays: RaysTable | None,
+    path: Trajectory | None,
+    truth: Truth | None,
+    up: Up,
+    colours: Sequence[Colour] | None = None,
 ) -> dict[str, Any]:
     """Return the data as JSON values. Positions are in the frame of the view, m.
 
     The rays, the path and the true path are float32 arrays in base64. A site has neither rays nor a path. "axes" are the
     map's axes in the frame of the view. truth: the ground truth in the frame of the map. up: the axis of the map that points
-    up.
+    up. colours: of the objects, those of their labels by default.
     """
     turn = upright(up)
-    names, colours = captions(objects), label_colours(objects)
+    names, of_label = captions(objects), label_colours(objects)
+    colours = [of_label[o.label] for o in objects] if colours is None else colours
     shown = [i for i, o in enumerate(objects) if np.isfinite(o.position).all()]
     positions = objects.positions @ turn.T
     way = np.zeros((0, 3)) if path is None else path.poses[:, :3, 3] @ turn.T
@@ -54,12 +62,12 @@ def scene_data(
             {
                 "id": objects[i].id,
                 "name": names[i],
-                "colour": hexadecimal(colours[objects[i].label]),
+                "colour": hexadecimal(colours[i]),
                 "ok": objects[i].status == "ok",
                 "at": positions[i].round(3).tolist(),
                 "axes": _half_axes(objects, i, turn),
                 "body": _body(objects, i, turn),
-                "cuboid": (body := objects[i].body) is not None and has_corners(body),
+                "shape": "point" if (body := objects[i].body) is None else drawn_shape(body),
             }
             for i in shown
         ],

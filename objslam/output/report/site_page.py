@@ -7,7 +7,8 @@ from pathlib import Path
 from objslam.core.object_map import FATES, Life, ObjectMap
 from objslam.core.validity import is_date
 from objslam.io.atomic_files import write_file
-from objslam.output.plot.style import captions, label_colours
+from objslam.output.plot.changes_plot import outcome_colour, outcome_of
+from objslam.output.plot.style import captions
 from objslam.output.report.render import render
 from objslam.output.report.scene import hexadecimal, scene_data
 from objslam.results.files import PICTURE, REPORT
@@ -18,21 +19,22 @@ def write_site_report(out: Path) -> Path:
     """Write report.html into the folder `out` of a site, and return its path. OutputError if the map cannot be read."""
     objects, summary = load_map(out), load_summary(out)
     every = ObjectMap((*objects, *objects.gone))
-    colours = label_colours(every)
+    colours = [outcome_colour(outcome_of(o)) for o in every]  # As in the picture of the site.
     number = Counter(o.life.state for o in every if o.life is not None)
     picture = out / PICTURE
+    there = colours[: len(objects)]
     page = render(
         "site.html.jinja",
-        scene=scene_data(objects, None, None, None, summary.get("up", "z")) if len(objects) else None,
+        scene=scene_data(objects, None, None, None, summary.get("up", "z"), there) if len(objects) else None,
         folder=out.resolve().name,
         frame=objects.frame,
         picture=picture.read_bytes() if picture.is_file() else None,
-        states=[(state, number[state]) for state in FATES if number[state]],
+        states=[(state, number[state], hexadecimal(outcome_colour(state))) for state in FATES if number[state]],
         sessions=summary.get("sessions", []),
         warnings=summary.get("warnings", []),
         rows=[
-            {"object": o, "name": name, "colour": hexadecimal(colours[o.label]), "updated": _date(o.life)}
-            for o, name in zip(every, captions(every), strict=True)
+            {"object": o, "name": name, "colour": hexadecimal(colour), "updated": _date(o.life)}
+            for o, name, colour in zip(every, captions(every), colours, strict=True)
         ],
     )
     write_file(out / REPORT, page.encode("utf-8", errors="replace"))

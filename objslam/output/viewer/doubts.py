@@ -29,5 +29,6 @@ def log_doubts(recording: Any, result: RunResult) -> None:
 
 def caption(doubt: Doubt) -> str:
     """Return a few words that say what a doubt is."""
-    number = f"{len(doubt.rays)} " if doubt.kind == "boxes" else ""
+    boxes = len(doubt.rays) or int(doubt.numbers.get("boxes_cut_off", 0))
+    number = f"{boxes} " if doubt.kind == "boxes" else ""
     return printable(f"{number}{doubt.label}: {doubt.reason}")

@@ -13,7 +13,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.rotation import quaternion_from_rotation
 from objslam.core.types import Truth
 from objslam.errors import printable
-from objslam.output.plot.style import captions, ellipsoid, has_corners, object_colours
+from objslam.output.plot.style import DrawnShape, captions, drawn_shape, ellipsoid, object_colours
 from objslam.output.viewer.view_point import ViewPoint, label_places
 
 _MAX_LABELS = 60  # The most objects of a map whose labels show at first. More labels would overlap.
@@ -30,10 +30,10 @@ def colours(objects: ObjectMap) -> list[tuple[int, int, int]]:
 def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path: Floats, *, static: bool = True) -> None:
     """Log the resolved objects as points, `map/objects`, and the entities below it.
 
-    `uncertainty` has the 2-sigma ellipsoids of resolved objects, and `extent` has boxes of their size. `bodies` has
-    filled ellipsoids, and `cuboids` has boxes, of objects with a body. `tags` has the outlines of fiducials, and `tags/axes`
-    has their axes: x red, y green, z blue. `unresolved` has the ray of each unresolved object. `labels` has the captions of
-    all objects.
+    `uncertainty` has the 2-sigma ellipsoids of resolved objects, and `extent` has boxes of their size. `ellipsoids`,
+    `cuboids` and `cylinders` have the bodies of objects, filled. `tags` has the outlines of fiducials, and `tags/axes` has
+    their axes: x red, y green, z blue. `unresolved` has the ray of each unresolved object. `labels` has the captions of all
+    objects.
 
     Args:
         path: (K, 3) points, m in map, that labels should not cover.
@@ -42,9 +42,9 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
     """
     every, texts, colour = objects.objects, captions(objects), colours(objects)
 
-    def log(name: str, archetype: Any, some: bool) -> None:
+    def log(name: str, archetype: Any, some: bool, *more: Any) -> None:
         if some or not static:
-            recording.log(f"map/objects{name}", archetype, static=static)
+            recording.log(f"map/objects{name}", archetype, *more, static=static)
 
     resolved = [i for i, o in enumerate(every) if o.status == "ok"]
     dots, shades = [every[i].position for i in resolved], [colour[i] for i in resolved]
@@ -87,20 +87,23 @@ def log_objects(recording: Any, objects: ObjectMap, view_point: ViewPoint, path:
 
 
 def _log_bodies(log: Any, bodies: list[tuple[Floats, Body, tuple[int, int, int]]]) -> None:
-    """Log bodies as filled ellipsoids, and as cuboids if the heading is known. The 2-sigma ellipsoids are lines."""
-    for name, kind, some in (
-        ("/bodies", rr.Ellipsoids3D, [one for one in bodies if not has_corners(one[1])]),
-        ("/cuboids", rr.Boxes3D, [one for one in bodies if has_corners(one[1])]),
-    ):
+    """Log bodies, filled, in the shapes in which pictures show them. The 2-sigma ellipsoids are lines."""
+    shapes: tuple[DrawnShape, ...] = ("ellipsoid", "cuboid", "cylinder")
+    for shape in shapes:
+        some = [one for one in bodies if drawn_shape(one[1]) == shape]
+        places, sizes = [place for place, _, _ in some], [body.size for _, body, _ in some]
         turns = lift_se2(np.array([[0.0, 0.0, body.yaw] for _, body, _ in some]).reshape(-1, 3))[:, :3, :3]
-        shapes = kind(
-            centers=[place for place, _, _ in some],
-            half_sizes=[body.size / 2 for _, body, _ in some],
-            quaternions=quaternion_from_rotation(turns) if some else [],
-            colors=[(*colour, _OPACITY) for _, _, colour in some],
-            fill_mode="solid",
-        )
-        log(name, shapes, bool(some))
+        quaternions = quaternion_from_rotation(turns)
+        look: dict[str, Any] = {"colors": [(*colour, _OPACITY) for _, _, colour in some], "fill_mode": "solid"}
+        if shape == "cylinder":
+            # A cylinder of rerun has one radius, but each may be scaled to its own length, width and height.
+            poses = rr.InstancePoses3D(translations=places, quaternions=quaternions, scales=sizes)
+            unit = rr.Cylinders3D(lengths=np.ones(len(some)), radii=np.full(len(some), 0.5), **look)
+            log("/cylinders", unit, bool(some), poses)
+            continue
+        kind = rr.Boxes3D if shape == "cuboid" else rr.Ellipsoids3D
+        half = [size / 2 for size in sizes]
+        log(f"/{shape}s", kind(centers=places, half_sizes=half, quaternions=quaternions, **look), bool(some))
 
 
 def _log_tags(log: Any, tags: list[tuple[Floats, TagPose, tuple[int, int, int]]]) -> None:

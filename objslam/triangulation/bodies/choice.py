@@ -1,4 +1,4 @@
-"""The choice between a point, a sphere, an ellipsoid and a cuboid by their evidence (Laplace's method; MacKay 1992).
+"""The choice between a point, a sphere, an ellipsoid, a cuboid and a cylinder by their evidence (Laplace; MacKay 1992).
 
 A point explains the place of a box, but not its size, so each size is equally probable. A body explains both. But it has
 more parameters, and the wider their priors are, the lower is its evidence (Occam's factor).
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import CAUCHY_K
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, Prior, Weights
@@ -32,3 +32,16 @@ def log_evidence(edges: BoxEdges, fit: Fit, prior: Prior, weights: Weights, *, f
     penalty = 0.5 * np.einsum("ni,nij,nj->n", off, prior.information, off)
     volume = 0.5 * (np.linalg.slogdet(prior.information)[1] - np.linalg.slogdet(fit.information)[1])
     return np.asarray(own - penalty + volume)
+
+
+def shapes_disagree(evidence: Floats, axes: Floats, chosen: Ints) -> Floats:
+    """Return by how much the shapes that fit about as well differ from the chosen ones, as covariances (N, A, A).
+
+    evidence: (S, N) the logarithm of the evidence of each shape. axes: (S, N, A) centres and half axes, m, of the bodies of
+    each shape, NaN for what a shape does not tell. chosen: (N,). The result is the second moment about the chosen shape: a
+    mixture's covariance has it beside the covariances of its parts (Hoeting et al. 1999, Bayesian model averaging).
+    """
+    chance = np.exp(evidence - evidence.max(axis=0))
+    chance /= chance.sum(axis=0)
+    away = np.nan_to_num(axes - axes[chosen, np.arange(len(chosen))])
+    return np.asarray(np.einsum("sn,sna,snb->nab", chance, away, away))

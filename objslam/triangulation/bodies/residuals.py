@@ -14,7 +14,7 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.triangulation.bodies.edges import BoxEdges
-from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
+from objslam.triangulation.bodies.shapes import PARAMETERS, Kind, rows_of_kinds
 
 ROWS = 5
 """The residuals of a box: its shift in two axes and half its size in two axes, px, and its range, m."""
@@ -72,6 +72,23 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
         use[row, place] = ~(edges.bound[row, place] & (off[row, place] > 0))
     value[:, 4], jacobian[:, 4], use[:, 4] = _ranges(edges, values, kind)
     return Residuals(value, jacobian, use)
+
+
+def residuals_of_shapes(edges: BoxEdges, values: Floats, shape: Ints) -> Residuals:
+    """Return the residuals of bodies (N, 7) with shapes (N,), indices of `core.bodies.body.SHAPES`."""
+    count = len(edges)
+    found = Residuals(np.empty((count, ROWS)), np.empty((count, ROWS, PARAMETERS)), np.empty((count, ROWS)))
+    for kind, boxes in rows_of_kinds(shape[edges.body]):
+        found.put(boxes, residuals(edges.take(boxes), values, kind))
+    return found
+
+
+def touched_points(edges: BoxEdges, values: Floats, shape: Ints) -> Floats:
+    """Return the points (B, 4, 3) in map at which bodies (N, 7) with shapes (N,) come closest to the planes."""
+    points = np.empty((len(edges), 4, 3))
+    for kind, boxes in rows_of_kinds(shape[edges.body]):
+        points[boxes] = edge_gaps(edges.take(boxes), values, kind)[2]
+    return points
 
 
 def nominal_noise(edges: BoxEdges) -> Floats:

@@ -1,6 +1,6 @@
-"""The two kinds of bodies, an upright ellipsoid and an upright cuboid, with the same functions for both.
+"""The kinds of bodies: upright ellipsoids, cuboids and cylinders, with the same functions for all.
 
-Both have seven parameters: the centre x, y, z (m), a number p and two numbers of the horizontal section, and the logarithm k
+All have seven parameters: the centre x, y, z (m), a number p and two numbers of the horizontal section, and the logarithm k
 of the half axis upwards. p is the mean logarithm of the horizontal half axes. `support` returns how far tangent planes are
 from the centre, `ranges` how far the surface is along rays.
 """
@@ -11,8 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from objslam.core.arrays import Bools, Floats
-from objslam.triangulation.bodies import cuboid, ellipsoid
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.triangulation.bodies import cuboid, cylinder, ellipsoid
 
 PARAMETERS = 7
 """The number of parameters of a body."""
@@ -42,5 +44,13 @@ def _kind(module: Any) -> Kind:
     return Kind(module.support, module.ranges, module.half_axes, module.heading, module.axes_jacobian)
 
 
-ELLIPSOID, CUBOID = _kind(ellipsoid), _kind(cuboid)
+ELLIPSOID, CUBOID, CYLINDER = _kind(ellipsoid), _kind(cuboid), _kind(cylinder)
 """The kinds of bodies. A sphere is an ellipsoid with a tight prior."""
+KINDS = (ELLIPSOID, ELLIPSOID, ELLIPSOID, CUBOID, CYLINDER)
+"""The kind of each shape, in the order of `core.bodies.body.SHAPES`."""
+
+
+def rows_of_kinds(shape: Ints) -> list[tuple[Kind, Ints]]:
+    """Return each kind that shapes (N,) have, with the indices of its shapes."""
+    kind = np.array([KINDS.index(one) for one in KINDS])[shape]
+    return [(KINDS[one], np.flatnonzero(kind == one)) for one in np.unique(kind).tolist()]

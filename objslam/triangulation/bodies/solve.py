@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.triangulation.bodies.choice import log_evidence
+from objslam.core.bodies.body import SHAPES
+from objslam.triangulation.bodies.choice import log_evidence, shapes_disagree
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, Prior, Weights, fit
 from objslam.triangulation.bodies.prior import cuboid_prior, dot_prior, known_sizes, label_prior, sphere_prior, weak_prior
-from objslam.triangulation.bodies.residuals import Residuals, edge_gaps, residuals
-from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+from objslam.triangulation.bodies.residuals import Residuals, residuals_of_shapes, touched_points
+from objslam.triangulation.bodies.shapes import CUBOID, CYLINDER, ELLIPSOID, KINDS, rows_of_kinds
 from objslam.triangulation.bodies.shared import (
     Sides,
     covariance_of,
@@ -30,7 +31,9 @@ Measure = Callable[[Floats | None], BoxEdges]
 More = Callable[["Bodies"], "BoxEdges | None"]
 """More edges that can only be found with the bodies, such as those of cut off boxes. None if there are none."""
 
-_POINT, _SPHERE, _ELLIPSOID, _CUBOID = range(4)
+_POINT, _SPHERE, _ELLIPSOID, _CUBOID, _CYLINDER = range(5)
+_SOLID = (_ELLIPSOID, _CUBOID, _CYLINDER)
+"""The shapes with three free half axes."""
 _ROUNDS = 2
 """How often the noise is estimated from the residuals of the last fit. More rounds are slower and change little."""
 _PER_SIDE = 3
@@ -48,11 +51,12 @@ _ENOUGH = 1e-3
 class Bodies:
     """The bodies of N objects.
 
-    values: (N, 7) parameters of a cuboid or of an ellipsoid (see `shapes`). covariance: (N, 7, 7). shape: (N,) 0 point, 1
-    sphere, 2 ellipsoid, 3 cuboid. evidence: (4, N) the logarithm of the evidence of each shape. weight: (B,) the robust
+    values: (N, 7) parameters of the body's kind (see `shapes`). covariance: (N, 7, 7). shape: (N,) 0 point, 1 sphere, 2
+    ellipsoid, 3 cuboid, 4 cylinder. evidence: (5, N) the logarithm of the evidence of each shape. weight: (B,) the robust
     weight of each box. share: (2,) the standard deviations of the errors of shift and size that boxes of one side share, as
     shares of half their size. factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to
-    the centre of each body, minus that to the centre of its predicted box, in map. It is 0 for a point.
+    the centre of each body, minus that to the centre of its predicted box, in map. It is 0 for a point. between_shapes: (N,
+    6, 6) the second moment of centre and half axes, m, over the shapes, about the chosen one. It is not in `covariance`.
     """
 
     values: Floats
@@ -63,45 +67,47 @@ class Bodies:
     share: Floats
     factors: Floats
     to_centre: Floats
+    between_shapes: Floats
 
     @property
     def axes(self) -> Floats:
         """(N, 7) centre, m, half axes, m, and yaw, rad."""
-        return self._by_kind("axes")
+        axes = np.empty_like(self.values)
+        for kind, rows in rows_of_kinds(self.shape):
+            some = self.values[rows]
+            axes[rows] = np.column_stack([some[:, :3], kind.half_axes(some), kind.heading(some)])
+        return axes
+
+    @property
+    def centre_covariance(self) -> Floats:
+        """(N, 3, 3) m^2, of the centres: with the chosen shape, and between the shapes."""
+        return self.covariance[:, :3, :3] + self.between_shapes[:, :3, :3]
 
     @property
     def slope(self) -> Floats:
         """(N, 7, 7) derivatives of `axes` by the parameters."""
-        return self._by_kind("slope")
-
-    def _by_kind(self, what: str) -> Floats:
-        found = [
-            kind.axes_jacobian(self.values)
-            if what == "slope"
-            else np.column_stack([self.values[:, :3], kind.half_axes(self.values), kind.heading(self.values)])
-            for kind in (ELLIPSOID, CUBOID)
-        ]
-        return _rows(self.shape == _CUBOID, found[1], found[0])
+        slope = np.empty_like(self.covariance)
+        for kind, rows in rows_of_kinds(self.shape):
+            slope[rows] = kind.axes_jacobian(self.values[rows])
+        return slope
 
 
 @dataclass(frozen=True)
 class _State:
     """The noise, the prior and the bodies of the rounds so far.
 
-    rounds, balls, dots: (N, 7) ellipsoids, spheres and points. cuboids: (N, 7), the starts of the next fit. evidence, shape:
-    see `Bodies`. best: the better of ellipsoid and cuboid, None before the first round. covariance: (N, 7, 7) of `best`.
+    fitted: for each shape, its bodies (N, 7), which are the starts of the next fit. evidence, shape: see `Bodies`. best: the
+    best of the solid shapes, None before the first round. solid: (N,) the shape of `best`. covariance: (N, 7, 7) of `best`.
     sized: (N,) whether the size is known, so that no sphere is chosen.
     """
 
     factors: Floats
     share: Floats
     prior: Prior
-    rounds: Floats
-    cuboids: tuple[Floats, ...]
-    balls: Floats
-    dots: Floats
+    fitted: tuple[Floats, ...]
     evidence: Floats
     shape: Ints
+    solid: Ints
     best: Fit | None
     covariance: Floats
     sized: Bools
@@ -134,10 +140,11 @@ def solve_bodies(
     few = some_of_each_side(sides, _PER_SIDE)
     label = np.unique(np.array(names), return_inverse=True)[1].ravel()
     weak = weak_prior(points, half)
-    nothing = np.zeros((4, len(points))), np.zeros(len(points), dtype=np.int64), None, np.zeros((len(points), 7, 7))
-    balls, dots = sphere_prior(weak).mean, dot_prior(weak).mean
+    count, none = len(points), np.zeros(len(points), dtype=np.int64)
+    starts = dot_prior(weak).mean, sphere_prior(weak).mean, *[weak.mean] * len(_SOLID)
+    nothing = np.zeros((len(SHAPES), count)), none, none, None, np.zeros((count, 7, 7))
     sized = np.array([name in (sizes or {}) for name in names])
-    now = _State(np.ones(2), np.full(2, share), weak, weak.mean, (), balls, dots, *nothing, sized)
+    now = _State(np.ones(2), np.full(2, share), weak, starts, *nothing, sized)
     for number in range(_ROUNDS + 1):
         some = edges.take(few)
         some_sides = sides_of(some, points)
@@ -147,9 +154,9 @@ def solve_bodies(
             break
         # An object that fits a point best has no size to learn from, such as a mark that is always drawn at one size.
         own = np.where(now.shape != _POINT, label, -1)
-        prior = label_prior(weak, best.values, now.covariance, own, now.shape == _CUBOID)
+        prior = label_prior(weak, best.values, now.covariance, own, now.solid == _CUBOID)
         if sizes:
-            prior = known_sizes(prior, now.rounds, names, sizes)
+            prior = known_sizes(prior, now.fitted[_ELLIPSOID], names, sizes)
         now = replace(now, prior=prior)
         if learn and (now.shape != _POINT).any():
             which = now.shape != _POINT
@@ -157,40 +164,44 @@ def solve_bodies(
             found = share_of(some, best, some_sides, factors, share, which)
             now = replace(now, factors=factors, share=found)
         if bent:
-            gaps = (edge_gaps(edges, one, kind)[2] for one, kind in ((now.cuboids[0], CUBOID), (now.rounds, ELLIPSOID)))
-            edges = measure(_rows((now.shape == _CUBOID)[edges.body], *gaps))
-    bodies = _finished(edges, sides, now)
+            solid = np.where(np.isin(now.shape, _SOLID), now.shape, _ELLIPSOID)
+            edges = measure(touched_points(edges, _of_shapes(now.fitted, solid), solid))
+    between = shapes_disagree(now.evidence, _axes_of_shapes(now), now.shape)
+    bodies = _finished(edges, sides, now, between)
     others = None if more is None else more(bodies)
     return bodies if others is None else _refitted(edges, others, now, bodies)
 
 
 def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
     """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
-    weights = _weights(edges, sides, now)
-    rounds = fit(edges, now.rounds, now.prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
-    if now.best is None:  # The fit of the cuboid begins at the ellipsoid.
-        now = replace(now, cuboids=_cuboid_starts(rounds.values))
-    square, square_prior = _best_cuboids(edges, now.cuboids, now.prior, weights)
-    ball_prior = sphere_prior(now.prior)
-    ball = fit(edges, now.balls, ball_prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    weights, first = _weights(edges, sides, now), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
+    ball_prior = sphere_prior(now.prior)
+    ball = fit(edges, now.fitted[_SPHERE], ball_prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    rounds = fit(edges, now.fitted[_ELLIPSOID], now.prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    # The first fits of the cuboid and of the cylinder begin at the ellipsoid.
+    starts = _cuboid_starts(rounds.values) if first else (now.fitted[_CUBOID],)
+    square, square_prior = _best_cuboids(edges, starts, now.prior, weights)
+    start = rounds.values if first else now.fitted[_CYLINDER]
+    tube = fit(edges, start, now.prior, weights, CYLINDER, still=_ENOUGH, most=_STEPS)
     evidence = np.stack(
         [
             dot_evidence,
             log_evidence(edges, ball, ball_prior, weights) - np.log(_RARE) - 1e9 * now.sized,
             log_evidence(edges, rounds, now.prior, weights),
             log_evidence(edges, square, square_prior, weights),
+            log_evidence(edges, tube, now.prior, weights),
         ]
     )
-    best = _mixed(evidence[_CUBOID] > evidence[_ELLIPSOID], edges.body, square, rounds)
+    solid = np.array(_SOLID)[evidence[list(_SOLID)].argmax(axis=0)]
+    best = _mixed(solid == _CUBOID, edges.body, square, rounds)
+    best = _mixed(solid == _CYLINDER, edges.body, tube, best)
     return replace(
         now,
-        rounds=rounds.values,
-        cuboids=(square.values,),
-        balls=ball.values,
-        dots=dots,
+        fitted=(dots, ball.values, rounds.values, square.values, tube.values),
         evidence=evidence,
         shape=evidence.argmax(axis=0),
+        solid=solid,
         best=best,
         covariance=covariance_of(edges, best, sides, now.factors, now.share),
     )
@@ -204,9 +215,9 @@ def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> 
     both = replace(both, body=np.searchsorted(mine, both.body))
     start = found.values[mine]
     shape, prior = now.shape[mine], Prior(now.prior.mean[mine], now.prior.information[mine])
-    use = _rows((shape == _CUBOID)[both.body], *(residuals(both, start, kind).use[:, :4] for kind in (CUBOID, ELLIPSOID)))
-    state = replace(now, prior=prior, rounds=start, cuboids=(start,), balls=start, shape=shape)
-    again = _finished(both, sides_of(both, start[:, :3], use), state)
+    use = residuals_of_shapes(both, start, shape).use[:, :4]
+    state = replace(now, prior=prior, fitted=(start,) * len(SHAPES), shape=shape)
+    again = _finished(both, sides_of(both, start[:, :3], use), state, found.between_shapes[mine])
     values, covariance, weight, to_centre = (
         getattr(found, name).copy() for name in ("values", "covariance", "weight", "to_centre")
     )
@@ -215,11 +226,10 @@ def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> 
     return replace(found, values=values, covariance=covariance, weight=weight, to_centre=to_centre)
 
 
-def _finished(edges: BoxEdges, sides: Sides, now: _State) -> Bodies:
-    """Return the bodies of the chosen shapes from all boxes."""
+def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bodies:
+    """Return the bodies of the chosen shapes from all boxes. between: (N, 6, 6), see `Bodies.between_shapes`."""
     weights = _weights(edges, sides, now)
     count, boxes = len(now.shape), len(edges)
-    starts = {_POINT: now.balls, _SPHERE: now.balls, _ELLIPSOID: now.rounds, _CUBOID: now.cuboids[0]}
     values, covariance = np.zeros((count, 7)), np.zeros((count, 7, 7))
     gap, weight = np.zeros((boxes, 2)), np.zeros(boxes)
     for shape in np.unique(now.shape).tolist():
@@ -228,7 +238,7 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State) -> Bodies:
         own = replace(edges.take(at), body=np.searchsorted(mine, edges.body[at]))
         loose = Prior(now.prior.mean[mine], now.prior.information[mine])
         some = Weights(weights.variance[at], weights.spread[at])
-        start, kind = starts[shape][mine], CUBOID if shape == _CUBOID else ELLIPSOID
+        start, kind = now.fitted[max(shape, _SPHERE)][mine], KINDS[shape]
         if shape == _CUBOID:
             loose = cuboid_prior(loose, start)
         tight = sphere_prior(loose) if shape in (_POINT, _SPHERE) else loose
@@ -239,7 +249,21 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State) -> Bodies:
         covariance[mine] = covariance_of(own, best, sides_of(own, best.values[:, :3]), now.factors, now.share)
         gap[at], weight[at] = best.found.value[:, :2], best.weight[:, 0] * some.variance[:, 0]
     to_centre = np.where((now.shape != _POINT)[edges.body, None], _to_centre(edges, values[:, :3], gap), 0.0)
-    return Bodies(values, covariance, now.shape, now.evidence, weight, now.share, now.factors, to_centre)
+    return Bodies(values, covariance, now.shape, now.evidence, weight, now.share, now.factors, to_centre, between)
+
+
+def _axes_of_shapes(now: _State) -> Floats:
+    """Return centres and half axes (5, N, 6), m, of the bodies of each shape. A point tells no half axes."""
+    axes = np.stack(
+        [np.column_stack([v[:, :3], kind.half_axes(v)]) for v, kind in zip(now.fitted, KINDS, strict=True)],
+    )
+    axes[_POINT, :, 3:] = np.nan
+    return axes
+
+
+def _of_shapes(fitted: tuple[Floats, ...], shape: Ints) -> Floats:
+    """Return the body (N, 7) of the given shape (N,) of each object."""
+    return np.stack(fitted)[shape, np.arange(len(shape))]
 
 
 def _weights(edges: BoxEdges, sides: Sides, now: _State) -> Weights:
@@ -272,7 +296,7 @@ def _dots(edges: BoxEdges, now: _State, weights: Weights, side: Floats) -> tuple
     prior, variance, spread = dot_prior(now.prior), weights.variance.copy(), weights.spread.copy()
     variance[:, 2:4] = spread[:, 2:4] = np.inf
     free = replace(weights, variance=variance, spread=spread)
-    found = fit(edges, now.dots, prior, free, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    found = fit(edges, now.fitted[_POINT], prior, free, ELLIPSOID, still=_ENOUGH, most=_STEPS)
     return found.values, log_evidence(edges, found, prior, weights, free_side=side)
 
 

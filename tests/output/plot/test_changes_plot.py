@@ -38,7 +38,8 @@ def test_each_outcome_has_a_mark_of_its_own_at_its_objects() -> None:
     for outcome, one in found.items():
         mine = np.array([o.position[:2] for name, o in items if name == outcome])
         np.testing.assert_array_equal(one.points, mine)
-        assert one.name == f"{outcome} ({len(mine)})"
+        words = ": only one had it in view" if outcome == "unconfirmed" else ""
+        assert one.name == f"{outcome} ({len(mine)}){words}"
     assert sorted(label.text for label in figure.labels) == sorted(f"{o.label} #{o.id}" for _, o in items)
 
 

@@ -13,12 +13,13 @@ from synthetic_result import clusters, synthetic_result
 from objslam.core.bodies.body import Body, Shape
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.output.plot.style import (
+    DrawnShape,
     body_outline,
     captions,
     colours_of,
+    drawn_shape,
     ellipsoid,
     frame_objects,
-    has_corners,
     label_colours,
     ray_ends,
     ray_kinds,
@@ -125,10 +126,17 @@ def test_a_label_has_one_colour_in_all_maps() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "length", "sigma", "corners"),
-    [("cuboid", 0.6, 5, True), ("cuboid", 0.6, 30, False), ("cuboid", 0.35, 5, False), ("ellipsoid", 0.6, 5, False)],
+    ("shape", "length", "sigma", "drawn"),
+    [
+        ("cuboid", 0.6, 5, "cuboid"),
+        ("cuboid", 0.6, 30, "cylinder"),
+        ("cuboid", 0.35, 5, "cylinder"),
+        ("cylinder", 0.6, 5, "cylinder"),
+        ("ellipsoid", 0.6, 5, "ellipsoid"),
+        ("sphere", 0.3, 5, "ellipsoid"),
+    ],
 )
-def test_a_body_has_corners_if_its_heading_is_known(shape: Shape, length: float, sigma: float, corners: bool) -> None:
+def test_a_body_has_corners_if_its_heading_is_known(shape: Shape, length: float, sigma: float, drawn: DrawnShape) -> None:
     body = Body(shape, np.array([length, 0.3, 1.0]), 0.4, np.array([0.05, 0.02, 0.1]), np.radians(sigma))
     thing = dataclasses.replace(_object(0, "post"), body=body)
     outline, wider = body_outline(thing), body_outline(thing, 2.0)
@@ -138,8 +146,8 @@ def test_a_body_has_corners_if_its_heading_is_known(shape: Shape, length: float,
     seen, seen_wider = ((rim - thing.position[:2]) @ axes for rim in (outline, wider))
     np.testing.assert_allclose(np.abs(seen).max(axis=0), [length / 2, 0.15], rtol=1e-3)
     np.testing.assert_allclose(np.abs(seen_wider).max(axis=0), [length / 2 + 0.05, 0.17], rtol=1e-3)
-    assert (np.linalg.norm(seen, axis=1).max() > np.hypot(length / 2, 0.15) - 1e-6) == corners
-    assert has_corners(body) is corners  # bool, because JSON takes no numpy.bool
+    assert (np.linalg.norm(seen, axis=1).max() > np.hypot(length / 2, 0.15) - 1e-6) == (drawn == "cuboid")
+    assert drawn_shape(body) == drawn
     assert body_outline(thing, -13.0) is None  # nothing is left of its length
 
 

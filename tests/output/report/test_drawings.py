@@ -62,11 +62,21 @@ def test_the_view_has_the_map_and_its_rays_with_z_up(up: Up) -> None:
 def test_the_view_has_the_bodies_with_their_headings(up: Up) -> None:
     result, rays, truth = a_map()
     body = Body("cuboid", np.array([0.6, 0.4, 0.9]), np.pi / 3, np.full(3, 0.01), 0.1)
-    first, second, *others = result.map.objects
-    objects = ObjectMap((replace(first, body=body), replace(second, body=replace(body, shape="ellipsoid")), *others))
-    cuboid, ellipsoid, point = scene_data(objects, rays, result.path_after, truth, up)["objects"][:3]
-    assert (cuboid["cuboid"], ellipsoid["cuboid"], point["cuboid"]) == (True, False, False)
+    bodies = (
+        body,
+        replace(body, shape="cylinder"),
+        replace(body, yaw_sigma=0.6),  # A cuboid whose corners may be anywhere.
+        replace(body, shape="ellipsoid"),
+        None,
+    )
+    many = len(bodies)
+    changed = [replace(o, body=one) for o, one in zip(result.map.objects[:many], bodies, strict=True)]
+    objects = ObjectMap((*changed, *result.map.objects[many:]))
+    drawn = scene_data(objects, rays, result.path_after, truth, up)["objects"][:many]
+    assert [one["shape"] for one in drawn] == ["cuboid", "cylinder", "cylinder", "ellipsoid", "point"]
+    cuboid, *_, point = drawn
     assert point["body"] == []
+    assert all(one["body"] == cuboid["body"] for one in drawn[:-1])
     half = np.array(cuboid["body"]) @ upright(up)  # back to the frame of the map
     np.testing.assert_allclose(half[0], 0.3 * np.array([0.5, np.sqrt(3) / 2, 0.0]), atol=1e-3)
     np.testing.assert_allclose(half[1], 0.2 * np.array([-np.sqrt(3) / 2, 0.5, 0.0]), atol=1e-3)

@@ -1,0 +1,58 @@
+"""Objects with a wide sigma are named, and keep their status."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from synthetic_result import clusters, synthetic_result
+
+from objslam.core.object_map import ObjectMap
+from objslam.core.result import Doubt, RunResult
+from objslam.mapping.doubts.find import with_doubts
+
+
+def result_of(*sigmas: float, shared: float = 0.0) -> RunResult:
+    """A result of a good map whose first objects have these own sigmas, m, and all the same shift as an error."""
+    result, _ = synthetic_result(*clusters(), keyframes=20)
+    common = np.zeros((7, 7))
+    common[:3, :3] = shared**2 * np.eye(3)
+    objects = [
+        replace(
+            o, covariance=np.diag([1e-4, 1e-4, (sigmas[i] if i < len(sigmas) else 0.1) ** 2]) + common[:3, :3], status="ok"
+        )
+        for i, o in enumerate(result.map.objects)
+    ]
+    objects_map = ObjectMap(tuple(objects), shared_covariance=common if shared else None)
+    good = {"level": "good", "reasons": ["The map is good."]}
+    return with_doubts(replace(result, map=objects_map, summary={**result.summary, "assessment": good}))
+
+
+def unsure(result: RunResult) -> list[Doubt]:
+    return [one for one in result.doubts if one.kind == "unsure"]
+
+
+def test_the_least_sure_object_comes_first_and_the_verdict_names_it() -> None:
+    result = result_of(0.6, 1.2)
+    first, second = unsure(result)
+    assert [one.objects for one in (first, second)] == [(result.map[1].id,), (result.map[0].id,)]
+    assert "has a sigma of 1.20 m" in first.text
+    assert abs(first.numbers["sigma_m"] - 1.2) < 1e-3
+    assert {o.status for o in result.map} == {"ok"}
+    assert result.summary["doubts"]["unsure"] == 2
+    (_, told) = result.summary["assessment"]["reasons"]
+    assert told.startswith("2 positions have a sigma above 0.5 m: ")
+    assert f"{result.map[1].label} #{result.map[1].id} (1.20 m)" in told
+
+
+def test_the_error_that_all_objects_share_makes_none_unsure() -> None:
+    assert unsure(result_of(0.4, shared=3.0)) == []
+    assert len(unsure(result_of(0.6, shared=3.0))) == 1
+
+
+def test_a_map_most_of_whose_objects_are_unsure_needs_a_look() -> None:
+    count = len(result_of().map)
+    some, most = result_of(*[0.6] * (count // 2)), result_of(*[0.6] * (count // 2 + 1))
+    assert some.summary["assessment"]["level"] == "good"
+    assert most.summary["assessment"]["level"] == "check"
+    assert most.summary["assessment"]["reasons"][0].startswith(f"{count // 2 + 1} positions have a sigma above 0.5 m")
