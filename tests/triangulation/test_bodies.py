@@ -17,7 +17,7 @@ from triangulation.true_boxes import (
 
 from objslam.core.bodies.body import SHAPES
 from objslam.core.camera import project
-from objslam.triangulation.bodies.choice import shapes_disagree
+from objslam.triangulation.bodies.choice import shapes_disagree, with_shares_of_shapes
 from objslam.triangulation.bodies.edges import BoxEdges, contacts
 from objslam.triangulation.bodies.ellipsoid import from_axes
 from objslam.triangulation.bodies.fit import Prior, Weights, fit
@@ -260,3 +260,19 @@ def test_the_spread_of_shapes_is_that_of_a_mixture():
     chance = np.exp(evidence[:, 0]) / np.exp(evidence[:, 0]).sum()
     drawn = axes[rng.choice(4, 400_000, p=chance), 0] - axes[2, 0]
     assert np.abs(drawn.T @ drawn / len(drawn) - told).max() < 0.02
+
+
+def test_the_shape_of_a_thing_is_judged_with_the_others_of_its_label():
+    """The others are sure, so their shares are the Dirichlet-multinomial's, with all shapes equally usual before."""
+    sure, open_ = np.array([0.0, 0.0, 30.0, 0.0, 0.0]), np.zeros(5)
+    evidence, label = np.stack([open_, *[sure] * 4], axis=1), np.zeros(5, dtype=int)
+    found = with_shares_of_shapes(evidence, label)
+    whole = np.array([1.0, 1, 5, 1, 1]) / 9
+    expected = np.array([0.0, 0, 4, 0, 0]) + 5 * whole
+    assert np.abs(found[:, 0] - np.log(expected / expected.sum())).max() < 1e-6
+    # Things of another label say less, and a hundred say no more than a few.
+    other = with_shares_of_shapes(evidence, np.array([1, 0, 0, 0, 0]))
+    assert 0 < other[2, 0] - other[3, 0] < found[2, 0] - found[3, 0]
+    many = with_shares_of_shapes(np.stack([open_, *[sure] * 100], axis=1), np.zeros(101, dtype=int))
+    assert many[2, 0] - many[3, 0] == pytest.approx(np.log((6 + 5 * 7 / 11) / (5 / 11)))
+    assert np.ptp(with_shares_of_shapes(np.zeros((5, 7)), np.arange(7))) < 1e-9

@@ -13,6 +13,15 @@ from objslam.core.statistics import CAUCHY_K
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, Prior, Weights
 
+_EQUAL = 1.0
+"""The prior of the shares of shapes weighs as much as this number of things of each shape. With a larger number, the other
+things of a log say less about the shape of one."""
+_MOST = 6.0
+"""The other things of a label, and those of a log, count as at most this number. If their true shape is not among those that
+are tried, all err alike, so a hundred tell little more than a few. With a larger number, the shape of one thing is surer."""
+_REPEATS = 20
+"""How often `with_shares_of_shapes` repeats its expectation. More are slower and change little."""
+
 
 def log_evidence(edges: BoxEdges, fit: Fit, prior: Prior, weights: Weights, *, free_side: Floats | None = None) -> Floats:
     """Return the logarithm of the evidence (N,) of a fit.
@@ -32,6 +41,31 @@ def log_evidence(edges: BoxEdges, fit: Fit, prior: Prior, weights: Weights, *, f
     penalty = 0.5 * np.einsum("ni,nij,nj->n", off, prior.information, off)
     volume = 0.5 * (np.linalg.slogdet(prior.information)[1] - np.linalg.slogdet(fit.information)[1])
     return np.asarray(own - penalty + volume)
+
+
+def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
+    """Return the logarithm of the evidence (S, N), with that of how usual each shape is among the other things of the log.
+
+    One thing often hardly tells an ellipsoid from a cylinder. But things of one label are alike, and so are the things of a
+    room. The shares of the shapes are those of the other things of the label. Their prior is the shares in the whole log, whose
+    own prior is that all are equal. Each is the expectation over what the other things may be (CVB0; Asuncion et al. 2009).
+    evidence: (S, N) of each shape. label: (N,).
+    """
+    shapes, things = evidence.shape
+    same = (label[:, None] == label) & ~np.eye(things, dtype=bool)
+    shares = np.full((shapes, things), 1 / shapes)
+    for _ in range(_REPEATS):
+        chance = shares * np.exp(evidence - evidence.max(axis=0))
+        chance /= chance.sum(axis=0)
+        whole = _told(chance.sum(axis=1, keepdims=True) - chance) + _EQUAL
+        shares = _told(chance @ same) + _EQUAL * shapes * whole / whole.sum(axis=0)
+        shares /= shares.sum(axis=0)
+    return np.asarray(evidence + np.log(shares))
+
+
+def _told(number: Floats) -> Floats:
+    """Return numbers (S, N) of things of each shape, in which all things together count as at most `_MOST`."""
+    return np.asarray(number * np.minimum(1.0, _MOST / np.maximum(number.sum(axis=0), 1e-12)))
 
 
 def shapes_disagree(evidence: Floats, axes: Floats, chosen: Ints) -> Floats:

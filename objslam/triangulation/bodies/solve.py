@@ -9,7 +9,7 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES
-from objslam.triangulation.bodies.choice import log_evidence, shapes_disagree
+from objslam.triangulation.bodies.choice import log_evidence, shapes_disagree, with_shares_of_shapes
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, Prior, Weights, fit
 from objslam.triangulation.bodies.prior import cuboid_prior, dot_prior, known_sizes, label_prior, sphere_prior, weak_prior
@@ -148,7 +148,7 @@ def solve_bodies(
     for number in range(_ROUNDS + 1):
         some = edges.take(few)
         some_sides = sides_of(some, points)
-        now = _round(some, some_sides, now, side[few])
+        now = _round(some, some_sides, now, side[few], label)
         best = now.best
         if number == _ROUNDS or best is None:
             break
@@ -172,7 +172,7 @@ def solve_bodies(
     return bodies if others is None else _refitted(edges, others, now, bodies)
 
 
-def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
+def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints) -> _State:
     """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
     weights, first = _weights(edges, sides, now), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
@@ -193,6 +193,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats) -> _State:
             log_evidence(edges, tube, now.prior, weights),
         ]
     )
+    evidence = with_shares_of_shapes(evidence, label)
     solid = np.array(_SOLID)[evidence[list(_SOLID)].argmax(axis=0)]
     best = _mixed(solid == _CUBOID, edges.body, square, rounds)
     best = _mixed(solid == _CYLINDER, edges.body, tube, best)
