@@ -28,6 +28,11 @@ _CLEAR = 1.0
 Above it, the position is the centre of the body. The angle is 4 for a cabinet from close by. It is below 0.6 for things on a
 table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
 
+_UNLIKE = 0.02
+"""The least error of a centre that repeats from all sides, as a share of half the size, because no thing has exactly the
+shape of its body. The centres of simulated pots, cones, hexagons, seats, monitors and people were off by 1 to 4 % of half the
+height (tools/bench_shapes.py). A larger share makes all centres less sure."""
+
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
     """Return a solution with a body for each object whose boxes show one. The points and their covariances stay.
@@ -142,8 +147,7 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
     position."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at].copy()
-    # A detector may draw all boxes of an object too large or beside it. This error repeats from all sides.
-    covariance[:3, :3] += (found.share[0] * half.mean()) ** 2 * np.eye(3)
+    covariance[:3, :3] += repeated_error(found.share[0], half) ** 2 * np.eye(3)
     covariance[[3, 6], [3, 6]] += found.share[1] ** 2
     to_size = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # from half axes to sizes
     slope = found.slope[at].copy()
@@ -154,3 +158,12 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
     sigma = np.sqrt(np.diagonal(covariance))
     body = Body(SHAPES[found.shape[at]], 2 * half, float(yaw), sigma[3:6], min(float(sigma[6]), UNKNOWN_YAW))
     return PlacedBody(body, centre if clear else None, (covariance + covariance.T) / 2)
+
+
+def repeated_error(share: float, half: Floats) -> float:
+    """Return the standard deviation, m, of the error of a centre that repeats from all sides, along each axis.
+
+    A detector may draw all boxes of an object too large or beside it, and the object has another shape than its body. share:
+    of `Bodies.share`, that of shifts. half: (3,) half axes, m.
+    """
+    return float(max(share, _UNLIKE) * half.mean())
