@@ -30,8 +30,8 @@ table that a noisy detector sees. With a larger value, more objects stay where t
 
 _UNLIKE = 0.02
 """The least error of a centre that repeats from all sides, as a share of half the size, because no thing has exactly the
-shape of its body. The centres of simulated pots, cones, hexagons, seats, monitors and people were off by 1 to 4 % of half the
-height (tools/bench_shapes.py). A larger share makes all centres less sure."""
+shape of its body. The centres of simulated pots, cones, seats, monitors and people were off by 1 to 4 % of half the height
+(tools/bench_shapes.py). A larger share makes all centres less sure."""
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
