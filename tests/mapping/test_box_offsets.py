@@ -78,7 +78,8 @@ def test_the_share_is_found_and_the_covariance_is_honest(share):
         result = mapped(log)
         found.append(result.summary["box_offset"])
         off += squares(result, places)
-        naive += squares(mapped(log, "rays.box_sigma=0"), places) if seed < 3 else []
+        # Without bodies too, because their centres have an error that repeats, whatever the boxes are said to have.
+        naive += squares(mapped(log, "rays.box_sigma=0", "bodies.use=false"), places) if seed < 3 else []
     assert np.median(found) == pytest.approx(share, rel=0.3)
     limit = chi2.ppf(0.95, 3)
     assert np.mean(np.array(naive) < limit) < 0.3
