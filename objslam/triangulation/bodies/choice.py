@@ -53,13 +53,14 @@ def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
     evidence: (S, N) of each shape. label: (N,).
     """
     shapes, things = evidence.shape
-    same = (label[:, None] == label) & ~np.eye(things, dtype=bool)
+    own = np.unique(label, return_inverse=True)[1].ravel()
     shares = np.full((shapes, things), 1 / shapes)
     for _ in range(_REPEATS):
         chance = shares * np.exp(evidence - evidence.max(axis=0))
         chance /= chance.sum(axis=0)
         whole = _told(chance.sum(axis=1, keepdims=True) - chance) + _EQUAL
-        shares = _told(chance @ same) + _EQUAL * shapes * whole / whole.sum(axis=0)
+        of_label = np.stack([np.bincount(own, one) for one in chance])[:, own]
+        shares = _told(of_label - chance) + _EQUAL * shapes * whole / whole.sum(axis=0)
         shares /= shares.sum(axis=0)
     return np.asarray(evidence + np.log(shares))
 
