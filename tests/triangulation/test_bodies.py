@@ -232,43 +232,39 @@ def test_cuboids_and_cylinders_are_told_apart():
     off = found.axes[:, :3] - true
     assert [SHAPES[one] for one in found.shape] == ["cuboid", "cylinder"] * (many // 2)
     assert np.abs(off).max() < 0.015
-    assert np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(found.centre_covariance), off) < 7.81) >= 0.9
+    assert inside(off, found.centre_covariance) >= 0.9
     assert np.median(np.abs(found.axes[:, 5] / half[:, 2] - 1)) < 0.02
+
+
+def turned_things(camera, bottom, top, arc):
+    """Bodies of 30 round things, and the errors (30, 3) of their centres. bottom, top: their radii there, as shares."""
+    rng, many = np.random.default_rng(8), 30
+    half = np.column_stack([np.tile(rng.uniform(0.15, 0.3, (many, 1)), 2), rng.uniform(0.15, 0.4, many)])
+    outlines = [ring_of(h) * np.repeat([[bottom, bottom, 1.0], [top, top, 1.0]], 40, axis=0) for h in half]
+    boxes, poses = boxes_of_outlines(camera, outlines, rng, 24, arc)
+    true = np.column_stack([np.zeros((many, 2)), half[:, 2]])
+    found = solved(camera, boxes, poses, true + rng.normal(0, 0.05, true.shape), np.full((many, 2), 0.25))
+    return found, found.axes[:, :3] - true
+
+
+def inside(off, covariance):
+    """The share of errors (N, 3) inside the 95 % ellipsoids of covariances (N, 3, 3)."""
+    return np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off) < 7.81)
 
 
 def test_no_shape_is_surer_than_the_choice_between_shapes():
     """A pot is wider at its top. A cylinder and an ellipsoid fit it about equally well, at two heights."""
-    rng, camera, many, each = np.random.default_rng(8), CAMERAS["pinhole"], 30, 24
-    half = np.column_stack([np.tile(rng.uniform(0.15, 0.3, (many, 1)), 2), rng.uniform(0.15, 0.4, many)])
-    outlines = [ring_of(h) * np.repeat([[0.6, 0.6, 1.0], [1.0, 1.0, 1.0]], 40, axis=0) for h in half]
-    boxes, poses = boxes_of_outlines(camera, outlines, rng, each, arc=0.6)
-    true = np.column_stack([np.zeros((many, 2)), half[:, 2]])
-    found = solved(camera, boxes, poses, true + rng.normal(0, 0.05, true.shape), np.full((many, 2), 0.25))
-    off = found.axes[:, :3] - true
-    inside = [
-        np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(c), off) < 7.81)
-        for c in (found.covariance[:, :3, :3], found.centre_covariance)
-    ]
-    assert inside[0] < 0.8
-    assert inside[1] >= 0.9
+    found, off = turned_things(CAMERAS["pinhole"], 0.6, 1.0, arc=0.6)
+    assert inside(off, found.covariance[:, :3, :3]) < 0.8
+    assert inside(off, found.centre_covariance) >= 0.9
 
 
 def test_a_shape_that_is_not_tried_lies_within_its_sigma():
     """Cones: all come out as cylinders, whose centres are too low. Their sigma has the error that repeats from all sides."""
-    rng, camera, many, each = np.random.default_rng(8), CAMERAS["pinhole"], 20, 24
-    half = np.column_stack([np.tile(rng.uniform(0.15, 0.3, (many, 1)), 2), rng.uniform(0.15, 0.4, many)])
-    outlines = [ring_of(h) * np.repeat([[1.0, 1.0, 1.0], [0.2, 0.2, 1.0]], 40, axis=0) for h in half]
-    boxes, poses = boxes_of_outlines(camera, outlines, rng, each, arc=2.0)
-    true = np.column_stack([np.zeros((many, 2)), half[:, 2]])
-    found = solved(camera, boxes, poses, true + rng.normal(0, 0.05, true.shape), np.full((many, 2), 0.25))
+    found, off = turned_things(CAMERAS["pinhole"], 1.0, 0.2, arc=2.0)
     repeated = np.array([repeated_error(found.share[0], axes) for axes in found.axes[:, 3:6]])
-    off = found.axes[:, :3] - true
-    inside = [
-        np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(c), off) < 7.81)
-        for c in (found.centre_covariance, found.centre_covariance + repeated[:, None, None] ** 2 * np.eye(3))
-    ]
-    assert inside[0] < 0.7
-    assert inside[1] >= 0.9
+    assert inside(off, found.centre_covariance) < 0.7
+    assert inside(off, found.centre_covariance + repeated[:, None, None] ** 2 * np.eye(3)) >= 0.9
 
 
 def test_the_spread_of_shapes_is_that_of_a_mixture():
