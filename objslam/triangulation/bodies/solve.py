@@ -53,10 +53,11 @@ class Bodies:
 
     values: (N, 7) parameters of the body's kind (see `shapes`). covariance: (N, 7, 7). shape: (N,) 0 point, 1 sphere, 2
     ellipsoid, 3 cuboid, 4 cylinder. evidence: (5, N) the logarithm of the evidence of each shape, with that of how usual it
-    is (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share: (2,) the standard deviations of the errors of shift and size that boxes of one side share, as
-    shares of half their size. factors: (2,) on the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to
-    the centre of each body, minus that to the centre of its predicted box, in map. It is 0 for a point. between_shapes: (N,
-    6, 6) the second moment of centre and half axes, m, over the shapes, about the chosen one. It is not in `covariance`.
+    is (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share: (2,) the standard deviations of the
+    errors of shift and size that boxes of one side share, as shares of half their size. factors: (2,) on the nominal noise
+    of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus that to the centre of its
+    predicted box, in map. It is 0 for a point. between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over
+    the shapes, about the chosen one. It is not in `covariance`.
     """
 
     values: Floats
