@@ -426,5 +426,5 @@ def test_boxes_of_a_mirrored_image_are_said_to_be_wrong_input():
 
     log = simulate(preset("demo", objects=15, classes=5, frames=250), 0)
     for said, one in ((False, log), (True, replace(log, cameras=tuple(map(mirrored, log.cameras))))):
-        result = run(one, "fixed", "bodies.use=false", "calibration.use=false")
+        result = run(one, "fixed", *HELD)
         assert any("the input may be wrong" in text for text in result.summary["warnings"]) == said
