@@ -43,8 +43,11 @@ def no_progress() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests that take longest. At the end, one process would run them while the others have nothing to do."""
-    items.sort(key=lambda item: item.get_closest_marker("long") is None)
+    """Begin with the tests that fork their process many times. A fork takes longer the more memory the process has, and that
+    is least at first. Then come the tests that take longest. At the end, one process would run them while the others have
+    nothing to do."""
+    first = ("forks", "long")
+    items.sort(key=lambda item: next((i for i, name in enumerate(first) if item.get_closest_marker(name)), len(first)))
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     return {case.name: case for case in make_cases(tmp_path_factory.mktemp("faults"), tuple(COUNTS))}
 
 
+@pytest.mark.forks
 @pytest.mark.parametrize("name", COUNTS)
 def test_a_fault_leaves_a_whole_result_or_none_and_the_next_start_cleans_up(
     cases: dict[str, Case], name: str, tmp_path: Path

@@ -141,6 +141,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_the_marked_blocks_do_what_the_text_says(played: Path) -> None:
     for result in ("demo_boxes/fixed", "demo_boxes/joint", "my_map", "out"):
         assert (played / result / "map.png").is_file()
@@ -171,6 +172,7 @@ def test_the_python_blocks_use_public_names() -> None:
     assert {"read", "run"} <= used <= set(objslam.__all__)
 
 
+@pytest.mark.long
 def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
     fields = set(re.findall(r"`(\w+)`", " ".join(row[0] for row in rows("field"))))
     written: set[str] = set()
@@ -185,6 +187,7 @@ def test_every_field_and_file_of_a_result_is_explained(played: Path) -> None:
         assert f"`{name}`" in PAGES["docs/results.md"], name
 
 
+@pytest.mark.long
 def test_the_demo_is_as_good_as_the_table_says(played: Path) -> None:
     table = {row[1]: row for row in rows("drive")}
     for mode in ("fixed", "joint"):

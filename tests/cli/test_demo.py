@@ -15,6 +15,8 @@ from small_log import small_log
 from objslam import simulation
 from objslam.cli import demo
 from objslam.cli.options import settings_of
+from objslam.simulation import render
+from objslam.simulation.render import RenderSettings
 from objslam.sources.log_folder import write_log_folder
 
 Objslam = Callable[..., Call]
@@ -74,8 +76,11 @@ def test_a_demo_replaces_no_log_of_others(objslam: Objslam, tmp_path: Path) -> N
 def test_demo_from_images(objslam: Objslam, attempts: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises.
 
-    The objects do not depend on the surface, so it is made of fewer depth images.
+    Half of the images have to meet them too, because rendering takes most of the time. An object then needs to be in half as
+    many, so that the room is that of the whole demo. The objects do not depend on the surface, so it is made of fewer depth
+    images.
     """
+    monkeypatch.setattr(render, "RenderSettings", partial(RenderSettings, frames=110, min_views=9))
     monkeypatch.setattr(demo, "settings_of", lambda mode, file, told: settings_of(mode, file, [*told, FEW_DEPTHS]))
     done = objslam("demo", "-o", tmp_path / "demo")
     assert done.code == 0, done.err

@@ -9,11 +9,13 @@ from pathlib import Path
 
 import pytest
 from fleet.fleet_logs import LAYOUT, write_logs
+from quick import ROUGH, options
 from waiting import LIMIT, wait_for
 
 ray = pytest.importorskip("ray", reason="pip install objslam[fleet]")
 CLUSTER = ("--head", "--num-cpus=2", "--port=0", "--object-store-memory=80000000", "--include-dashboard=false")
 COUNT = 2
+SETTINGS = options("output.picture=false", *ROUGH)
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +40,9 @@ def logs(tmp_path_factory):
 
 
 def fleet(*arguments):
+    """Run the command in a process of its own, which no connection to the cluster outlives."""
     command = [sys.executable, "-m", "objslam", "fleet", *map(str, arguments), "--layout", LAYOUT, "--json"]
-    done = subprocess.run([*command, "--set", "output.picture=false"], capture_output=True, text=True, check=False)
+    done = subprocess.run([*command, *SETTINGS], capture_output=True, text=True, check=False)
     return done.returncode, json.loads(done.stdout) if done.stdout else None, done.stderr
 
 
@@ -49,7 +52,7 @@ def test_a_cluster_gives_what_processes_give(address, logs, tmp_path):
     (bad / "odometry.txt").write_text("1 2 3\n")
     code, said, warned = fleet(logs, "-o", tmp_path / "ray", "--ray", address)
     assert (code, said["new"], [one["kind"] for one in said["failures"]]) == (1, COUNT, ["log"]), warned
-    code, here, _ = fleet(logs, "-o", tmp_path / "here", "-j", "2")
+    code, here, _ = fleet(logs, "-o", tmp_path / "here", "-j", "1")
     assert (code, here["new"]) == (1, COUNT)
     names = ["sites/site_0/objects.json", "failed.parquet"]
     names += [str(file.relative_to(tmp_path / "here")) for file in (tmp_path / "here" / "results").glob("*/[ortv]*")]

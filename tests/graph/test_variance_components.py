@@ -1,5 +1,7 @@
 """The noise that is estimated from the residuals: against the noise that was put in, and against GTSAM's own basis."""
 
+from functools import cache
+
 import gtsam
 import numpy as np
 import pytest
@@ -18,14 +20,18 @@ from objslam.simulation import DepthNoise, preset, simulate
 HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "clock", "range_scale"))
 
 
-def solved(drift, pixels=3.0, ranges=None, seed=1, overrides=(), frames=400, **changes):
-    """A drive with odometry noise `drift` times the default, solved with the default settings; and the drive."""
+@cache
+def solved(drift, pixels=3.0, ranges=None, seed=1, overrides=(), frames=400):
+    """A drive with odometry noise `drift` times the default, solved with the default settings; and the drive.
+
+    Several tests look at the same one.
+    """
     settings = load_settings(None, ("mode=joint", *HELD, *overrides))
     of = Odometry()
     noise = of.model_copy(update={n: drift * getattr(of, n) for n in type(of).model_fields if not n.startswith("floor")})
     depth = None if ranges is None else DepthNoise(sigma=0.03 * ranges, sigma_per_m=0.02 * ranges)
-    changes = {"localization": None, "odometry": noise, "depth": depth, "pixel_sigma": pixels, **changes}
-    log = simulate(preset("demo", **{"objects": 12, "classes": 12, "frames": frames, **changes}), seed)
+    changes = {"localization": None, "odometry": noise, "depth": depth, "pixel_sigma": pixels}
+    log = simulate(preset("demo", objects=12, classes=12, frames=frames, **changes), seed)
     made = drive_of(log, settings)
     errors = shared_errors(log, made.keyframes, made.rays, settings)
     return solve_joint(made.keyframes, made.rays, made.association, settings, Ledger(), errors=errors), made

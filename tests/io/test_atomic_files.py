@@ -43,6 +43,7 @@ def test_a_set_goes_as_a_whole_and_other_files_stay(tmp_path: Path) -> None:
     assert not has_staging(out)
 
 
+@pytest.mark.forks
 def test_killed_at_any_moment_the_seal_stands_for_the_whole_set(tmp_path: Path) -> None:
     old, new = ("first", "second", "a.part", "seal"), ("seal", "first", "rarely", "b.part", "c.part")
     was, will_be = ({name: name.encode() + data for name in names} for names, data in ((old, b" 1"), (new, b" 2")))

@@ -27,7 +27,7 @@ from objslam.sources.journal import journal as journals
 from objslam.sources.log_folder import write_log_folder
 
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", *HELD))
-QUIET = options(*NOTHING_DRAWN, "rays.pixel_sigma=2")
+QUIET = options(*HELD, *NOTHING_DRAWN, "rays.pixel_sigma=2")
 live_command = importlib.import_module("objslam.cli.live_command.command")
 
 

@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from quick import HELD, NOTHING_DRAWN
 from small_log import small_log
 
 import objslam
-from objslam.config import Odometry
+from objslam.config import Odometry, load_settings
+from objslam.core.types import Log
 from objslam.frontend.bearings import CUT_OFF
 from objslam.frontend.log_part import part_of_log
 from objslam.mapping.checks.assessment import Evidence, assess
@@ -17,6 +19,8 @@ from objslam.simulation import DepthNoise, PoseNoise
 
 GOOD = Evidence(resolved=12, unresolved=1, boxes=1000, cut=100, rays=900, unexplained=90, rejected=20, misses=1.0)
 QUIET = {"output": {"recording": False, "picture": False}}
+ALONE = load_settings(None, (*HELD, *NOTHING_DRAWN))
+"""For verdicts on what went in, which no stage after the association changes."""
 
 
 def test_a_usual_result_is_good() -> None:
@@ -92,7 +96,7 @@ def test_a_summary_has_the_part_that_was_used() -> None:
     log = small_log()
     middle = float(np.median(log.robot_path.stamps))
     assert log.part == (None, None)
-    result = objslam.run(part_of_log(log, None, middle), **QUIET)
+    result = objslam.run(part_of_log(log, None, middle), ALONE)
     assert result.summary["part"] == {"begin": None, "end": middle}
     assert f"a part of the recording: to stamp {middle:.3f} s." in result.summary["assessment"]["reasons"][-1]
 
@@ -127,20 +131,20 @@ def test_a_run_knows_how_far_its_rays_miss(sigma: float, level: str) -> None:
 
 
 def test_a_run_from_odometry_says_that_the_map_has_its_frame() -> None:
-    joint = objslam.run(small_log(), QUIET, mode="joint", poses={"use": "odometry"})
+    joint = objslam.run(small_log(), ALONE, mode="joint", poses={"use": "odometry"})
     assert "frame of the odometry" in str(joint.assessment)
 
 
 def test_fixed_poses_are_good_where_they_are_absolute_and_not_where_they_drift() -> None:
-    drifting = objslam.run(small_log(), QUIET, mode="fixed", poses={"use": "odometry"})
+    drifting = objslam.run(small_log(), ALONE, mode="fixed", poses={"use": "odometry"})
     assert drifting.assessment.level == "check"
     assert "drift is in the map" in drifting.assessment.reasons[0]
-    absolute = objslam.run(small_log(), QUIET, mode="fixed", poses={"use": "localization"})
+    absolute = objslam.run(small_log(), ALONE, mode="fixed", poses={"use": "localization"})
     assert "drift is in the map" not in str(absolute.assessment)
 
 
 def test_boxes_at_the_edge_are_told() -> None:
-    cut = objslam.run(small_log(), QUIET, rays={"border": 150})
+    cut = objslam.run(small_log(), ALONE, rays={"border": 150})
     dropped, boxes = cut.dropped[CUT_OFF], cut.summary["counts"]["detections"]
     assert dropped > boxes / 3
     assert f"{100 * dropped / boxes:.0f} % of the boxes were dropped" in str(cut.assessment)
@@ -152,8 +156,8 @@ def test_a_hint_at_the_mode_that_uses_the_odometry_too_is_no_doubt() -> None:
     assert "for objects seen from several sides" in str(assess(replace(GOOD, odometry_unused=True)))
     assert len(assess(replace(GOOD, odometry_unused=True, spoilt=True)).reasons) == 1
 
-    def hints(log: object, **changes: object) -> int:
-        return str(objslam.run(log, {**QUIET, **changes}).assessment).count("--mode joint uses both")  # type: ignore[arg-type]
+    def hints(log: Log, **changes: object) -> int:
+        return str(objslam.run(log, ALONE, **changes).assessment).count("--mode joint uses both")
 
     log = small_log()
     assert hints(log) == 1

@@ -58,7 +58,8 @@ def drive(share: float, seed: int, objects: int = 6, arc: float = 2.0, white: fl
 
 def mapped(log, *more):
     exact = ("localization.xy=0.001", "localization.yaw=0.0002", "rays.pixel_sigma=1")
-    given = ("mode=fixed", "association.method=by_label", "output.picture=false", "checks.use=false", *exact, *more)
+    alone = ("calibration.use=false", "checks.use=false", "output.recording=false")
+    given = ("mode=fixed", "association.method=by_label", *alone, *exact, *more)
     return pipeline.run(log, load_settings(None, given), Ledger())
 
 

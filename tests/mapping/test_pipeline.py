@@ -424,7 +424,7 @@ def test_boxes_of_a_mirrored_image_are_said_to_be_wrong_input():
         boxes = found.boxes[:, [2, 1, 0, 3]] * [-1, 1, -1, 1] + [width - 1, 0, width - 1, 0]
         return replace(camera, detections=replace(found, boxes=boxes))
 
-    log = simulate(preset("demo", objects=15, classes=5), 0)
+    log = simulate(preset("demo", objects=15, classes=5, frames=250), 0)
     for said, one in ((False, log), (True, replace(log, cameras=tuple(map(mirrored, log.cameras))))):
-        result = run(one, "fixed", "bodies.use=false", "calibration.use=false")
+        result = run(one, "fixed", *HELD)
         assert any("the input may be wrong" in text for text in result.summary["warnings"]) == said

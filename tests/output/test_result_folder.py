@@ -324,6 +324,7 @@ def test_an_older_result_goes_as_a_whole_and_foreign_files_stay(tmp_path: Path) 
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
+@pytest.mark.forks
 def test_killed_at_any_moment_no_half_file_and_no_mix(tmp_path: Path) -> None:
     old, new = small(seed=0), dataclasses.replace(small(seed=1, keyframes=13), summary={"mode": "fixed"})
     write_result(old, tmp_path / "old")

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from objslam.config import Output, Settings
+from objslam.config import Output, Settings, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, lift_se2
 from objslam.evaluation.alignment import match_points
@@ -14,8 +14,11 @@ from objslam.mapping.localization import PriorMap, moved_log
 from objslam.mapping.pipeline import run
 from objslam.sources import read
 
+pytestmark = pytest.mark.long
 SETTINGS = Settings(output=Output(recording=False))
 """The defaults, without the steps of the solver that a recording would show."""
+UNCHECKED = load_settings(None, ("output.recording=false", "checks.use=false"))
+"""For the halves. The checks look at the whole log, which has the same input."""
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +85,9 @@ def test_no_object_is_there_twice(whole):
 def halves(log):
     """The first half as a map, and the second half in a frame that nobody knows, found in this map."""
     unknown = lift_se2(np.array([3.0, -7.0, 2.0]))
-    first = run(half(log, False), SETTINGS, Ledger())
+    first = run(half(log, False), UNCHECKED, Ledger())
     known = PriorMap("first", first.map)
-    return first, run(moved_log(half(log, True), unknown), SETTINGS, Ledger(), known=known)
+    return first, run(moved_log(half(log, True), unknown), UNCHECKED, Ledger(), known=known)
 
 
 def test_the_second_half_is_found_in_the_map_of_the_first(log, halves, whole):

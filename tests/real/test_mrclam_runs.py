@@ -24,9 +24,11 @@ from objslam.sources import SourceOptions, read
 RADIUS = 2.0  # m; labels say who is whom, the error is what is asked
 
 
-@pytest.mark.parametrize("robot", [1, 3, 5])
-@pytest.mark.parametrize(("with_range", "position", "path"), [(False, 0.25, 0.35), (True, 0.10, 0.35)])
-def test_landmarks_and_path(data_dir, robot, with_range, position, path):
+@pytest.mark.parametrize(
+    ("robot", "with_range", "position"),
+    [(1, False, 0.25), (3, False, 0.25), (1, True, 0.10), (3, True, 0.10), (5, True, 0.10)],
+)
+def test_landmarks_and_path(data_dir, robot, with_range, position):
     log, result, ledger = mapped(data_dir, robot, with_range)
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     found = evaluate(
@@ -34,7 +36,7 @@ def test_landmarks_and_path(data_dir, robot, with_range, position, path):
     ).to_dict()
     assert (found["matched"], found["missed"], found["false"], found["unresolved"]) == (15, 0, 0, 0)
     assert found["position_rmse"] <= position
-    assert found["ate"] <= path
+    assert found["ate"] <= 0.35
     assert not any("no single solution" in warning for warning in ledger.warnings)
     assert np.isfinite(result.rays.range).all() == with_range
 

@@ -372,6 +372,7 @@ def test_a_log_written_by_hand(tmp_path):
     assert log.cameras[0].detections.stamps.tolist() == [1.5]
 
 
+@pytest.mark.forks
 def test_what_killed_processes_left_goes_and_a_log_that_was_being_replaced_comes_back(log, tmp_path):
     """A killed process leaves its temporary folder beside the log, perhaps with the log that it was replacing."""
     place = tmp_path / "place"
