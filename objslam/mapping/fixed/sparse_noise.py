@@ -8,6 +8,7 @@ noise of places a third too small. So this noise is taken from the residuals of 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING
@@ -19,6 +20,7 @@ from objslam.association.refinement import grouped_sums
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
 from objslam.core.noise import MOST_POSE_NOISE
 from objslam.core.types import CameraLog, Log
 from objslam.frontend.bearings import build_rays
@@ -28,6 +30,7 @@ from objslam.mapping.checks.agreement import take_frames
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
+from objslam.mapping.checks.hypotheses.every import coarse_hypotheses, with_poses
 from objslam.mapping.fixed.pose_noise import least_cost
 from objslam.mapping.progress import Progress
 
@@ -44,6 +47,16 @@ _MOST_BOXES = 600
 """The most boxes that are searched, from frames that follow each other. More boxes are more exact and take longer."""
 _EXPLAINED = 0.5
 """The least share of the boxes that the objects must explain. With a smaller share, noise is taken for objects."""
+_TURN = 30
+"""The steps (degrees) of the tried turns of all cameras about the vertical axis. A larger step misses more wrong mounts."""
+_LEAD = 10.0
+"""The least lead, in log odds, of the log as it is over the log with any usual mistake corrected. A turn of the cameras by
+15 degrees costs 50 and more. With a larger lead, fewer streets are mapped. With a smaller one, wrong mounts are taken for
+noise."""
+_MOST_VIEWS = 12.0
+"""The most boxes that an object may have on average. The streets have 4. If objects with more boxes still disagree, wrong
+input is likelier than noise, because their frames would show the noise. With a larger number, a turned camera is sooner
+taken for noisy places."""
 _FAR = 10.0
 """The prior standard deviation of an object's place, as a multiple of the largest distance of a ray. So the place of an
 object with one ray has a variance. The number hardly matters if it is large."""
@@ -133,7 +146,13 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> SparseNois
         progress("noise of few boxes", number, len(tried))
         other = _searched(part, settings, SparseNoise(*factors))
         best = max(best, other, key=lambda one: one.value)
-    if best.value == -np.inf or best.found.chance < nothing.found.chance + _CLEAR:
+    views = len(best.found.ray) / max(len(best.found.positions), 1)
+    if best.value == -np.inf or best.found.chance < nothing.found.chance + _CLEAR or views > _MOST_VIEWS:
+        return None
+    if any(
+        _searched(corrected, settings, best.noise).value > best.value - _LEAD
+        for corrected in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total))
+    ):
         return None
     # With the larger noise, a second search would take more stray boxes into its objects, and the noise would grow again.
     return best.with_place_of_residuals(settings.noise.prior)
@@ -234,6 +253,22 @@ def _searched(log: Log, settings: Settings, noise: SparseNoise) -> _Searched:
         of.range_sigma / noise.ranges,
         place / noise.place,
     )
+
+
+def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[Log]:
+    """Yield the log with each usual mistake about directions corrected, and with all cameras turned about the vertical axis.
+
+    Errors of the clock and of the size of images are left out. They move rays by little, or all places by the same way.
+    """
+    usual = [one for one in coarse_hypotheses(log) if one.usual]
+    turns = range(_TURN, 360, _TURN)
+    for number, hypothesis in enumerate(usual):
+        progress(number, len(usual) + len(turns))
+        yield hypothesis.put_right(log)
+    for number, degrees in enumerate(turns):
+        progress(len(usual) + number, len(usual) + len(turns))
+        turn = lift_se2(np.array([0.0, 0.0, np.radians(degrees)]))
+        yield with_poses(log, lambda poses, turn=turn: poses @ turn)
 
 
 def _part(log: Log) -> Log:
