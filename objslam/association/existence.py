@@ -40,6 +40,10 @@ class Rates:
         frames."""
         return -2 * _beta_binomial(seen, expected, self.mean[label], self.concentration)
 
+    def log_likelihood(self, history: DetectionHistory, label: Ints) -> float:
+        """Return ln of the probability of all detections and misses of objects with these labels (N,)."""
+        return float(_beta_binomial(history.seen, history.expected, self.mean[label], self.concentration).sum())
+
     def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:
         """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses."""
         rate = self.mean[label]

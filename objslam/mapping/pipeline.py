@@ -32,6 +32,7 @@ from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.lasting_errors import with_lasting_errors
+from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
 from objslam.mapping.refuted import without_refuted
@@ -65,6 +66,8 @@ def run(
     with _stage("rays", seconds, progress):
         if settings.checks.use:
             diagnosis = diagnose(expected, settings, ledger, progress)
+            if settings.mode == "fixed":
+                settings, diagnosis = with_sparse_noise(expected, settings, diagnosis, ledger, progress)
             if settings.mode == "fixed" or not diagnosis.refutable:
                 say(diagnosis, ledger)  # No solve will refute the findings, so a user need not wait for one.
         if diagnosis.certain and settings.mode == "joint":

@@ -11,7 +11,7 @@ import numpy as np
 from objslam import config
 from objslam.association.appearance.evidence import learn_ratio
 from objslam.association.existence import detection_rates, static_odds
-from objslam.association.few_rays.chance import Strays, chance_odds, unmatched_costs
+from objslam.association.few_rays.chance import Strays, chance_odds, log_evidence, unmatched_costs
 from objslam.association.few_rays.sparse_search import SparseSearch, discover_sparse
 from objslam.association.gating import alternate, gate_limit, near
 from objslam.association.landmarks import Landmarks, State
@@ -54,20 +54,8 @@ def add_few_ray_objects(
     rays, keyframes: all observed frames and their rays. positions: (N, 3) m of the objects, NaN where unknown.
     map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, position_sigma: m, the noise of the rays' angles and origins.
     """
-    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
-    known = np.isfinite(positions).all(axis=1)
-    labels = len(rays.label_names)
-    held = Landmarks.new(positions[known], np.ones(known.sum()), association.label[known], labels)
-    state = State(obs, view, held, np.append(np.where(known, np.cumsum(known) - 1, -1), -1)[association.object[ray]])
-    ratio = learn_ratio(obs, obs.frame, obs.track, association.object[ray], labels)
-    state = replace(state, landmarks=replace(held, noise=state.noise), ratio=ratio)
-    free = association.object[ray] < 0
-    if association.refuted is not None:
-        free &= ~association.refuted[ray]
-    gate, least = gate_limit(settings.association.gate), settings.association.min_existence
-    few = _Few(state, np.flatnonzero(free), Strays.of(obs, view, labels), gate)
-    found = few.search(least, seed)
+    few, ray = _few(rays, keyframes, cameras, settings, association, positions, map_T_camera, sigma, position_sigma)
+    found = few.search(settings.association.min_existence, seed)
     old, new = association.count, found.count
     index = association.object.copy()
     index[ray[few.free]] = np.where(found.matched < 0, -1, found.matched + old)
@@ -81,6 +69,75 @@ def add_few_ray_objects(
         existence=None if before[1] is None else np.append(before[1], few.existence(found)),
         few_rays=np.arange(old + new) >= old,
     )
+
+
+@dataclass(frozen=True)
+class FewRayEvidence:
+    """How well the objects that a search finds among all rays explain the boxes.
+
+    chance: the log odds of these objects over boxes that are all stray. detections: ln of the probability of the objects'
+    detections and misses. explained: the share of the boxes with an object. ray, owner: (P,), (P,) the rays with an object,
+    and their objects. positions: (N, 3) m of the objects.
+    """
+
+    chance: float
+    detections: float
+    explained: float
+    ray: Ints
+    owner: Ints
+    positions: Floats
+
+
+def few_ray_evidence(
+    rays: Rays,
+    keyframes: Keyframes,
+    cameras: tuple[Camera, ...],
+    settings: config.Settings,
+    *,
+    map_T_camera: Floats,
+    sigma: Floats,
+    position_sigma: float,
+    seed: int = 0,
+) -> FewRayEvidence:
+    """Return the evidence of all objects that a search for few rays finds. Arguments are as in `add_few_ray_objects`."""
+    nothing = Association(np.full(len(rays), -1), np.zeros(0, dtype=np.int64))
+    positions = np.zeros((0, 3))
+    few, ray = _few(rays, keyframes, cameras, settings, nothing, positions, map_T_camera, sigma, position_sigma)
+    found = few.joined(few.search(settings.association.min_existence, seed))
+    members = ray[found.assigned], found.owner, found.landmarks.position
+    if not found.count:
+        return FewRayEvidence(0.0, 0.0, 0.0, *members)
+    rates = detection_rates(found.history, found.label, len(found.unassigned))
+    chance = log_evidence(found, few.gate, few.strays, rates)
+    explained = float((found.matched >= 0).mean())
+    return FewRayEvidence(chance, rates.log_likelihood(found.history, found.label), explained, *members)
+
+
+def _few(
+    rays: Rays,
+    keyframes: Keyframes,
+    cameras: tuple[Camera, ...],
+    settings: config.Settings,
+    association: Association,
+    positions: Floats,
+    map_T_camera: Floats,
+    sigma: Floats,
+    position_sigma: float,
+) -> tuple["_Few", Ints]:
+    """Return the search of `add_few_ray_objects`, and the index (P,) of the ray of each observation."""
+    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
+    known = np.isfinite(positions).all(axis=1)
+    labels = len(rays.label_names)
+    held = Landmarks.new(positions[known], np.ones(known.sum()), association.label[known], labels)
+    state = State(obs, view, held, np.append(np.where(known, np.cumsum(known) - 1, -1), -1)[association.object[ray]])
+    ratio = learn_ratio(obs, obs.frame, obs.track, association.object[ray], labels)
+    state = replace(state, landmarks=replace(held, noise=state.noise), ratio=ratio)
+    free = association.object[ray] < 0
+    if association.refuted is not None:
+        free &= ~association.refuted[ray]
+    strays = Strays.of(obs, view, labels)
+    return _Few(state, np.flatnonzero(free), strays, gate_limit(settings.association.gate)), ray
 
 
 @dataclass(frozen=True)

@@ -32,10 +32,11 @@ _WRONG_RANGE = 0.1
 """The assumed share of correct boxes that have a wrong range. A larger share trusts ranges less."""
 _TRIED = 25
 """The number of tried values, for the share of strays and for the density of objects. A larger number is more exact."""
-_DENSITIES = (1e-4, 10.0)
-"""The density of objects is first computed from the density of boxes, and then multiplied by a factor between these limits.
-The factor is needed because objects do not lie everywhere where boxes could show them. A larger upper limit keeps more
-landmarks with few rays."""
+_DENSITY_FACTORS = np.geomspace(1e-4, 10.0, _TRIED)
+"""The tried factors on the density of objects, which is first computed from the density of boxes. A factor is needed because
+objects do not lie everywhere where boxes could show them. A larger upper limit keeps more landmarks with few rays."""
+_SHARES = np.geomspace(1e-4, 1.0, _TRIED)
+"""The tried shares of stray boxes. A smaller lower limit trusts the boxes of a clean log more."""
 _PRIOR_STRAYS = 1.0
 """The number of strays of each label that are assumed in addition to those of the log. A larger number keeps fewer
 landmarks."""
@@ -199,8 +200,20 @@ def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floa
     x) dx by Laplace's method. If they are strays, each box has the density of the label's strays.
     """
     total, label = _evidence(state, gate, strays, rates), state.label
-    share, density = _likeliest(total, _looks(state), label, *_expected(state, rates))
-    return np.clip(total + np.log(density[label]) - _looks(state) * np.log(share[label]), -MOST_ODDS, MOST_ODDS)
+    grid = _likelihoods(total, _looks(state), label, *_expected(state, rates))
+    density, share = np.unravel_index(grid.reshape(len(grid), -1).argmax(axis=1), (_TRIED, _TRIED))
+    odds = total + np.log(_DENSITY_FACTORS[density])[label] - _looks(state) * np.log(_SHARES[share])[label]
+    return np.clip(odds, -MOST_ODDS, MOST_ODDS)
+
+
+def log_evidence(state: State, gate: float, strays: Strays, rates: Rates) -> float:
+    """Return the log odds of all landmarks together over the case that all boxes are strays.
+
+    The share of strays and the density of objects are those that fit each label best.
+    """
+    boxes, objects = _expected(state, rates)
+    grid = _likelihoods(_evidence(state, gate, strays, rates), _looks(state), state.label, boxes, objects)
+    return float((grid.reshape(len(grid), -1).max(axis=1) + boxes)[boxes > 0].sum())
 
 
 def _evidence(state: State, gate: float, strays: Strays, rates: Rates) -> Floats:
@@ -238,24 +251,23 @@ def _expected(state: State, rates: Rates) -> tuple[Ints, Floats]:
     return boxes, np.asarray(_PRIOR * boxes / np.maximum(looks, 1.0))
 
 
-def _likeliest(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: Floats) -> tuple[Floats, Floats]:
-    """Return the share (L,) of the boxes of each label that are stray, and the factor (L,) on the density of its objects.
+def _likelihoods(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: Floats) -> Floats:
+    """Return the log likelihoods (L, D, S) of the density of objects and of the share of stray boxes, for each label.
 
-    The numbers of strays and objects are Poisson distributed. The mean number of strays is c n, for n boxes. The mean number
-    of objects is m times the nominal number. Then the likelihood is c^n exp(-c n - m objects), times 1 + m o c^-k for each
-    landmark with k rays and the odds o at c = m = 1. odds, number, label: (N,). boxes, objects: (L,), the nominal numbers of
-    boxes and objects.
+    The tried values are `_DENSITY_FACTORS` (D,) and `_SHARES` (S,). The numbers of strays and objects are Poisson
+    distributed. The mean number of strays is c n, for n boxes. The mean number of objects is m times the nominal number.
+    Then the likelihood is c^n exp(-c n - m objects), times 1 + m o c^-k for each landmark with k rays and the odds o at c =
+    m = 1. odds, number, label: (N,). boxes, objects: (L,), the nominal numbers of boxes and objects.
     """
-    log_share, log_density = np.log(np.geomspace(1e-4, 1.0, _TRIED)), np.log(np.geomspace(*_DENSITIES, _TRIED))
+    log_share, log_density = np.log(_SHARES), np.log(_DENSITY_FACTORS)
     grid = np.zeros((len(boxes), _TRIED, _TRIED))
     for j in np.flatnonzero(boxes).tolist():
         mine = label == j
         gain = odds[mine, None] - number[mine, None] * log_share
         grid[j] = [np.logaddexp(0.0, gain + m).sum(axis=0) for m in log_density]
-    grid += boxes[:, None, None] * (log_share - np.exp(log_share)) + _PRIOR_STRAYS * log_share
-    grid -= objects[:, None, None] * np.exp(log_density)[:, None]
-    density, share = np.unravel_index(grid.reshape(len(boxes), -1).argmax(axis=1), (_TRIED, _TRIED))
-    return np.exp(log_share[share]), np.exp(log_density[density])
+    grid += boxes[:, None, None] * (log_share - _SHARES) + _PRIOR_STRAYS * log_share
+    grid -= objects[:, None, None] * _DENSITY_FACTORS[:, None]
+    return grid
 
 
 def log_places(state: State, strays: Strays, rates: Rates) -> Floats:

@@ -4,6 +4,7 @@ A wrong heading of a pose turns all rays of its frame to one side, and a wrong p
 boxes does neither. So frames that show several objects tell the noise of the poses, even if the noise of boxes is unknown.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,23 +135,23 @@ def _most_likely(sums: _Sums) -> Floats:
     """Return the factors (3,) on the noise of rays, headings and places with the least cost.
 
     The factors on headings and places are 1 unless larger factors cost significantly less."""
-    usual, cost_usual = _searched(sums, np.array([True, False, False]), np.zeros(3))
-    found, cost = _searched(sums, np.ones(3, dtype=bool), usual)
+    usual, cost_usual = least_cost(sums.cost, np.array([True, False, False]), np.zeros(3), _BOUNDS)
+    found, cost = least_cost(sums.cost, np.ones(3, dtype=bool), usual, _BOUNDS)
     return np.exp(found if cost < cost_usual - _SIGNIFICANT else usual)
 
 
-def _searched(sums: _Sums, free: Bools, start: Floats) -> tuple[Floats, float]:
-    """Return the logarithms (3,) of factors with the least cost, and this cost, by steps along the axes that become smaller.
+def least_cost(cost: Callable[[Floats], float], free: Bools, start: Floats, bounds: Floats) -> tuple[Floats, float]:
+    """Return the logarithms (n,) of factors with the least cost, and this cost, by steps along the axes that become smaller.
 
-    free: (3,) which factors change. start: (3,) logarithms."""
-    best, cost = start, sums.cost(start)
-    moves = np.concatenate([np.eye(3), -np.eye(3)])[np.tile(free, 2)]
+    free: (n,) which factors change. start: (n,) logarithms. bounds: (2, n) their least and largest values."""
+    best, least = start, cost(start)
+    moves = np.concatenate([np.eye(len(start)), -np.eye(len(start))])[np.tile(free, 2)]
     for step in _STEPS:
         moved = True
         while moved:
             moved = False
             for move in moves:
-                other = np.clip(best + step * move, *_BOUNDS)
-                if (tried := sums.cost(other)) < cost - 1e-9:
-                    best, cost, moved = other, tried, True
-    return best, cost
+                other = np.clip(best + step * move, *bounds)
+                if (tried := cost(other)) < least - 1e-9:
+                    best, least, moved = other, tried, True
+    return best, least

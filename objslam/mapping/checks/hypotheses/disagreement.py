@@ -8,6 +8,8 @@ from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.mounts import unset
 from objslam.mapping.checks.hypotheses.trials import Trial, chance
 
+DISAGREE = "boxes disagree"
+"""The name of a finding whose cause no hypothesis explains."""
 _BAD_SCORE = 0.4
 """Boxes may disagree with the poses if their score is below this. Clean logs have at least 0.56, recorded or simulated. Logs
 with a camera that is turned in any way have at most 0.3. A larger score accuses more logs."""
@@ -45,7 +47,7 @@ def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | Non
     )
     if unset(part.log):
         message += ". base_T_camera has no rotation, so the camera looks where z of the poses points"
-    return Finding("boxes disagree", message, basis="boxes")
+    return Finding(DISAGREE, message, basis="boxes")
 
 
 def _at_rest(found: Agreement) -> Bools:

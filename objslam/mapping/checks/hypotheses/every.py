@@ -29,14 +29,19 @@ _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 
 def hypotheses(log: Log) -> Iterator[Hypothesis]:
     """Yield each hypothesis that applies to a log."""
-    yield from mounts(log)
-    yield from _paths(log)
-    yield from _images()
+    yield from coarse_hypotheses(log)
     edges = _clipped_edges(log)
     if not edges:
         yield from _boxes(any(one.camera.sees_size for one in log.cameras))
     yield from _squares(edges)
     yield from _clocks()
+
+
+def coarse_hypotheses(log: Log) -> Iterator[Hypothesis]:
+    """Yield the hypotheses about mounts, paths and images. Each moves most rays far, if it is wrong."""
+    yield from mounts(log)
+    yield from _paths(log)
+    yield from _images()
 
 
 def _paths(log: Log) -> Iterator[Hypothesis]:
