@@ -8,7 +8,7 @@ from association_scenes import drive, join, rays_of_boxes, watch
 from scipy.stats import multivariate_normal, norm
 
 from objslam.association.existence import detection_rates
-from objslam.association.few_rays.additional_objects import add_few_ray_objects
+from objslam.association.few_rays.additional_objects import add_few_ray_objects, few_ray_evidence
 from objslam.association.few_rays.chance import Strays, _Density, _looks, _smoothed, chance_odds, log_volume, ray_odds
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.observations import observe
@@ -71,6 +71,23 @@ def test_two_rays_are_an_object_where_strays_are_rare_and_none_where_they_are_de
     assert pair.associate().count == 0
     crowd = join(pair.rays, stray(pair, 4000, 2))
     assert search(pair, rays=crowd).count == 0
+
+
+def test_the_evidence_counts_the_rays_that_meet_and_the_frames_that_miss():
+    def found(scene, rays):
+        of = {"map_T_camera": scene.keyframes.map_T_camera, "sigma": rays.sigma, "position_sigma": 0.0}
+        return few_ray_evidence(rays, scene.keyframes, scene.cameras, Settings(), **of)
+
+    two, five = (watch(POINT, around(np.arange(n) * 60)) for n in (2, 5))
+    few, more = found(two, two.rays), found(five, five.rays)
+    assert few.explained == more.explained == 1.0
+    assert more.chance > few.chance + 5.0 > 5.0
+    crowd = found(two, join(two.rays, stray(two, 4000, 2)))
+    assert (crowd.chance, crowd.detections, crowd.explained) == (0.0, 0.0, 0.0)
+    beside = watch(POINT, around(np.arange(5) * 15))  # An object need not be seen from its other side.
+    assert found(beside, beside.rays.take(np.array([0, 4]))).detections < few.detections - 1.0
+    assert (more.owner == 0).all()
+    np.testing.assert_allclose(more.positions, POINT, atol=0.05)
 
 
 def test_one_ray_with_a_range_that_another_ray_meets_is_surer_than_two_bearings():

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -267,8 +268,12 @@ def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[Log]:
         yield hypothesis.put_right(log)
     for number, degrees in enumerate(turns):
         progress(len(usual) + number, len(usual) + len(turns))
-        turn = lift_se2(np.array([0.0, 0.0, np.radians(degrees)]))
-        yield with_poses(log, lambda poses, turn=turn: poses @ turn)
+        yield with_poses(log, partial(_turned, by=np.radians(degrees)))
+
+
+def _turned(poses: Floats, by: float) -> Floats:
+    """Return poses (N, 4, 4) with their headings turned by an angle, rad."""
+    return poses @ lift_se2(np.array([0.0, 0.0, by]))
 
 
 def _part(log: Log) -> Log:

@@ -1,0 +1,113 @@
+"""The noise of a street past which a car with GPS drives: against what was drawn, and wrong mounts that look like noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from association_parts.streets import street_counts
+from peers.street import simulate_street
+
+from objslam.association.few_rays.additional_objects import FewRayEvidence
+from objslam.config import Settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.mapping import pipeline
+from objslam.mapping.checks.diagnosis import diagnose
+from objslam.mapping.checks.hypotheses.every import with_poses
+from objslam.mapping.fixed import sparse_noise as tested
+from objslam.mapping.fixed.sparse_noise import SparseNoise, _part, _Searched, sparse_noise, with_sparse_noise
+
+FIXED = Settings.model_validate({"mode": "fixed", "output": {"recording": False}})
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    pass
+
+
+@pytest.fixture
+def few_tried(monkeypatch):
+    """Fewer noises than usual are tried, the true ones among them."""
+    monkeypatch.setattr(tested, "_PLACES", (1.0, 30.0))
+    monkeypatch.setattr(tested, "_RAYS", (1.0,))
+
+
+@pytest.mark.usefixtures("few_tried")
+def test_a_street_with_default_settings_is_mapped_with_the_noise_that_it_has():
+    street = simulate_street(3)
+    result = pipeline.run(street.log, FIXED, Ledger())
+    (finding,) = result.summary["wrong_input"]
+    assert finding["name"] == "noise"
+    assert not finding["spoils_positions"]
+    assert "places that err by 0.4 m and depths that err by 16 %" in finding["message"]  # 0.36 m and 15 % are true.
+    points = np.array([item.position[:2] for item in result.map.resolved()])
+    (right, found, twice, of), _ = street_counts(street, points)
+    assert right >= 0.85 * found
+    assert twice >= 0.85 * of
+
+
+@pytest.mark.usefixtures("few_tried")
+def test_cameras_that_look_elsewhere_are_no_noise():
+    turn = lift_se2(np.array([0.0, 0.0, np.radians(40.0)]))
+    log = with_poses(simulate_street(3).log, lambda poses: poses @ turn)
+    diagnosis = diagnose(log, FIXED, Ledger())
+    assert [one.name for one in diagnosis.findings] == ["boxes disagree"]
+    assert with_sparse_noise(log, FIXED, diagnosis, Ledger(), silent) == (FIXED, diagnosis)
+
+
+@pytest.mark.usefixtures("few_tried")
+def test_noise_that_the_settings_say_is_not_changed():
+    log = simulate_street(3).log
+    said = FIXED.model_copy(update={"localization": FIXED.localization.model_copy(update={"xy": 0.03})})
+    assert sparse_noise(log, said, silent) is None
+    said = FIXED.model_copy(update={"depth": FIXED.depth.model_copy(update={"sigma_per_m": 0.15})})
+    found = sparse_noise(log, said, silent)
+    assert found is not None
+    assert found.ranges == 1.0
+    assert found.place > 10
+
+
+def test_a_log_that_agrees_is_left_alone():
+    log = simulate_street(3).log
+    diagnosis = replace(diagnose(log, FIXED, Ledger()), findings=())
+    assert with_sparse_noise(log, FIXED, diagnosis, Ledger(), silent) == (FIXED, diagnosis)
+
+
+@pytest.mark.parametrize("place", [0.3, 2.0])
+def test_the_residuals_show_the_noise_of_the_places(place):
+    """500 objects, four rays each, at their least-squares positions. Restricted likelihood has no bias there."""
+    rng, views, count = np.random.default_rng(0), 4, 500
+    owner = np.repeat(np.arange(count), views)
+    bearing, away = rng.uniform(-np.pi, np.pi, len(owner)), rng.uniform(5.0, 20.0, len(owner))
+    ahead = np.column_stack([np.cos(bearing), np.sin(bearing)])
+    said = bearing + 0.01 * rng.standard_normal(len(owner))
+    range_ = away * (1 + 0.02 * rng.standard_normal(len(owner)))
+    origin = -away[:, None] * ahead + place * rng.standard_normal((len(owner), 2))
+    ends = origin + range_[:, None] * np.column_stack([np.cos(said), np.sin(said)])
+    weight = 1 / (place**2 + (0.015 * away) ** 2)
+    middle = np.array([np.bincount(owner, weight * ends[:, k]) / np.bincount(owner, weight) for k in range(2)]).T
+    level = np.zeros((len(owner), 1))
+    of = np.column_stack([middle, np.zeros(count)])
+    found = FewRayEvidence(0.0, 0.0, 1.0, np.arange(len(owner)), owner, of)
+    searched = _Searched(
+        SparseNoise(place=10.0),
+        found,
+        np.hstack([np.column_stack([np.cos(said), np.sin(said)]), level]),
+        np.hstack([middle[owner] - origin, level]),
+        np.full(len(owner), 0.01),
+        range_,
+        0.02 * away,
+        0.02,
+    )
+    assert 0.02 * searched.with_place_of_residuals(10.0).place == pytest.approx(place, rel=0.06)
+
+
+def test_a_long_street_is_searched_in_its_middle():
+    log = simulate_street(0).log
+    assert _part(log) is log
+    boxes = sum(len(one.detections) for one in log.cameras)
+    many = replace(log, cameras=log.cameras * 4)
+    part = _part(many)
+    stamps = np.unique(np.concatenate([one.detections.frame_stamps for one in part.cameras]))
+    assert np.diff(stamps).max() == pytest.approx(1.0)
+    assert tested._MOST_BOXES <= sum(len(one.detections) for one in part.cameras) < 4 * boxes
+    assert stamps[0] > log.cameras[0].detections.frame_stamps[0]
