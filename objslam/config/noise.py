@@ -12,8 +12,9 @@ class Noise(Section):
     then only a prior of the weight `prior`.
 
     auto: estimate the noise if the settings of this noise have their defaults. The noise of rays, ranges and odometry is
-    estimated only in joint mode with odometry. true: estimate it even if these settings differ from their defaults. false:
-    never estimate it.
+    estimated only in joint mode with odometry. In fixed mode, the noise of rays and ranges is estimated if few boxes show
+    each thing, and they agree only with far more noise. true: estimate it even if these settings differ from their defaults.
+    false: never estimate it.
     """
 
     rays: Estimated = "auto"
