@@ -7,11 +7,10 @@ from itertools import pairwise
 import numpy as np
 
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.observations import MIN_DEPTH, Observations
+from objslam.association.observations import MIN_DEPTH, SIZED_BY, Observations, UsualSizes
 from objslam.association.refinement import range_costs, refine, variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
-from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 
 TRACK_GAIN = 2.0
 """The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
@@ -22,20 +21,6 @@ _FAR = 1e6
 _PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
-_SIZE_SPREAD = 0.25
-"""The expected standard deviation of ln width and ln height over the boxes of a landmark. The sizes change with the side and
-with the detector. With a larger value, only larger differences of size count."""
-_SIZE_POOLED = 5.0
-"""With this many boxes, the measured spread of a landmark's sizes weighs as much as `_SIZE_SPREAD`. A larger number trusts
-the measured spread less."""
-_SIZED_BY = 5
-"""The least number of boxes that give a landmark a size. A larger number leaves more landmarks without a size."""
-_SIZE_FREE = 5.99
-"""A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. With a larger
-value, only larger differences of size count."""
-SIZE_LOSS = 6.0
-"""The largest cost of a size. It is less than a usual gate, so that the bearing alone can still match a half hidden thing. A
-larger value loses more boxes of half hidden things."""
 
 
 @dataclass(frozen=True)
@@ -229,28 +214,12 @@ def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
 
 
 def size_costs(state: State, edges: Edges) -> Floats:
-    """Return the cost (E,), from 0 to `SIZE_LOSS`, of the size of the box in each match, in squared standard deviations.
-
-    Bearings do not tell a small thing from a large thing on the same line of sight. If only one of the two is detected, its
-    box fits the bearings of both, but only one of the sizes. A landmark has the median of the sizes of its boxes, and their
-    spread. Boxes of another size than usual cost more. A box without a size, and a landmark with few boxes, cost nothing.
-    """
-    obs, number = state.obs, state.ray_count
-    if not (number >= _SIZED_BY).any():
+    """Return the cost (E,) of the size of the box in each match (`UsualSizes.costs`)."""
+    if not (state.ray_count >= SIZED_BY).any():
         return np.zeros(len(edges.ray))
-    with np.errstate(divide="ignore"):  # A box without a size gets a deviation that is not finite.
-        size = np.log(obs.size)
-        noise = 2 * obs.sigma[edges.ray, None] / obs.size[edges.ray]  # Two edges, each with sqrt(2) times a centre's noise.
-    own = size[state.assigned] + np.log(state.distance)[:, None]
-    middle = grouped_median(own, state.owner, state.count)
-    away = np.linalg.norm(state.landmarks.position[edges.landmark] - obs.origin[edges.ray], axis=1)
-    with np.errstate(invalid="ignore"):
-        spread = grouped_median(np.abs(own - middle[state.owner]), state.owner, state.count) / NORMAL_MEDIAN
-        spread2 = (number[:, None] * spread**2 + _SIZE_POOLED * _SIZE_SPREAD**2) / (number[:, None] + _SIZE_POOLED)
-        off = size[edges.ray] + np.log(away)[:, None] - middle[edges.landmark]
-        squared = (off**2 / (spread2[edges.landmark] + noise**2)).sum(axis=1)
-    told = np.isfinite(squared) & (number[edges.landmark] >= _SIZED_BY)
-    return np.where(told, np.clip(squared - _SIZE_FREE, 0.0, SIZE_LOSS), 0.0)
+    usual = UsualSizes.of(state.obs.size[state.assigned], state.distance, state.owner, state.count)
+    away = np.linalg.norm(state.landmarks.position[edges.landmark] - state.obs.origin[edges.ray], axis=1)
+    return usual.costs(state.obs, edges.ray, edges.landmark, away)
 
 
 def _appearance_gain(state: State, edges: Edges) -> Floats | float:

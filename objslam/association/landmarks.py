@@ -10,7 +10,7 @@ import numpy as np
 
 from objslam.association.appearance.cosine_ratio import CosineRatio
 from objslam.association.appearance.evidence import Looks
-from objslam.association.observations import Observations
+from objslam.association.observations import Observations, UsualSizes
 from objslam.association.refinement import BEHIND, normalised_residuals, variance
 from objslam.association.visibility import CameraFrames, DetectionHistory, detection_history
 from objslam.core.arrays import Bools, Floats, Ints
@@ -48,7 +48,8 @@ class PredictedLandmarks:
     """The n landmarks and candidates that the next frame of a live session may show. The landmarks come first. landmarks:
     their number. id: (n,) negative for candidates. label: (n,) negative for a candidate whose rays were grouped by label
     alone. position: (n, 3) m. covariance: (n, 3, 3) m^2. drift: (n, 6, 6) covariance of the odometry's drift up to the last
-    observation. noise: (n,) factor on the noise of the rays. far: m, the greatest distance at which a landmark was seen."""
+    observation. noise: (n,) factor on the noise of the rays. sizes: of their boxes. far: m, the greatest distance at which a
+    landmark was seen."""
 
     landmarks: int
     id: Ints
@@ -57,6 +58,7 @@ class PredictedLandmarks:
     covariance: Floats
     drift: Floats
     noise: Floats
+    sizes: UsualSizes
     far: float
 
 

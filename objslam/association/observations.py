@@ -1,6 +1,10 @@
-"""Rays as lines in the map for association, their closest approaches, and the sizes of what they observe."""
+"""Rays as lines in the map for association, their closest approaches, and the sizes of what they observe.
 
-from dataclasses import dataclass, replace
+The sizes of boxes are evidence too: what a landmark usually measures, and what an unusual box costs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Self
 
@@ -9,11 +13,25 @@ import numpy as np
 from objslam.core.appearance.features import FeatureTable
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
-from objslam.core.statistics import grouped_median
+from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 
 MIN_DEPTH = 0.05
 """The least distance (m) of an object from a camera. A larger value loses objects right in front of the camera."""
+_SIZE_SPREAD = 0.25
+"""The expected standard deviation of ln width and ln height over the boxes of a landmark. The sizes change with the side and
+with the detector. With a larger value, only larger differences of size count."""
+_SIZE_POOLED = 5.0
+"""With this many boxes, the measured spread of a landmark's sizes weighs as much as `_SIZE_SPREAD`. A larger number trusts
+the measured spread less."""
+SIZED_BY = 5
+"""The least number of boxes that give a landmark a size. A larger number leaves more landmarks without a size."""
+_SIZE_FREE = 5.99
+"""A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. With a larger
+value, only larger differences of size count."""
+SIZE_LOSS = 6.0
+"""The largest cost of a size. It is less than a usual gate, so that the bearing alone can still match a half hidden thing. A
+larger value loses more boxes of half hidden things."""
 
 
 @dataclass(frozen=True)
@@ -108,12 +126,19 @@ def observe(
 
 def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]) -> Floats:
     """Return width and height (R, 2) of the object in each box, in m per m of its distance."""
-    of = keyframes.camera[rays.keyframe]
-    focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[of]
-    pinhole = np.array([c.distortion_model != "equidistant" for c in cameras])[of]
-    depth = np.where(pinhole, rays.direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
+    return box_sizes(rays.box, rays.direction, cameras, keyframes.camera[rays.keyframe])
+
+
+def box_sizes(box: Floats, direction: Floats, cameras: Sequence[Camera], camera: Ints) -> Floats:
+    """Return width and height (R, 2) of the objects in boxes (R, 4), px, in m per m of their distances.
+
+    direction: (R, 3) unit vectors through the centres of the boxes, in the camera frame. camera: (R,) number of its camera.
+    """
+    focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[camera]
+    pinhole = np.array([not c.fisheye for c in cameras])[camera]
+    depth = np.where(pinhole, direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
     # If a box is read in another order than it was written, a side may be negative.
-    return np.asarray(np.maximum(rays.box[:, 2:] - rays.box[:, :2], 0.0) / focal * depth[:, None])
+    return np.asarray(np.maximum(box[:, 2:] - box[:, :2], 0.0) / focal * depth[:, None])
 
 
 def extents(
@@ -143,3 +168,61 @@ def overlap(one: Floats, two: Floats) -> Floats:
     common = np.maximum(high - low, 0.0).prod(axis=-1)
     total = (one[..., 2:] - one[..., :2]).prod(axis=-1) + (two[..., 2:] - two[..., :2]).prod(axis=-1) - common
     return np.asarray(common / np.maximum(total, 1e-12))
+
+
+@dataclass(frozen=True)
+class UsualSizes:
+    """What the boxes of N landmarks usually measure.
+
+    number: (N,) of the boxes with a size. ln_size: (N, 2) medians of ln width and ln height, in m. variance: (N, 2) of both
+    over the boxes of the landmark. Without boxes, the medians are NaN.
+    """
+
+    number: Ints
+    ln_size: Floats
+    variance: Floats
+
+    @classmethod
+    def of(cls, size: Floats, distance: Floats, owner: Ints, count: int) -> Self:
+        """Take the usual sizes from P boxes.
+
+        size: (P, 2) width and height of the object per metre of its distance. A box with a size of 0 has no size. distance:
+        (P,) m. owner: (P,) the landmark of each box. count: number N of landmarks.
+        """
+        known = np.flatnonzero((size > 0).all(axis=1))
+        owner = owner[known]
+        own = np.log(size[known]) + np.log(distance[known])[:, None]
+        number = np.bincount(owner, minlength=count)
+        middle = grouped_median(own, owner, count)
+        spread = np.nan_to_num(grouped_median(np.abs(own - middle[owner]), owner, count)) / NORMAL_MEDIAN
+        weight = number[:, None]
+        return cls(number, middle, (weight * spread**2 + _SIZE_POOLED * _SIZE_SPREAD**2) / (weight + _SIZE_POOLED))
+
+    def take(self, which: Ints) -> Self:
+        """Select landmarks by indices (n,)."""
+        return type(self)(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def costs(
+        self, obs: Observations, ray: Ints, landmark: Ints, distance: Floats, distance_sigma: Floats | None = None
+    ) -> Floats:
+        """Return the cost (E,), from 0 to `SIZE_LOSS`, of the size of the box in each match, in squared standard deviations.
+
+        Bearings do not tell a small thing from a large thing on the same line of sight. If only one of the two is detected,
+        its box fits the bearings of both, but only one of the sizes. Boxes of another size than usual cost more. A box
+        without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the matches. distance: (E,) m,
+        from the camera to the landmark. distance_sigma: (E,) m, its uncertainty, by default 0.
+        """
+        cost = np.zeros(len(ray))
+        some = np.flatnonzero((self.number[landmark] >= SIZED_BY) & (obs.size[ray] > 0).all(axis=1))
+        if not len(some):
+            return cost
+        ray, landmark = ray[some], landmark[some]
+        size = obs.size[ray]
+        noise = 2 * obs.sigma[ray, None] / size  # Two edges, each with sqrt(2) times a centre's noise.
+        off = np.log(size) + np.log(distance[some])[:, None] - self.ln_size[landmark]
+        spread = self.variance[landmark] + noise**2
+        if distance_sigma is not None:
+            spread += (distance_sigma[some] / distance[some])[:, None] ** 2
+        squared = (off**2 / spread).sum(axis=1)
+        cost[some] = np.clip(squared - _SIZE_FREE, 0.0, SIZE_LOSS)
+        return cost

@@ -42,6 +42,8 @@ class IncrementalGraph(GrowingGraph):
         super().__init__(settings)
         self._isam = new_isam({})
         self._stale = self._unfinished = False
+        self._coming = np.zeros(0, dtype=np.int64)  # The landmarks for which the tree was last prepared.
+        self._prepared = True  # Whether the tree has a layout for them. A rebuild in slices ends without one.
         self.rebuilds = 0
 
     def update(self) -> None:
@@ -56,8 +58,10 @@ class IncrementalGraph(GrowingGraph):
         to the root if it may be observed and is not there yet. relinearise: whether to relinearise changed variables too.
         """
         sunk = any(self._touched.get(j, -_FRESH) <= self._updates - _FRESH for j in coming.tolist())
-        if relinearise or sunk or self._new.size():
-            self._work_in(relinearise, self._layout(coming))
+        self._coming = coming
+        if relinearise or sunk or not self._prepared or self._new.size():
+            self._prepared = True
+            self._work_in(relinearise, self._layout())
             shown = {j: number for j, number in self._touched.items() if number == self._updates}
             # A landmark that is not in this table counts as deep.
             self._touched = {**dict.fromkeys(coming.tolist(), self._updates - 1), **shown}
@@ -183,7 +187,7 @@ class IncrementalGraph(GrowingGraph):
             return
         self._clear()  # The new iSAM2 contains these factors and variables too.
         self._isam, self._stale = self._rebuild.isam, True
-        self._rebuild, self._unfinished = None, False
+        self._rebuild, self._unfinished, self._prepared = None, False, False
 
     def _work_in(self, relinearise: bool = False, layout: dict[int, int] | None = None) -> None:
         try:
@@ -195,8 +199,10 @@ class IncrementalGraph(GrowingGraph):
         except (RuntimeError, ValueError):  # The system is indeterminate, or the layout is impossible.
             self._rescue()
 
-    def _layout(self, coming: Ints) -> dict[int, int]:
+    def _layout(self, values: gtsam.Values | None = None) -> dict[int, int]:
         """Return a group number for each key that is eliminated late. A higher group is eliminated later.
+
+        values: the variables of a tree that is built anew. If not given, the layout is for the present tree.
 
         The newest keyframe X(k) and the landmarks that it observes make the root. The landmarks `coming` make the clique
         below the root. GTSAM merges a clique into its parent if the clique involves all variables of the parent. The cliques
@@ -208,22 +214,24 @@ class IncrementalGraph(GrowingGraph):
         while len(chain) < 3 and (before := self.before(chain[-1])) is not None:
             chain.append(before)
         groups = {X0 + k: 1 for k in chain}
-        groups.update((L0 + j, 2) for j in coming.tolist())
+        groups.update((L0 + j, 2) for j in self._coming.tolist())
         groups.update((L0 + j, 3) for j, number in self._touched.items() if number == self._updates)
         groups.update((X0 + k, 3) for k in chain[:2])
-        isam, new = self._isam, self._values
-        groups = {key: group for key, group in groups.items() if isam.valueExists(key) or new.exists(key)}
+        if values is None:
+            there = {key for key in groups if self._isam.valueExists(key) or self._values.exists(key)}
+        else:
+            there = {key for key in groups if values.exists(key)}
+        groups = {key: group for key, group in groups.items() if key in there}
         number = {group: i for i, group in enumerate(sorted(set(groups.values())), start=1)}
         # CCOLAMD needs consecutive groups, with 0 for all other variables, and fewer groups than variables.
         return {key: number[group] for key, group in groups.items()} if len(number) < len(groups) else {}
 
     def _update(self, relinearise: bool, layout: dict[int, int]) -> None:
-        last, reordered = gtsam.KeyGroupMap(), gtsam.KeyList()
-        for key, group in layout.items():
-            last.insert2(key, group)
+        reordered = gtsam.KeyList()
+        for key in layout:
             if self._isam.valueExists(key):
                 reordered.push_back(key)
-        self._isam.update(self._new, self._values, [], last if layout else None, None, reordered, relinearise)
+        self._isam.update(self._new, self._values, [], _groups(layout), None, reordered, relinearise)
         self._clear()
         self._stale = True
 
@@ -231,8 +239,8 @@ class IncrementalGraph(GrowingGraph):
         self._new, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 
     def _fill(self, graph: gtsam.NonlinearFactorGraph) -> None:
-        isam = new_isam(self._at.others)
-        isam.update(graph, self._at.values())
+        isam, values = new_isam(self._at.others), self._at.values()
+        isam.update(graph, values, [], _groups(self._layout(values)), None, gtsam.KeyList())
         isam.calculateEstimate()  # It raises here if the graph is indeterminate.
         self._isam, self._stale = isam, True
         self._rebuild, self._unfinished, self._outgrown = None, False, False
@@ -260,3 +268,13 @@ class IncrementalGraph(GrowingGraph):
             return np.asarray(self._isam.marginalCovariance(key))
         except RuntimeError:
             return np.full((dimension, dimension), np.nan)
+
+
+def _groups(layout: dict[int, int]) -> gtsam.KeyGroupMap | None:
+    """Return a layout in the form that iSAM2 takes, None for an empty one."""
+    if not layout:
+        return None
+    groups = gtsam.KeyGroupMap()
+    for key, group in layout.items():
+        groups.insert2(key, group)
+    return groups

@@ -244,7 +244,9 @@ def round_trip():
     return drive_of(simulate(preset("large", **changes), 5), load_settings(None, ("mode=joint", "rays.pixel_sigma=2")))
 
 
-def test_what_is_prepared_for_takes_little(round_trip):
+def test_what_is_prepared_for_takes_little(round_trip, monkeypatch):
+    """So it does after a rebuild at once, and after one in slices, which is prepared for anew."""
+    monkeypatch.setattr("objslam.graph.isam2._AT_ONCE", 50)
     drive = round_trip
     graph, landmarks = grown(drive)
     owner, keyframe, last = drive.association.object, drive.rays.keyframe, len(drive.keyframes) - 1
@@ -253,11 +255,18 @@ def test_what_is_prepared_for_takes_little(round_trip):
     assert latest[np.argsort(latest)[4]] < last - 150
     coming = np.union1d(long_ago, landmarks[latest >= last - 20])
 
-    def count(prepared, shown):
+    def count(prepared, shown, rebuilt="not"):
         one = IncrementalGraph(drive.settings)
         one.restore(graph.save())
         if prepared:
             one.prepare(coming, relinearise=True)
+        if rebuilt == "at once":
+            one.rebuild()
+        if rebuilt == "in slices":
+            one.rebuild_in_slices(np.arange(last + 1))
+            while one.is_rebuilding:
+                one.continue_rebuild()
+            one.prepare(coming)
         before = one.points(landmarks)
         result = one_more(one, drive, shown)
         np.testing.assert_allclose(one.points(landmarks), before, atol=5e-3)
@@ -265,6 +274,8 @@ def test_what_is_prepared_for_takes_little(round_trip):
 
     for j in (0, 4):
         assert count(True, long_ago[[j]]) <= len(coming) + 6 < count(False, long_ago[[j]]) / 3
+        for rebuilt in ("at once", "in slices"):
+            assert count(True, long_ago[[j]], rebuilt) <= len(coming) + 6, rebuilt
 
 
 def test_a_graph_that_cannot_be_built_says_so_on_one_line(monkeypatch):

@@ -30,13 +30,15 @@ def landmarks(positions, labels):
     return known
 
 
-def rays(targets, label=0):
+def rays(targets, label=0, size=0.0):
+    """Rays to targets (n, 3), m. size: m, of the things in their boxes, 0 if the camera sees no sizes."""
     local = np.asarray(targets) @ AHEAD[:3, :3]
     count = len(local)
     nothing, one = np.full(count, np.nan), np.ones(count)
-    direction = local / np.linalg.norm(local, axis=1, keepdims=True)
+    away = np.linalg.norm(local, axis=1, keepdims=True)
+    sizes, labels = np.tile(np.reshape(size, (-1, 1)), 2) / away, np.full(count, label)
     return FrameRays(
-        direction, one * SIGMA, nothing, nothing, np.full(count, label), one, np.zeros((count, 4)), np.full(count, -1)
+        local / away, one * SIGMA, nothing, nothing, labels, one, np.zeros((count, 4)), sizes, np.full(count, -1)
     )
 
 
@@ -51,11 +53,43 @@ def found(known, target, heading, place=np.nan, tracks=()):
     return match(rays(targets), AHEAD, predict_landmarks(known, tracks), uncertainty(heading, place), 2, 0.99, {}).tolist()
 
 
+def match_of(known, seen, tracks=()):
+    """The indices of the landmarks and tracks of rays, where the pose is certain."""
+    return match(seen, AHEAD, predict_landmarks(known, tracks), uncertainty(1e-4), 2, 0.999, {}).tolist()
+
+
 HALL = [(5.0, 0.0, 0.5), *((x, y, 0.5) for x in (-8.0, 0.0, 8.0, 14.0) for y in (-8.0, -5.0, 5.0, 8.0))]
 
 
 def test_a_landmark_seen_just_now_is_matched_among_many():
     assert found(landmarks(HALL, [0] * len(HALL)), (5.0, 0.05, 0.5), 0.02) == [0]
+
+
+def sized(known, sizes):
+    """Give landmarks usual sizes (n,), m."""
+    known.sized[:], known.ln_size[:], known.size_variance[:] = 30, np.log(np.reshape(sizes, (-1, 1))), 0.1**2
+    return known
+
+
+@pytest.mark.parametrize("first", [0.0, 0.02])
+def test_a_box_between_two_landmarks_is_of_the_one_of_its_size(first):
+    """A large thing behind a small one, whose centres the noise of bearings hides. first: m, which one the bearing is at."""
+    places, sizes = np.array([(4.0, 0.0, 0.5), (6.0, 0.03, 0.75)]), (0.15, 0.8)
+    known, off = landmarks(places, [0, 0]), np.array([0.0, first, 0.0])
+    blind = match_of(known, rays([places[0] + off], size=0.15))
+    assert blind == [int(first > 0)]  # No landmark has a size yet.
+    sized(known, sizes)
+    assert match_of(known, rays([places[0] + off], size=0.15)) == [0]
+    assert match_of(known, rays([places[0] + off], size=0.8 * 4 / 6)) == [1]  # `size` is that at 4 m.
+    assert match_of(known, rays([places[0] + off])) == blind  # The camera sees no sizes.
+
+
+def test_a_size_alone_takes_no_box_from_its_landmark():
+    """Neither a track, which has no size, nor a new landmark gets the box, though half the thing is hidden."""
+    known, one = sized(landmarks([(5.0, 0.0, 0.5)], [0]), [0.8]), track(np.zeros((6, 6)))
+    one.position = np.array([5.0, 0.05, 0.5])
+    for hidden in (0.8, 0.2, 0.02):
+        assert match_of(known, rays([(5.0, 0.01, 0.5)], size=hidden), [one]) == [0]
 
 
 def turned(points, angle):

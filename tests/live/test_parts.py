@@ -1,7 +1,10 @@
 """The small parts of a session, each against something that does the same for a whole log."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from driving import feed
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,6 +21,9 @@ from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.tables import GrowingTable, KeyframeTable, column
 from objslam.live.mapper.trajectory_buffer import PathBuffer
 from objslam.live.session.clock import Clock
+from objslam.live.session.session import Session
+from objslam.simulation import make_camera, preset, simulate
+from objslam.simulation.scene import EXTENTS
 from objslam.triangulation.triangulate import triangulate
 
 
@@ -224,3 +230,18 @@ def test_asking_whether_a_frame_is_redundant_changes_nothing():
     assert selector.is_redundant(0, here, {1})  # it was only asked about a frame from elsewhere
     selector.pass_over(0, there)
     assert not selector.is_redundant(0, here, {1})  # now it has been elsewhere
+
+
+@pytest.mark.parametrize("sees_size", [True, False])
+def test_the_sizes_of_landmarks_are_those_of_their_things(sees_size):
+    """The boxes of far and near things, from odometry that drifts: a session measures what the simulation drew."""
+    camera = replace(make_camera(), sees_size=sees_size)
+    drive = preset("demo", cameras=(camera,), frames=200, localization=None, laps=1.0)
+    session = feed(Session(load_settings(None, ("association.method=global",)), patient=True).start(), simulate(drive, 0))
+    m = session._mapper.state
+    assert len(m.landmarks) >= 10
+    known = m.landmarks.sized >= 5
+    assert known.all() if sees_size else not known.any()
+    true = np.log([EXTENTS[m.labels[label]] for label in m.landmarks.label[known].tolist()])
+    assert (np.abs(m.landmarks.ln_size[known] - true.reshape(-1, 2)) < 0.1).all()
+    session.abort()

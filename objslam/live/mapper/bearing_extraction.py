@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.association.observations import box_sizes
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.noise import range_noise
@@ -73,14 +74,16 @@ class BearingExtractor:
         kept, direction, sigma = kept[few], direction[few], sigma[few]
         reach = frame.depths[kept] / direction[:, 2] if settings.depth.use else np.full(len(kept), np.nan)
         lens, longer = lens_errors(errors, frame.camera), 1 + errors.get("range_scale", 0.0)
+        same = np.zeros(len(kept), dtype=np.int64)
         rays = FrameRays(
             direction=refocused(direction, np.ones(len(direction), dtype=bool), lens),
             sigma=sigma,
             range=reach * longer,
-            range_sigma=range_noise(reach, np.zeros(len(reach), dtype=np.int64), [camera], settings)[0] * longer,
+            range_sigma=range_noise(reach, same, [camera], settings)[0] * longer,
             label=label[kept],
             score=frame.scores[kept],
             box=frame.boxes[kept],
+            size=box_sizes(frame.boxes[kept], direction, [camera], same) * camera.sees_size,
             track=frame.track_ids[kept],
         )
         return FrameView(number, mount, base_T_camera, rays)

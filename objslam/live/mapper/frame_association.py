@@ -10,7 +10,7 @@ import numpy as np
 from objslam.association.gating import TRACK_GAIN, Edges, gate_limit, gated_edges, pair_up
 from objslam.association.joint_compatibility import jointly_compatible, unknown_density
 from objslam.association.landmarks import Landmarks, PredictedLandmarks
-from objslam.association.observations import Observations
+from objslam.association.observations import SIZED_BY, Observations, UsualSizes
 from objslam.association.refinement import RANGE_LOSS
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty, long_unseen
@@ -31,7 +31,8 @@ class FrameRays:
     """The rays of the usable boxes of one frame.
 
     direction: (n, 3) unit vectors in the camera frame. sigma: (n,) rad. range, range_sigma: (n,) m, NaN if unknown. label:
-    (n,) the numbers of the labels. score: (n,). box: (n, 4) px. track: (n,) the track ids of the detector, -1 if unknown.
+    (n,) the numbers of the labels. score: (n,). box: (n, 4) px. size: (n, 2) width and height per metre of the distance, 0
+    if the camera sees no sizes. track: (n,) the track ids of the detector, -1 if unknown.
     """
 
     direction: Floats
@@ -41,6 +42,7 @@ class FrameRays:
     label: Ints
     score: Floats
     box: Floats
+    size: Floats
     track: Ints
 
     def take(self, rays: Ints) -> FrameRays:
@@ -82,7 +84,9 @@ def match(
     accepts = predicted.label[rows][:, None] == np.arange(labels)
     limit = gate_limit(gate)
     spread = own + uncertainty.of_landmarks(to, then, map_T_camera)
-    edges = _clear(gated_edges(obs, Landmarks(places, spread, noises, accepts), limit), rays.sigma, to, landmark)
+    edges = gated_edges(obs, Landmarks(places, spread, noises, accepts), limit)
+    edges = _with_sizes(edges, obs, predicted.sizes.take(rows), to, spread)
+    edges = _clear(edges, rays.sigma, to, landmark)
     cost = edges.cost
     if landmark_of_track and (rays.track >= 0).any():
         before = np.array([landmark_of_track.get(t, -1) for t in rays.track.tolist()])
@@ -137,9 +141,10 @@ def in_map(rays: FrameRays, map_T_camera: Floats, which: Ints | slice = slice(No
     """Return rays as observations in map. map_T_camera: (4, 4). which: the indices of the rays to return."""
     direction = rays.direction[which] @ map_T_camera[:3, :3].T
     origin = np.broadcast_to(map_T_camera[:3, 3], direction.shape)
-    return Observations.of_lines(
+    lines = Observations.of_lines(
         origin, direction, rays.sigma[which], rays.range[which], rays.range_sigma[which], rays.label[which]
     )
+    return replace(lines, size=rays.size[which])
 
 
 def _possible(
@@ -173,6 +178,29 @@ def _best(edges: Edges, cost: Floats, rays: int, places: int, unmatched: float) 
 
 def _some(edges: Edges, keep: Bools) -> Edges:
     return Edges(**{name: value[keep] for name, value in vars(edges).items()})
+
+
+def _with_sizes(edges: Edges, obs: Observations, usual: UsualSizes, to: Floats, spread: Floats) -> Edges:
+    """Add the costs of sizes (`UsualSizes.costs`), where a box may belong to several landmarks with a size.
+
+    Sizes only decide between such landmarks, so each cost counts from the least one of the box. A candidate without a size
+    would otherwise win the box of a landmark that is badly placed, and become its duplicate. usual: the sizes of the m
+    candidates. to: (m, 3) m, from the camera to them. spread: (m, 3, 3) m^2, its covariance.
+    """
+    sized = usual.number[edges.landmark] >= SIZED_BY
+    several = np.bincount(edges.ray[sized], minlength=len(obs)) > 1
+    some = np.flatnonzero(sized & several[edges.ray])
+    if not len(some):
+        return edges
+    ray, landmark = edges.ray[some], edges.landmark[some]
+    way = to[landmark]
+    away = np.sqrt((way * way).sum(axis=1))
+    along = np.sqrt(np.einsum("ei,eij,ej->e", way, spread[landmark], way)) / away
+    added = usual.costs(obs, ray, landmark, away, along)
+    first = np.flatnonzero(np.diff(ray, prepend=-1))  # The edges are sorted by ray.
+    cost = edges.cost.copy()
+    cost[some] += added - np.repeat(np.minimum.reduceat(added, first), np.diff(first, append=len(ray)))
+    return replace(edges, cost=cost)
 
 
 def _clear(edges: Edges, sigma: Floats, to: Floats, landmark: Bools) -> Edges:

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.association.landmarks import PredictedLandmarks
+from objslam.association.observations import UsualSizes
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.box_centres import beside_centres, image_axes
 from objslam.core.camera import Camera
@@ -38,6 +39,9 @@ class LandmarkTable(GrowingTable):
     number of frames that should have shown it. far: m, the largest observed distance. squared: sum of the squared normalised
     residuals of its rays, clipped. rejected: number of its rays outside the gate.
 
+    sized, ln_size, size_variance: the number and the usual size of its boxes, as in `UsualSizes`. measured,
+    measured_at: `seen` and `position` when they were last measured.
+
     shape: of the body to whose centre the bearings point, as an index into `core.bodies.body.SHAPES`. 0 means that they
     point to the centres of boxes. half, yaw: m and rad, the half axes and the heading of this body. shape_covariance: of
     these four numbers.
@@ -55,6 +59,11 @@ class LandmarkTable(GrowingTable):
     far: Floats = column(np.float64)
     squared: Floats = column(np.float64)
     rejected: Ints = column(np.int64)
+    sized: Ints = column(np.int64)
+    ln_size: Floats = column(np.float64, 2)
+    size_variance: Floats = column(np.float64, 2)
+    measured: Ints = column(np.int64)
+    measured_at: Floats = column(np.float64, 3)
     shape: Ints = column(np.int64)
     half: Floats = column(np.float64, 3)
     yaw: Floats = column(np.float64)
@@ -110,8 +119,15 @@ def predict_landmarks(landmarks: LandmarkTable, tracks: Sequence[Track]) -> Pred
         covariance=np.concatenate([covariances(landmarks, every), spread]),
         drift=np.concatenate([landmarks.drift, drift]),
         noise=np.concatenate([noise(landmarks, every), np.ones(more)]),
+        sizes=_sizes(landmarks, more),
         far=float(landmarks.far.max(initial=0.0)),
     )
+
+
+def _sizes(landmarks: LandmarkTable, more: int) -> UsualSizes:
+    """Return the sizes of the boxes of all landmarks, followed by `more` entries without a size."""
+    columns = landmarks.sized, landmarks.ln_size, landmarks.size_variance
+    return UsualSizes(*(np.concatenate([values, np.zeros((more, *values.shape[1:]), values.dtype)]) for values in columns))
 
 
 def box_centres(

@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 
+from objslam.association.observations import SIZED_BY, UsualSizes
 from objslam.association.refinement import information, normalised_residuals
 from objslam.core.arrays import Ints
 from objslam.core.statistics import CLIPPED_RAY
@@ -14,6 +15,14 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
 _JUMP = np.radians(2.0)  # The residual (rad) above which the graph relinearises soon. A larger one relinearises more rarely.
+_GROWN = 1.2
+"""The size of a landmark's boxes is measured again when its observations have grown by this factor. With a larger factor, it
+is older, and takes less time."""
+_MOVED = 0.05
+"""It is also measured again when the landmark has moved by this share of its distance from the camera, because a box on a
+farther landmark shows a larger thing. With a larger share, it is older."""
+_BOXES = 20
+"""The most boxes of a landmark for its size, spread evenly over its boxes. More boxes take longer."""
 _TRACKS = 4096  # The detector tracks whose landmark is stored. A larger number knows a track id after a longer absence.
 
 
@@ -52,7 +61,11 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
     landmarks.seen[rows] += 1
     landmarks.drift[rows] = keyframes.drift[-1]
     landmarks.last[rows] = np.maximum(landmarks.last[rows], keyframes.stamp[-1])
-    landmarks.far[rows] = np.maximum(landmarks.far[rows], np.linalg.norm(position - pose[:3, 3], axis=1))
+    away = np.linalg.norm(position - pose[:3, 3], axis=1)
+    landmarks.far[rows] = np.maximum(landmarks.far[rows], away)
+    moved = np.linalg.norm(position - landmarks.measured_at[rows], axis=1) > _MOVED * away
+    grown = landmarks.seen[rows] >= _GROWN * landmarks.measured[rows]
+    measure_sizes(m, rows[(landmarks.seen[rows] >= SIZED_BY) & (moved | grown)])
     for track, j in zip(rays.track[update.matched].tolist(), ids.tolist(), strict=True):
         if track >= 0:
             m.landmark_of_track[track] = j
@@ -63,6 +76,22 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
         for (first, label), (second, other) in combinations(shown, 2):
             if label == other:
                 m.pairs.together[first, second] += 1
+
+
+def measure_sizes(m: MapState, rows: Ints) -> None:
+    """Measure the usual sizes of the boxes of the landmarks in these rows (n,), from at most `_BOXES` boxes of each."""
+    if not len(rows):
+        return
+    landmarks, rays = m.landmarks, m.rays
+    chosen = [np.flatnonzero((rays.owner == j) & rays.used) for j in landmarks.id[rows].tolist()]
+    chosen = [mine[np.linspace(0, len(mine) - 1, min(len(mine), _BOXES)).astype(np.int64)] for mine in chosen]
+    mine, index = np.concatenate(chosen), np.repeat(np.arange(len(rows)), [len(some) for some in chosen])
+    origin = np.array([m.graph.pose(k)[:3, 3] for k in rays.keyframe[mine].tolist()]).reshape(-1, 3)
+    distance = np.linalg.norm(landmarks.position[rows[index]] - origin, axis=1)
+    usual = UsualSizes.of(rays.size[mine], distance, index, len(rows))
+    landmarks.sized[rows], landmarks.ln_size[rows] = usual.number, usual.ln_size
+    landmarks.size_variance[rows] = usual.variance
+    landmarks.measured[rows], landmarks.measured_at[rows] = landmarks.seen[rows], landmarks.position[rows]
 
 
 def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
@@ -81,6 +110,7 @@ def merge_landmarks(m: MapState, keep: int, drop: int) -> None:
     if rays.to_centre[mine].any() or landmarks.shape[keep]:
         rays.to_centre[mine], rays.centre_sigma[mine] = m.to_centres(mine)
     m.graph.add_rays(m.bearings(mine[rays.used[mine]]))
+    measure_sizes(m, np.array([keep]))
 
 
 def remove_landmarks(m: MapState, rows: Ints, rebuild: bool = True) -> None:

@@ -195,6 +195,7 @@ class RayTable(GrowingTable):
     label: Ints = column(np.int64)
     score: Floats = column(np.float64)
     box: Floats = column(np.float64, 4)
+    size: Floats = column(np.float64, 2)
     track: Ints = column(np.int64)
     owner: Ints = column(np.int64)
     used: Bools = column(np.bool_)

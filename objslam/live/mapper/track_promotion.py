@@ -13,6 +13,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import CLIPPED_RAY
 from objslam.graph.isam2 import IncrementalGraph
+from objslam.live.mapper.landmark_update import measure_sizes
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
@@ -67,6 +68,7 @@ def add_landmark(m: MapState, at: Ints, fit: PointFit, obs: Observations, seen: 
         squared=[float((normalised_residuals(inner, fit.position) ** 2).clip(max=CLIPPED_RAY**2).sum())],
         rejected=[0],
     )
+    measure_sizes(m, np.array([len(m.landmarks) - 1]))
     m.rays.to_centre[at] = m.rays.centre_sigma[at] = 0.0  # They may have belonged to a landmark with a body.
     m.graph.add_landmark(j, fit.position)
     m.graph.add_rays(m.bearings(at[fit.inlier]))

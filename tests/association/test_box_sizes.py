@@ -1,0 +1,79 @@
+"""What the boxes of a thing usually measure, and what it costs a box to measure something else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from objslam.association.observations import SIZE_LOSS, Observations, UsualSizes
+
+SIGMA = 0.004
+
+
+def boxes(size):
+    """Observations of boxes with sizes (R, 2) m per m of their distance."""
+    count = len(size)
+    nothing = np.full(count, np.nan)
+    lines = Observations.of_lines(
+        np.zeros((count, 3)), np.tile([1.0, 0, 0], (count, 1)), np.full(count, SIGMA), nothing, nothing
+    )
+    return replace(lines, size=np.asarray(size, dtype=float))
+
+
+def usual(size, number=30, spread=0.0):
+    """The usual size of one thing of `size`, (2,) m, seen from 1 to 5 m. spread: the deviation of ln size."""
+    rng = np.random.default_rng(0)
+    distance = rng.uniform(1.0, 5.0, number)
+    measured = np.asarray(size) * np.exp(spread * rng.standard_normal((number, 2))) / distance[:, None]
+    return UsualSizes.of(measured, distance, np.zeros(number, dtype=np.int64), 1)
+
+
+def cost(of, size, distance, sigma=0.0):
+    """The cost of one box of a thing of `size`, m, at a distance, m."""
+    zero = np.zeros(1, dtype=np.int64)
+    seen = boxes(np.asarray(size)[None] / distance)
+    return float(of.costs(seen, zero, zero, np.array([distance]), np.array([sigma]))[0])
+
+
+def test_the_size_of_each_landmark_is_that_of_its_boxes():
+    rng, owner = np.random.default_rng(0), np.repeat([2, 0], [4000, 3000])
+    true = np.array([[0.2, 0.5], [np.nan, np.nan], [1.0, 0.3]])
+    distance = rng.uniform(1.0, 6.0, len(owner))
+    size = true[owner] * np.exp(0.1 * rng.standard_normal((len(owner), 2))) / distance[:, None]
+    size[::5, 1] = 0.0  # These cameras see no sizes.
+    found = UsualSizes.of(size, distance, owner, 3)
+    np.testing.assert_array_equal(found.number, np.bincount(owner[(size > 0).all(axis=1)], minlength=3))
+    np.testing.assert_allclose(np.exp(found.ln_size[[0, 2]]), true[[0, 2]], rtol=0.02)
+    np.testing.assert_allclose(found.variance[[0, 2]], 0.1**2, rtol=0.1)
+    one = found.take(np.array([2]))
+    assert (one.number[0], *one.ln_size[0]) == (found.number[2], *found.ln_size[2])
+
+
+def test_a_box_of_the_usual_size_costs_nothing_and_one_of_another_size_much():
+    known = usual((0.2, 0.4), number=1000, spread=0.1)
+    for distance in (1.0, 4.0):
+        assert cost(known, (0.2, 0.4), distance) == 0.0
+        assert cost(known, (0.23, 0.36), distance) == 0.0
+        assert cost(known, (0.6, 1.2), distance) == SIZE_LOSS
+        assert cost(known, (0.07, 0.13), distance) == SIZE_LOSS
+    costs = [cost(known, (0.2 * factor, 0.4 * factor), 2.0) for factor in (1.2, 1.27, 1.29, 1.6)]
+    assert costs == sorted(costs)
+    assert 0 < costs[1] < SIZE_LOSS
+
+
+def test_the_deviation_counts_in_its_variances():
+    """Chi-squared of two sizes, beyond its 95 % quantile: the spread, the noise of two edges, and that of the distance."""
+    known, distance, sigma = usual((0.5, 0.5), number=1000, spread=0.2), 4.0, 0.6
+    size = 0.5 * 1.7
+    variance = known.variance[0] + (2 * SIGMA / (size / distance)) ** 2 + (sigma / distance) ** 2
+    expected = ((np.log(size) - known.ln_size[0]) ** 2 / variance).sum() - 5.991
+    assert 0 < expected < SIZE_LOSS
+    assert cost(known, (size, size), distance, sigma) == pytest.approx(expected, abs=0.01)
+
+
+def test_what_is_not_known_costs_nothing():
+    assert cost(usual((0.2, 0.4), number=4), (0.8, 1.6), 2.0) == 0.0  # Four boxes are too few.
+    assert cost(usual((0.2, 0.4), number=5), (0.8, 1.6), 2.0) > 0.0
+    assert cost(usual((0.2, 0.4)), (0.0, 0.4), 2.0) == 0.0
+    assert cost(usual((0.2, 0.4)), (0.5, 1.0), 2.0, sigma=2.0) == 0.0  # Half as far away, the thing is as large as usual.
+    assert cost(usual((0.2, 0.4)), (0.5, 1.0), 2.0) > 0.0
