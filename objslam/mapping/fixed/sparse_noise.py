@@ -108,25 +108,24 @@ def with_sparse_noise(
     """
     if not any(one.name == DISAGREE for one in diagnosis.findings) or diagnosis.certain:
         return settings, diagnosis
-    noise = sparse_noise(log, settings, progress)
-    if noise is None:
-        return settings, diagnosis
-    noisier = noise.settings(settings)
-    again = diagnose(log, noisier, ledger, progress)
-    if again.spoilt:
-        return settings, diagnosis
-    message = (
-        f"the boxes agree only with {noise.in_words(settings)}, far more than the settings say. The map was made with this "
-        "noise. If you know the noise, set localization.xy, depth.sigma_per_m and rays.pixel_sigma"
-    )
-    return noisier, again.with_findings([Finding("noise", message, spoils=False)])
+    for noise in sparse_noise(log, settings, progress):
+        noisier = noise.settings(settings)
+        again = diagnose(log, noisier, ledger, progress)
+        if not again.spoilt:
+            message = (
+                f"the boxes agree only with {noise.in_words(settings)}, far more than the settings say. The map was made "
+                "with this noise. If you know the noise, set localization.xy, depth.sigma_per_m and rays.pixel_sigma"
+            )
+            return noisier, again.with_findings([Finding("noise", message, spoils=False)])
+    return settings, diagnosis
 
 
-def sparse_noise(log: Log, settings: Settings, progress: Progress) -> SparseNoise | None:
+def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[SparseNoise, ...]:
     """Return the noise of a log's places, depths and boxes with which its boxes show objects at the given poses.
 
-    None if the settings say the noise of the poses, or if no noise explains most of the boxes, far better than the noise in
-    the settings. Only noise that the settings let a run estimate is changed.
+    The likeliest noise comes first. If a noise that is about as likely has noisier places, it comes second. There is none if
+    the settings say the noise of the poses, or if no noise explains most of the boxes, far better than the noise in the
+    settings. Only noise that the settings let a run estimate is changed.
     """
     default = Settings()
 
@@ -135,28 +134,33 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> SparseNois
         return bool(usual if use == "auto" else use)
 
     if log.localization is None or not unknown("localization", settings.localization == default.localization):
-        return None
+        return ()
     part = _part(log)
     told = any(one.camera.depth_noise is not None for one in log.cameras)
     ranged = any(one.detections is not None and np.isfinite(one.detections.depths).any() for one in part.cameras)
     depths = ranged and unknown("ranges", settings.depth == default.depth and not told)
     boxes = unknown("rays", settings.rays == default.rays)
-    nothing = best = _searched(part, settings, SparseNoise())
-    tried = list(product(_PLACES, _RANGES if depths else (1.0,), _RAYS if boxes else (1.0,)))[1:]
+    tried = list(product(_PLACES, _RANGES if depths else (1.0,), _RAYS if boxes else (1.0,)))
+    searched = []
     for number, factors in enumerate(tried):
         progress("noise of few boxes", number, len(tried))
-        other = _searched(part, settings, SparseNoise(*factors))
-        best = max(best, other, key=lambda one: one.value)
+        searched.append(_searched(part, settings, SparseNoise(*factors)))
+    best = max(searched, key=lambda one: one.value)
     views = len(best.found.ray) / max(len(best.found.positions), 1)
-    if best.value == -np.inf or best.found.chance < nothing.found.chance + _CLEAR or views > _MOST_VIEWS:
-        return None
+    grown = best.found.chance - searched[0].found.chance
+    if best.value == -np.inf or grown < _CLEAR or views > _MOST_VIEWS:
+        return ()
     if any(
         _searched(corrected, settings, best.noise).value > best.value - _LEAD
         for corrected in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total))
     ):
-        return None
+        return ()
     # With the larger noise, a second search would take more stray boxes into its objects, and the noise would grow again.
-    return best.with_place_of_residuals(settings.noise.prior)
+    prior = settings.noise.prior
+    likely = best.with_place_of_residuals(prior)
+    others = [one.with_place_of_residuals(prior) for one in searched if one.value > best.value - _LEAD]
+    noisy = max(others, key=lambda one: one.place)
+    return (likely, noisy) if noisy.place > likely.place else (likely,)
 
 
 @dataclass(frozen=True)
