@@ -38,6 +38,7 @@ def doctor(
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.diagnosis import diagnose
+    from objslam.mapping.fixed.sparse_noise import with_sparse_noise
     from objslam.mapping.pipeline import chosen_poses, with_mode_of
     from objslam.sources.camera_words import doubts_of
 
@@ -49,6 +50,7 @@ def doctor(
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
         found = diagnose(said, settings, ledger, show, thorough=True)
+        settings, found = with_sparse_noise(said, settings, found, ledger, show)
         solved = _solved(given, settings, show) if found.refutable and settings.mode == "joint" else None
     report(ledger)
     _show_trials(found)

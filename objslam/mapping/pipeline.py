@@ -66,8 +66,7 @@ def run(
     with _stage("rays", seconds, progress):
         if settings.checks.use:
             diagnosis = diagnose(expected, settings, ledger, progress)
-            if settings.mode == "fixed":
-                settings, diagnosis = with_sparse_noise(expected, settings, diagnosis, ledger, progress)
+            settings, diagnosis = with_sparse_noise(expected, settings, diagnosis, ledger, progress)
             if settings.mode == "fixed" or not diagnosis.refutable:
                 say(diagnosis, ledger)  # No solve will refute the findings, so a user need not wait for one.
         if diagnosis.certain and settings.mode == "joint":

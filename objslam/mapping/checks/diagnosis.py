@@ -79,6 +79,10 @@ class Diagnosis:
         """Return the diagnosis with only the findings that the log itself shows."""
         return replace(self, findings=tuple(finding for finding in self.findings if finding.basis == "log"))
 
+    def without(self, name: str) -> Self:
+        """Return the diagnosis without the findings of this name."""
+        return replace(self, findings=tuple(finding for finding in self.findings if finding.name != name))
+
     @property
     def refutable(self) -> bool:
         """Whether a solve that explains the boxes may refute one of the findings."""

@@ -48,12 +48,15 @@ _MOST_BOXES = 600
 """The most boxes that are searched, from frames that follow each other. More boxes are more exact and take longer."""
 _EXPLAINED = 0.5
 """The least share of the boxes that the objects must explain. With a smaller share, noise is taken for objects."""
-_TURN = 30
+_TURN = 15
 """The steps (degrees) of the tried turns of all cameras about the vertical axis. A larger step misses more wrong mounts."""
-_LEAD = 10.0
-"""The least lead, in log odds, of the log as it is over the log with any usual mistake corrected. A turn of the cameras by
-15 degrees costs 50 and more. With a larger lead, fewer streets are mapped. With a smaller one, wrong mounts are taken for
-noise."""
+_LEAD = 20.0
+"""The least lead, in log odds, of the log as it is over the log with turned cameras. On ten streets the lead is 33 and more.
+With cameras turned by 15 degrees and more, and in rooms with turned cameras, it is 19 at most. With a larger lead, fewer
+streets are mapped. With a smaller one, wrong mounts are taken for noise."""
+_BETTER = 40.0
+"""The least lead, in log odds, of a usual mistake over the log as it is. A straight street looks alike in a mirror, so a
+corrected mistake leads by up to 25 by chance. With a larger lead, mistakes are sooner taken for noise."""
 _MOST_VIEWS = 12.0
 """The most boxes that an object may have on average. The streets have 4. If objects with more boxes still disagree, wrong
 input is likelier than noise, because their frames would show the noise. With a larger number, a turned camera is sooner
@@ -92,9 +95,9 @@ class SparseNoise:
     def in_words(self, nominal: Settings) -> str:
         """Return the noise in words, for people."""
         of = self.settings(nominal)
-        told = [f"places that err by {of.localization.xy:.2g} m"] if self.place > 1 else []
-        told += [f"depths that err by {100 * of.depth.sigma_per_m:.2g} %"] if self.ranges > 1 else []
-        told += [f"box centres that err by {of.rays.pixel_sigma:.2g} px"] if self.rays > 1 else []
+        told = [f"places that err by about {of.localization.xy:.2g} m"] if self.place > 1 else []
+        told += [f"depths that err by about {100 * of.depth.sigma_per_m:.2g} %"] if self.ranges > 1 else []
+        told += [f"box centres that err by about {of.rays.pixel_sigma:.2g} px"] if self.rays > 1 else []
         return " and ".join(told)
 
 
@@ -104,11 +107,14 @@ def with_sparse_noise(
     """Return settings with the noise of a log whose boxes disagree only because the settings say too little noise.
 
     diagnosis: of the log with the noise in the settings. If another noise lets the boxes agree, the returned diagnosis is of
-    the log with this noise, and says so. Otherwise the settings and the diagnosis are returned unchanged.
+    the log with this noise, and says so. If few boxes of each thing agree with the noise in the settings, the finding that
+    they disagree is taken back. Otherwise the settings and the diagnosis are returned unchanged.
     """
-    if not any(one.name == DISAGREE for one in diagnosis.findings) or diagnosis.certain:
+    if settings.mode != "fixed" or diagnosis.certain or not any(one.name == DISAGREE for one in diagnosis.findings):
         return settings, diagnosis
     for noise in sparse_noise(log, settings, progress):
+        if noise == SparseNoise():
+            return settings, diagnosis.without(DISAGREE)
         noisier = noise.settings(settings)
         again = diagnose(log, noisier, ledger, progress)
         if not again.spoilt:
@@ -124,43 +130,51 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[Spar
     """Return the noise of a log's places, depths and boxes with which its boxes show objects at the given poses.
 
     The likeliest noise comes first. If a noise that is about as likely has noisier places, it comes second. There is none if
-    the settings say the noise of the poses, or if no noise explains most of the boxes, far better than the noise in the
-    settings. Only noise that the settings let a run estimate is changed.
+    no noise explains most of the boxes, far better than chance and than the noise in the settings. Only noise that the
+    settings let a run estimate is changed. Without depths, the noise in the settings is the only one: with noisy places,
+    bearings meet anywhere.
     """
-    default = Settings()
-
-    def unknown(name: str, usual: bool) -> bool:
-        use = getattr(settings.noise, name)
-        return bool(usual if use == "auto" else use)
-
-    if log.localization is None or not unknown("localization", settings.localization == default.localization):
+    if log.localization is None:
         return ()
     part = _part(log)
-    told = any(one.camera.depth_noise is not None for one in log.cameras)
-    ranged = any(one.detections is not None and np.isfinite(one.detections.depths).any() for one in part.cameras)
-    depths = ranged and unknown("ranges", settings.depth == default.depth and not told)
-    boxes = unknown("rays", settings.rays == default.rays)
-    tried = list(product(_PLACES, _RANGES if depths else (1.0,), _RAYS if boxes else (1.0,)))
+    places, depths, boxes = _unknown(part, settings)
+    tried = product(_PLACES if places else (1.0,), _RANGES if depths else (1.0,), _RAYS if boxes else (1.0,))
+    noises = [SparseNoise(*factors) for factors in tried]
     searched = []
-    for number, factors in enumerate(tried):
-        progress("noise of few boxes", number, len(tried))
-        searched.append(_searched(part, settings, SparseNoise(*factors)))
+    for number, noise in enumerate(noises):
+        progress("noise of few boxes", number, len(noises))
+        searched.append(_searched(part, settings, noise))
     best = max(searched, key=lambda one: one.value)
     views = len(best.found.ray) / max(len(best.found.positions), 1)
-    grown = best.found.chance - searched[0].found.chance
+    nominal = best is searched[0]
+    grown = best.found.chance - (0.0 if nominal else searched[0].found.chance)
     if best.value == -np.inf or grown < _CLEAR or views > _MOST_VIEWS:
         return ()
-    if any(
-        _searched(corrected, settings, best.noise).value > best.value - _LEAD
-        for corrected in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total))
-    ):
-        return ()
+    for corrected, lead in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total)):
+        if _searched(corrected, settings, best.noise).value > best.value + lead:
+            return ()
+    if nominal or not places:
+        return (best.noise,)
     # With the larger noise, a second search would take more stray boxes into its objects, and the noise would grow again.
     prior = settings.noise.prior
     likely = best.with_place_of_residuals(prior)
     others = [one.with_place_of_residuals(prior) for one in searched if one.value > best.value - _LEAD]
     noisy = max(others, key=lambda one: one.place)
     return (likely, noisy) if noisy.place > likely.place else (likely,)
+
+
+def _unknown(log: Log, settings: Settings) -> tuple[bool, bool, bool]:
+    """Return whether the noise of places, of depths, and of boxes is unknown, and can be found."""
+    usual, told = Settings(), any(one.camera.depth_noise is not None for one in log.cameras)
+    ranged = any(one.detections is not None and np.isfinite(one.detections.depths).any() for one in log.cameras)
+    known = {
+        "localization": settings.localization == usual.localization,
+        "ranges": settings.depth == usual.depth and not told,
+        "rays": settings.rays == usual.rays,
+    }
+    uses = {name: getattr(settings.noise, name) for name in known}
+    places, depths, boxes = (ranged and bool(known[name] if use == "auto" else use) for name, use in uses.items())
+    return places, depths, boxes
 
 
 @dataclass(frozen=True)
@@ -260,19 +274,20 @@ def _searched(log: Log, settings: Settings, noise: SparseNoise) -> _Searched:
     )
 
 
-def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[Log]:
-    """Yield the log with each usual mistake about directions corrected, and with all cameras turned about the vertical axis.
+def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[tuple[Log, float]]:
+    """Yield the log with all cameras turned about the vertical axis, and with each usual mistake about directions corrected.
 
-    Errors of the clock and of the size of images are left out. They move rays by little, or all places by the same way.
+    With each log comes the gain in log odds from which it is likelier than the log as it is. Errors of the clock and of the
+    size of images are left out. They move rays by little, or all places by the same way.
     """
     usual = [one for one in coarse_hypotheses(log) if one.usual]
     turns = range(_TURN, 360, _TURN)
-    for number, hypothesis in enumerate(usual):
-        progress(number, len(usual) + len(turns))
-        yield hypothesis.put_right(log)
     for number, degrees in enumerate(turns):
-        progress(len(usual) + number, len(usual) + len(turns))
-        yield with_poses(log, partial(_turned, by=np.radians(degrees)))
+        progress(number, len(usual) + len(turns))
+        yield with_poses(log, partial(_turned, by=np.radians(degrees))), -_LEAD
+    for number, hypothesis in enumerate(usual):
+        progress(len(turns) + number, len(usual) + len(turns))
+        yield hypothesis.put_right(log), _BETTER
 
 
 def _turned(poses: Floats, by: float) -> Floats:

@@ -13,6 +13,8 @@ DISAGREE = "boxes disagree"
 _BAD_SCORE = 0.4
 """Boxes may disagree with the poses if their score is below this. Clean logs have at least 0.56, recorded or simulated. Logs
 with a camera that is turned in any way have at most 0.3. A larger score accuses more logs."""
+_HARDLY = 0.1
+"""Boxes disagree if their score is below this, whatever the score by chance is. A larger score accuses more logs."""
 _TIMES = 2.0
 """Boxes agree only by chance if their score is below this multiple of the score by chance (`trials.chance`). Clean logs have
 at least 2.9 times the score by chance, logs with turned cameras at most 1.9 times. A larger value accuses more logs."""
@@ -36,14 +38,15 @@ def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | Non
     one direction.
     """
     by_chance = chance(trials)
-    if by_chance is None or found.score >= min(_BAD_SCORE, _TIMES * by_chance):
+    if by_chance is None or found.score >= min(_BAD_SCORE, max(_TIMES * by_chance, _HARDLY)):
         return None
     if _at_rest(found).sum() >= _DISTANT * found.boxes:
         return None
     message = (
         f"only {100 * found.share:.0f} % of the boxes agree with the poses, hardly more than with a camera that is turned "
         "at random, and no usual mistake explains that: look at base_T_camera, at the frame of the poses and at the "
-        "stamps, and ask whether the poses are of this drive"
+        "stamps, and ask whether the poses are of this drive, or err by far more than localization.xy, or the depths by far "
+        "more than depth.sigma_per_m"
     )
     if unset(part.log):
         message += ". base_T_camera has no rotation, so the camera looks where z of the poses points"
