@@ -50,10 +50,13 @@ _EXPLAINED = 0.5
 """The least share of the boxes that the objects must explain. With a smaller share, noise is taken for objects."""
 _TURN = 15
 """The steps (degrees) of the tried turns of all cameras about the vertical axis. A larger step misses more wrong mounts."""
-_LEAD = 20.0
-"""The least lead, in log odds, of the log as it is over the log with turned cameras. On ten streets the lead is 33 and more.
-With cameras turned by 15 degrees and more, and in rooms with turned cameras, it is 19 at most. With a larger lead, fewer
-streets are mapped. With a smaller one, wrong mounts are taken for noise."""
+_LEAD = 15.0
+"""The least lead, in log odds, of the log as it is over the log with turned cameras. On streets the lead is 18 and more.
+With cameras turned by 15 degrees and more, it is below 0, and mostly in rooms with turned cameras too. With a larger lead,
+fewer streets are mapped. With a smaller one, wrong mounts are taken for noise."""
+_SURE = 60.0
+"""The lead from which the boxes agree even if few points explain most of them: each thing has few boxes. With a larger lead,
+more right streets with few boxes are called wrong."""
 _BETTER = 40.0
 """The least lead, in log odds, of a usual mistake over the log as it is. A straight street looks alike in a mirror, so a
 corrected mistake leads by up to 25 by chance. With a larger lead, mistakes are sooner taken for noise."""
@@ -112,30 +115,34 @@ def with_sparse_noise(
     """
     if settings.mode != "fixed" or diagnosis.certain or not any(one.name == DISAGREE for one in diagnosis.findings):
         return settings, diagnosis
-    for noise in sparse_noise(log, settings, progress):
-        if noise == SparseNoise():
-            return settings, diagnosis.without(DISAGREE)
+    noises, lead = sparse_noise(log, settings, progress)
+    for number, noise in enumerate(noises, start=1):
         noisier = noise.settings(settings)
-        again = diagnose(log, noisier, ledger, progress)
-        if not again.spoilt:
-            message = (
-                f"the boxes agree only with {noise.in_words(settings)}, far more than the settings say. The map was made "
-                "with this noise. If you know the noise, set localization.xy, depth.sigma_per_m and rays.pixel_sigma"
-            )
-            return noisier, again.with_findings([Finding("noise", message, spoils=False)])
+        again = diagnosis if noise == SparseNoise() else diagnose(log, noisier, ledger, progress)
+        if lead >= _SURE and number == len(noises):
+            again = again.without(DISAGREE)
+        if again.spoilt:
+            continue
+        if noise == SparseNoise():
+            return settings, again
+        message = (
+            f"the boxes agree only with {noise.in_words(settings)}, far more than the settings say. The map was made "
+            "with this noise. If you know the noise, set localization.xy, depth.sigma_per_m and rays.pixel_sigma"
+        )
+        return noisier, again.with_findings([Finding("noise", message, spoils=False)])
     return settings, diagnosis
 
 
-def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[SparseNoise, ...]:
+def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tuple[SparseNoise, ...], float]:
     """Return the noise of a log's places, depths and boxes with which its boxes show objects at the given poses.
 
-    The likeliest noise comes first. If a noise that is about as likely has noisier places, it comes second. There is none if
-    no noise explains most of the boxes, far better than chance and than the noise in the settings. Only noise that the
-    settings let a run estimate is changed. Without depths, the noise in the settings is the only one: with noisy places,
-    bearings meet anywhere.
+    Also return its lead, in log odds, over the log with turned cameras. The likeliest noise comes first. If a noise that is
+    about as likely has noisier places, it comes second. There is none if no noise explains most of the boxes, far better
+    than chance and than the noise in the settings. Only noise that the settings let a run estimate is changed. Without
+    depths, the noise in the settings is the only one: with noisy places, bearings meet anywhere.
     """
     if log.localization is None:
-        return ()
+        return (), 0.0
     part = _part(log)
     places, depths, boxes = _unknown(part, settings)
     tried = product(_PLACES if places else (1.0,), _RANGES if depths else (1.0,), _RAYS if boxes else (1.0,))
@@ -149,18 +156,21 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[Spar
     nominal = best is searched[0]
     grown = best.found.chance - (0.0 if nominal else searched[0].found.chance)
     if best.value == -np.inf or grown < _CLEAR or views > _MOST_VIEWS:
-        return ()
-    for corrected, lead in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total)):
-        if _searched(corrected, settings, best.noise).value > best.value + lead:
-            return ()
+        return (), 0.0
+    lead = np.inf
+    for corrected, turned in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total)):
+        ahead = best.value - _searched(corrected, settings, best.noise).value
+        lead = min(lead, ahead) if turned else lead
+        if ahead < (_LEAD if turned else -_BETTER):
+            return (), 0.0
     if nominal or not places:
-        return (best.noise,)
+        return (best.noise,), lead
     # With the larger noise, a second search would take more stray boxes into its objects, and the noise would grow again.
     prior = settings.noise.prior
     likely = best.with_place_of_residuals(prior)
     others = [one.with_place_of_residuals(prior) for one in searched if one.value > best.value - _LEAD]
     noisy = max(others, key=lambda one: one.place)
-    return (likely, noisy) if noisy.place > likely.place else (likely,)
+    return ((likely, noisy) if noisy.place > likely.place else (likely,)), lead
 
 
 def _unknown(log: Log, settings: Settings) -> tuple[bool, bool, bool]:
@@ -274,20 +284,20 @@ def _searched(log: Log, settings: Settings, noise: SparseNoise) -> _Searched:
     )
 
 
-def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[tuple[Log, float]]:
+def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[tuple[Log, bool]]:
     """Yield the log with all cameras turned about the vertical axis, and with each usual mistake about directions corrected.
 
-    With each log comes the gain in log odds from which it is likelier than the log as it is. Errors of the clock and of the
-    size of images are left out. They move rays by little, or all places by the same way.
+    With each log comes whether its cameras are turned. Errors of the clock and of the size of images are left out. They move
+    rays by little, or all places by the same way.
     """
     usual = [one for one in coarse_hypotheses(log) if one.usual]
     turns = range(_TURN, 360, _TURN)
     for number, degrees in enumerate(turns):
         progress(number, len(usual) + len(turns))
-        yield with_poses(log, partial(_turned, by=np.radians(degrees))), -_LEAD
+        yield with_poses(log, partial(_turned, by=np.radians(degrees))), True
     for number, hypothesis in enumerate(usual):
         progress(len(turns) + number, len(usual) + len(turns))
-        yield hypothesis.put_right(log), _BETTER
+        yield hypothesis.put_right(log), False
 
 
 def _turned(poses: Floats, by: float) -> Floats:
