@@ -11,8 +11,11 @@ from objslam.association.few_rays.additional_objects import FewRayEvidence
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
+from objslam.errors import SolveError
 from objslam.mapping import pipeline
-from objslam.mapping.checks.diagnosis import diagnose
+from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
 from objslam.mapping.checks.hypotheses.every import with_poses
 from objslam.mapping.fixed import sparse_noise as tested
 from objslam.mapping.fixed.sparse_noise import SparseNoise, _part, _Searched, sparse_noise, with_sparse_noise
@@ -65,6 +68,30 @@ def test_noise_that_the_settings_say_is_not_changed():
     (likely, *_), _ = sparse_noise(log, said, silent)
     assert likely.ranges == 1.0
     assert likely.place > 10
+
+
+def test_few_rays_are_searched_if_nothing_shows_the_shared_errors(monkeypatch):
+    def fails(*args):
+        raise SolveError("no object shows them")
+
+    monkeypatch.setattr("objslam.graph.calibration.fixed_pose_calibration.calibrate_at_poses", fails)
+    street, ledger = simulate_street(3), Ledger()
+    settings = street.settings(True)
+    asked = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"use": True})})
+    result = pipeline.run(street.log, asked, ledger)
+    assert any("no object shows them" in warning for warning in ledger.warnings)
+    assert result.map.resolved()
+    points = np.array([item.position[:2] for item in result.map.resolved()])
+    (_, _, twice, of), _ = street_counts(street, points)
+    assert twice >= 0.85 * of
+
+
+def test_a_street_that_agrees_with_the_settings_is_not_accused():
+    """Few points explain most of its boxes, because each thing has few. The noise of the settings explains them best."""
+    street = simulate_street(3)
+    settings = street.settings(True).model_copy(update={"mode": "fixed"})
+    accused = Diagnosis((Finding(DISAGREE, "the boxes disagree", basis="boxes"),))
+    assert with_sparse_noise(street.log, settings, accused, Ledger(), silent) == (settings, Diagnosis())
 
 
 def test_a_log_that_agrees_is_left_alone():

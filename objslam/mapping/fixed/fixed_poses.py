@@ -213,6 +213,9 @@ def calibrate_fixed(
             found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
         except SolveError as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+            every_object = now.add_few(association, estimate, told)
+            if every_object.count > association.count:
+                association, estimate = every_object, now.solve(every_object, trace, _parameters(calibration))
             return now, association, replace(estimate, calibration=calibration), rounds
         earlier.append((calibration.values, np.hypot(_own(now), told)))
         moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
