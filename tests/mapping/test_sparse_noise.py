@@ -17,10 +17,16 @@ from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
 from objslam.mapping.checks.hypotheses.every import with_poses
+from objslam.mapping.fixed import few_box_search
 from objslam.mapping.fixed import sparse_noise as tested
-from objslam.mapping.fixed.sparse_noise import SparseNoise, _part, _Searched, sparse_noise, with_sparse_noise
+from objslam.mapping.fixed.few_box_search import Searched, SparseNoise, middle
+from objslam.mapping.fixed.sparse_noise import sparse_noise, with_sparse_noise
 
 FIXED = Settings.model_validate({"mode": "fixed", "output": {"recording": False}})
+
+
+def accused() -> Diagnosis:
+    return Diagnosis((Finding(DISAGREE, "the boxes disagree", basis="boxes"),))
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -60,6 +66,29 @@ def test_cameras_that_look_elsewhere_are_no_noise():
 
 
 @pytest.mark.usefixtures("few_tried")
+def test_cameras_that_look_elsewhere_are_named_with_much_noise_in_the_settings():
+    turn = lift_se2(np.array([0.0, 0.0, np.radians(30.0)]))
+    street = simulate_street(2)
+    settings = street.settings(True).model_copy(update={"mode": "fixed"})
+    log = with_poses(street.log, lambda poses: poses @ turn)
+    said = settings.model_copy(update={"localization": settings.localization.model_copy(update={"xy": 0.6})})
+    _, diagnosis = with_sparse_noise(log, said, Diagnosis(), Ledger(), silent)
+    assert [(one.name, one.spoils) for one in diagnosis.findings] == [("cameras turned", True)]
+    assert "turned by about -30 degrees" in diagnosis.findings[0].message
+    assert with_sparse_noise(street.log, said, Diagnosis(), Ledger(), silent) == (said, Diagnosis())
+
+
+def test_boxes_without_a_ray_are_no_street():
+    street = simulate_street(2)
+    cameras = [
+        replace(one, detections=replace(one.detections, boxes=one.detections.boxes * 0)) for one in street.log.cameras
+    ]
+    log, settings = replace(street.log, cameras=tuple(cameras)), street.settings(True)
+    said = settings.model_copy(update={"mode": "fixed"})
+    assert with_sparse_noise(log, said, Diagnosis(), Ledger(), silent) == (said, Diagnosis())
+    assert with_sparse_noise(log, FIXED, accused(), Ledger(), silent) == (FIXED, accused())
+
+
 def test_noise_that_the_settings_say_is_not_changed():
     log = simulate_street(3).log
     said = FIXED.model_copy(update={"localization": FIXED.localization.model_copy(update={"xy": 0.03})})
@@ -88,10 +117,9 @@ def test_few_rays_are_searched_if_nothing_shows_the_shared_errors(monkeypatch):
 
 def test_a_street_that_agrees_with_the_settings_is_not_accused():
     """Few points explain most of its boxes, because each thing has few. The noise of the settings explains them best."""
-    street = simulate_street(3)
+    street = simulate_street(34)
     settings = street.settings(True).model_copy(update={"mode": "fixed"})
-    accused = Diagnosis((Finding(DISAGREE, "the boxes disagree", basis="boxes"),))
-    assert with_sparse_noise(street.log, settings, accused, Ledger(), silent) == (settings, Diagnosis())
+    assert with_sparse_noise(street.log, settings, accused(), Ledger(), silent) == (settings, Diagnosis())
 
 
 def test_a_log_that_agrees_is_left_alone():
@@ -112,15 +140,15 @@ def test_the_residuals_show_the_noise_of_the_places(place):
     origin = -away[:, None] * ahead + place * rng.standard_normal((len(owner), 2))
     ends = origin + range_[:, None] * np.column_stack([np.cos(said), np.sin(said)])
     weight = 1 / (place**2 + (0.015 * away) ** 2)
-    middle = np.array([np.bincount(owner, weight * ends[:, k]) / np.bincount(owner, weight) for k in range(2)]).T
+    best = np.array([np.bincount(owner, weight * ends[:, k]) / np.bincount(owner, weight) for k in range(2)]).T
     level = np.zeros((len(owner), 1))
-    of = np.column_stack([middle, np.zeros(count)])
+    of = np.column_stack([best, np.zeros(count)])
     found = FewRayEvidence(0.0, 0.0, 1.0, np.arange(len(owner)), owner, of)
-    searched = _Searched(
+    searched = Searched(
         SparseNoise(place=10.0),
         found,
         np.hstack([np.column_stack([np.cos(said), np.sin(said)]), level]),
-        np.hstack([middle[owner] - origin, level]),
+        np.hstack([best[owner] - origin, level]),
         np.full(len(owner), 0.01),
         range_,
         0.02 * away,
@@ -131,11 +159,11 @@ def test_the_residuals_show_the_noise_of_the_places(place):
 
 def test_a_long_street_is_searched_in_its_middle():
     log = simulate_street(0).log
-    assert _part(log) is log
+    assert middle(log) is log
     boxes = sum(len(one.detections) for one in log.cameras)
     many = replace(log, cameras=log.cameras * 4)
-    part = _part(many)
+    part = middle(many)
     stamps = np.unique(np.concatenate([one.detections.frame_stamps for one in part.cameras]))
     assert np.diff(stamps).max() == pytest.approx(1.0)
-    assert tested._MOST_BOXES <= sum(len(one.detections) for one in part.cameras) < 4 * boxes
+    assert few_box_search._MOST_BOXES <= sum(len(one.detections) for one in part.cameras) < 4 * boxes
     assert stamps[0] > log.cameras[0].detections.frame_stamps[0]
