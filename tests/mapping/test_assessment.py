@@ -36,6 +36,7 @@ def test_a_usual_result_is_good() -> None:
         ({"resolved": 0}, "bad", "No object has a place. Drive around things"),
         ({"resolved": 0, "unexplained": 900}, "bad", "No object has a place, because 100 % of the used boxes agree on none"),
         ({"findings": ("rays miss",)}, "check", "The input has an error that the warnings explain (rays miss)."),
+        ({"findings": ("noise",)}, "check", "The poses or depths are far noisier than the settings say, and the warnings"),
         ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
         ({"doubted": ("mug", "cup")}, "check", "It is not clear whether mug, cup name one object each, or several."),
         ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from objslam.core.snapshot import RARE_POSES, TOO_SLOW
 from objslam.frontend.bearings import CUT_OFF
 from objslam.frontend.log_part import part_in_words
+from objslam.mapping.checks.finding import NOISIER
 
 Level = Literal["good", "check", "bad"]
 
@@ -173,9 +174,12 @@ def _check(e: Evidence) -> list[str]:
     if e.fixed and e.odometry_frame:
         # Drift splits an object into parts, and the rays of each part fit it well. So the residuals do not show drift.
         found.append("The poses are those of the odometry, so its drift is in the map: --mode joint takes it out.")
-    if e.findings:
-        found.append(f"The input has an error that the warnings explain ({', '.join(e.findings)}).")
-    elif e.misses > _MISSES:
+    errors = [name for name in e.findings if name != NOISIER]
+    if NOISIER in e.findings:
+        found.append("The poses or depths are far noisier than the settings say, and the warnings say how noisy.")
+    if errors:
+        found.append(f"The input has an error that the warnings explain ({', '.join(errors)}).")
+    elif not e.findings and e.misses > _MISSES:
         found.append(
             f"The rays miss their objects {e.misses:.1f} times as far as the settings say, so poses, clock, calibration or "
             "boxes are worse than that."

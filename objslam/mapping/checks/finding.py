@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+NOISIER = "noise"
+"""The name of the finding that a log is far noisier than the settings say. It is no error of the input."""
+
 
 @dataclass(frozen=True)
 class Finding:

@@ -19,7 +19,7 @@ from objslam.core.geometry import lift_se2
 from objslam.core.types import Log
 from objslam.frontend.known_errors import coarse
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
-from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.finding import NOISIER, Finding
 from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
 from objslam.mapping.checks.hypotheses.every import coarse_hypotheses, with_poses
 from objslam.mapping.fixed.few_box_search import SparseNoise, middle, search_objects
@@ -86,7 +86,7 @@ def with_sparse_noise(
             f"the boxes agree only with {noise.in_words(settings)}, far more than the settings say. The map was made "
             "with this noise. If you know the noise, set localization.xy, depth.sigma_per_m and rays.pixel_sigma"
         )
-        return noisier, again.with_findings([Finding("noise", message, spoils=False)])
+        return noisier, again.with_findings([Finding(NOISIER, message, spoils=False)])
     return settings, diagnosis
 
 
