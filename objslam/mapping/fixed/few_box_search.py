@@ -87,6 +87,11 @@ class Searched:
         """The evidence of the noise. It is minus infinity if the noise explains too few boxes."""
         return self.found.chance + self.found.detections if self.found.explained >= _EXPLAINED else -np.inf
 
+    @property
+    def views(self) -> float:
+        """The mean number of boxes of an object."""
+        return len(self.found.ray) / max(len(self.found.positions), 1)
+
     def with_place_of_residuals(self, prior: float) -> SparseNoise:
         """Return the noise with the noise of places that agrees best with the misses of the rays, by restricted likelihood
         (Patterson and Thompson 1971).

@@ -17,6 +17,7 @@ from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.core.types import Log
+from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.finding import NOISIER, Finding
@@ -67,12 +68,16 @@ def with_sparse_noise(
     boxes = sum(len(one.detections) for one in log.cameras if one.detections is not None)
     if settings.mode != "fixed" or diagnosis.certain or log.localization is None or boxes < _FEWEST:
         return settings, diagnosis
-    if coarse(settings):
-        found = _turned_cameras(log, settings, progress)
-        return settings, diagnosis.with_findings([found] if found else [])
-    if not any(one.name == DISAGREE for one in diagnosis.findings):
+    accused = any(one.name == DISAGREE for one in diagnosis.findings)
+    if diagnosis.spoilt if coarse(settings) else not accused:
         return settings, diagnosis
-    noises, lead = sparse_noise(log, settings, progress)
+    try:
+        if coarse(settings):
+            found = _turned_cameras(log, settings, progress)
+            return settings, diagnosis.with_findings([found] if found else [])
+        noises, lead = sparse_noise(log, settings, progress)
+    except LogError:  # No frame of the part lies on the path. If no frame of the log does, the run says so.
+        return settings, diagnosis
     for number, noise in enumerate(noises, start=1):
         noisier = noise.settings(settings)
         again = diagnosis if noise == SparseNoise() else diagnose(log, noisier, ledger, progress)
@@ -107,10 +112,9 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
         progress("noise of few boxes", number, len(noises))
         searched.append(search_objects(part, settings, noise))
     best = max(searched, key=lambda one: one.value)
-    views = len(best.found.ray) / max(len(best.found.positions), 1)
     nominal = best is searched[0]
     grown = best.found.chance - (0.0 if nominal else searched[0].found.chance)
-    if best.value == -np.inf or grown < _CLEAR or views > _MOST_VIEWS:
+    if best.value == -np.inf or grown < _CLEAR or best.views > _MOST_VIEWS:
         return (), 0.0
     lead = np.inf
     for corrected, turned in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total)):
@@ -131,13 +135,16 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
 def _turned_cameras(log: Log, settings: Settings, progress: Progress) -> Finding | None:
     """Return a finding if the objects have far more evidence with all cameras turned about the vertical axis.
 
-    Other checks compare single rays, and with noise of this size rays meet anywhere.
+    Other checks compare single rays, and with noise of this size rays meet anywhere. None if an object has many boxes.
     """
     part, tried = middle(log), range(0, 360, _TURN)
     values = []
     for number, degrees in enumerate(tried):
         progress("what-ifs about the cameras", number, len(tried))
-        values.append(search_objects(_with_headings(part, degrees), settings, SparseNoise()).value)
+        searched = search_objects(_with_headings(part, degrees), settings, SparseNoise())
+        if searched.views > _MOST_VIEWS:
+            return None
+        values.append(searched.value)
     best = int(np.argmax(values))
     if values[best] < max(values[0], 0.0) + _BETTER:
         return None
