@@ -19,7 +19,7 @@ from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
 from objslam.mapping.checks.hypotheses.every import with_poses
 from objslam.mapping.fixed import few_box_search
 from objslam.mapping.fixed import sparse_noise as tested
-from objslam.mapping.fixed.few_box_search import Searched, SparseNoise, middle
+from objslam.mapping.fixed.few_box_search import Searched, SparseNoise, middle, search_objects
 from objslam.mapping.fixed.sparse_noise import sparse_noise, with_sparse_noise
 
 FIXED = Settings.model_validate({"mode": "fixed", "output": {"recording": False}})
@@ -78,12 +78,13 @@ def test_cameras_that_look_elsewhere_are_named_with_much_noise_in_the_settings()
     assert with_sparse_noise(street.log, said, Diagnosis(), Ledger(), silent) == (said, Diagnosis())
 
 
-@pytest.mark.usefixtures("few_tried")
 def test_misses_count_against_many_objects_with_few_boxes():
-    """By their boxes alone, more objects at exact places explain this street better: 226 against 224 log odds."""
-    (likely, *_), lead = sparse_noise(simulate_street(0).log, FIXED, silent)
-    assert 20 < likely.place < 110  # 52 is true.
-    assert lead > 30
+    """By their boxes alone, more objects at exact places explain this street better. GPS with 1.4 m of noise is true."""
+    log = simulate_street(4).log
+    exact, noisy = (search_objects(log, FIXED, SparseNoise(place=place, ranges=8.0)) for place in (1.0, 30.0))
+    assert exact.found.chance > noisy.found.chance
+    assert noisy.value > exact.value + 10
+    assert noisy.views > exact.views
 
 
 @pytest.mark.parametrize("noise", [0.02, 1.0])
