@@ -210,6 +210,23 @@ def test_what_a_session_cannot_observe_stays_as_it_is():
     assert observed(replace(found, prior=np.full(3, 50.0)), now).values.tolist() == found.values.tolist()
 
 
+def test_a_clock_that_may_be_right_delays_no_frame():
+    """Against the mean square of the errors of draws from the posterior, about the values that the session takes."""
+    names, rng = ("front.clock", "front.yaw"), np.random.default_rng(3)
+    covariance = np.array([[0.04**2, 2e-4], [2e-4, 0.02**2]])
+
+    def of(clock, sigma=0.1):
+        return Calibration(names, np.array([clock, 0.01]), covariance, np.array([sigma, 0.05]))
+
+    kept = observed(of(0.03), np.zeros(2))
+    np.testing.assert_allclose(kept.values, [0.0, 0.01 - 0.03 * 2e-4 / 0.04**2], atol=1e-12)
+    drawn = rng.multivariate_normal(of(0.03).values, covariance, 100_000) - kept.values
+    np.testing.assert_allclose(kept.covariance, drawn.T @ drawn / len(drawn), rtol=0.03)
+    for clock in (-0.03, 0.05):  # The first delays nothing, and the second is clearly behind.
+        assert observed(of(clock), np.zeros(2)).values.tolist() == [clock, 0.01]
+    assert observed(of(0.03), np.array([0.05, 0.0])).values[0] == 0
+
+
 def test_a_worker_that_fails_costs_no_frame(log, monkeypatch):
     monkeypatch.setattr("objslam.live.worker.Worker._run", lambda self: self._process.kill())
     session = drive(log, settings_of("live.calibrate_from=80"))

@@ -10,7 +10,7 @@ import numpy as np
 
 from objslam.config import Noise, Settings
 from objslam.core.arrays import Floats
-from objslam.core.calibration import OBSERVABLE, Calibration
+from objslam.core.calibration import OBSERVABLE, Calibration, kind
 from objslam.live.calibration.collected import collect
 from objslam.live.calibration.recalibration import recalibrate
 from objslam.live.calibration.request import CalibrationRequest
@@ -31,21 +31,29 @@ done by then, the map does not depend on the machine's speed. A larger share sui
 _CHANGED = 1.0
 """The map is corrected if an error has changed by more than this, in standard deviations. A larger value corrects more
 rarely."""
+_NO_DELAY = 1.0
+"""A session does not correct a camera clock that is behind by at most this multiple of its standard deviation. Each frame
+would wait that much longer for its pose, and the gain is small. A larger value maps sooner, but with larger errors."""
 
 
 def observed(found: Calibration, now: Floats) -> Calibration:
     """Return a calibration in which errors that the session does not observe keep their present values, `now` (P,).
 
-    Otherwise, noise would move the map with each calibration. Observed errors get their most probable values, given the
-    values that are kept.
+    Otherwise, noise would move the map with each calibration. A camera clock that is behind by no more than `_NO_DELAY` is
+    not corrected. Observed errors get their most probable values, given the other values. The covariance is about the new
+    values, so it contains their distance from the most probable ones.
     """
-    stay = found.sigma > OBSERVABLE * found.prior
+    clock = np.array([kind(name) == "clock" for name in found.names], dtype=bool)
+    behind = clock & (found.values > 0) & (found.values <= _NO_DELAY * found.sigma)
+    kept = np.where(behind, 0.0, now)
+    stay = behind | (found.sigma > OBSERVABLE * found.prior)
     if not stay.any():
         return found
     values, covariance = found.values.copy(), found.covariance
-    values[~stay] += covariance[np.ix_(~stay, stay)] @ np.linalg.solve(covariance[np.ix_(stay, stay)], (now - values)[stay])
-    values[stay] = now[stay]
-    return replace(found, values=values)
+    values[~stay] += covariance[np.ix_(~stay, stay)] @ np.linalg.solve(covariance[np.ix_(stay, stay)], (kept - values)[stay])
+    values[stay] = kept[stay]
+    moved = values - found.values
+    return replace(found, values=values, covariance=covariance + np.outer(moved, moved))
 
 
 class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
@@ -87,7 +95,7 @@ class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
             return None
         now = np.array([self._mapper.state.errors.get(name, 0.0) for name in answer.names])
         found = observed(answer, now)
-        far = (np.abs(found.values - now) > _CHANGED * found.sigma).any()
+        far = (np.abs(found.values - now) > _CHANGED * answer.sigma).any()
         if not far:
             self._counters.accept("calibrations without a change")
             return None
