@@ -214,7 +214,7 @@ def solve_joint(
     covariance = np.full((association.count, 3, 3), np.nan)
     inliers = used & (weight > 0)
     at = association.object, inliers, map_T_camera, positions
-    solved: Solved = SolvedMeasurements(measured, association, *at[1:])
+    solved: Solved = SolvedMeasurements(measured, association, *at[1:], found.near)
     if tags is not None:
         solved = SolvedGraph(measured.whole(*at, "gnc")[0], optimum.values)
     covariance[landmarks] = marginal_covariances(solved, landmarks, ledger)

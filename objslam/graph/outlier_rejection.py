@@ -166,6 +166,11 @@ def known_landmarks(positions: Floats) -> Ints:
     return np.flatnonzero(np.isfinite(positions[:, 0]))
 
 
+def order_near(near: Near | None, landmarks: Ints) -> Ints | None:
+    """Return the order of elimination (D,) of a solve that had these landmarks (m,). None if it had others."""
+    return near[1].order if near is not None and np.array_equal(near[0], landmarks) else None
+
+
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:
     """Return a mask (R,) of the rejected rays whose neighbours in time are mostly rejected too."""
     order = np.flatnonzero(np.isin(association.object, np.flatnonzero(np.isfinite(found.positions[:, 0]))))

@@ -37,17 +37,18 @@ class Inverse:
     late_blocks: dict[bytes, tuple[Ints, Floats]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, jacobian: sparse.csr_matrix, keys: Sequence[int], variable: Ints) -> Self | None:
+    def of(cls, jacobian: sparse.csr_matrix, keys: Sequence[int], variable: Ints, order: Ints | None = None) -> Self | None:
         """Factor the normal equations of a Jacobian (M, D). None if the system is indeterminate.
 
         keys: the keys of all variables, in the order of their columns. variable: (D,) the index of each column in `keys`.
+        order: (D,) the order of elimination, if it is known.
         """
         scale = np.sqrt(np.asarray(jacobian.power(2).sum(axis=0)).ravel())
         if not (np.isfinite(scale) & (scale > 0)).all():
             return None
         scaled = sparse.csr_matrix(jacobian @ sparse.diags_array(1 / scale))
         try:
-            normal = NormalEquations.of(scaled, elimination_order(scaled, variable))
+            normal = NormalEquations.of(scaled, elimination_order(scaled, variable) if order is None else order)
         except SolveError:
             return None
         if not normal.least_pivot > LEAST_PIVOT:

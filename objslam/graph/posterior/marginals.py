@@ -16,6 +16,7 @@ from objslam.graph.assembly import Measurements
 from objslam.graph.factors.priors import point_prior
 from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.graph.optimizers import indeterminate
+from objslam.graph.outlier_rejection import Near, order_near
 from objslam.graph.posterior.inverse import LEAST_PIVOT, Inverse
 from objslam.graph.variables import L0, X0
 
@@ -57,7 +58,8 @@ class SolvedMeasurements:
     To make a graph of GTSAM takes longer than to factor the normal equations, so they are made from arrays.
 
     measured, association: the measurements, and the landmark of each ray. used: (R,) the rays in the graph. map_T_camera:
-    (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph.
+    (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. near: of a solve that may have had the same
+    variables. Then its order of elimination is taken.
     """
 
     measured: Measurements
@@ -65,13 +67,15 @@ class SolvedMeasurements:
     used: Bools
     map_T_camera: Floats
     positions: Floats
+    near: Near | None = None
 
     @cached_property
     def inverse(self) -> Inverse | None:
         """The inverse of the normal equations, None if the system is indeterminate."""
         graph = JointGraph.of(self.measured, self.association, self.used, self.positions, gaussian=True)
         keys = [*(L0 + graph.landmarks).tolist(), *range(X0, X0 + len(self.map_T_camera))]
-        return Inverse.of(graph.rows(self.map_T_camera, graph.weak).jacobian, keys, graph.blocks)
+        jacobian = graph.rows(self.map_T_camera, graph.weak).jacobian
+        return Inverse.of(jacobian, keys, graph.blocks, order_near(self.near, graph.landmarks))
 
     @cached_property
     def _whole(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
