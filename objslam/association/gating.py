@@ -8,9 +8,10 @@ import numpy as np
 
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.observations import MIN_DEPTH, SIZED_BY, Observations, UsualSizes
-from objslam.association.refinement import range_costs, refine, variance
+from objslam.association.refinement import dots, range_costs, refine, variance
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.rotation import skew
+from objslam.core.statistics import order_by_group
 
 TRACK_GAIN = 2.0
 """The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
@@ -18,7 +19,7 @@ trusts the tracker more."""
 _ALTERNATIONS = 3  # The most alternations after a change. A larger value converges further.
 _FAR = 1e6
 """The distance (m) from the first camera beyond which only parallel rays meet. A larger distance keeps farther landmarks."""
-_PAIRS_AT_ONCE = 1 << 19  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
+_PAIRS_AT_ONCE = 1 << 15  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
 
@@ -55,27 +56,47 @@ def gated_edges(obs: Observations, landmarks: Landmarks, gate: float, pose: Floa
     map axes (rad), its last three the position (m).
     """
     ray, index = _near(obs, landmarks, gate, pose)
-    direction = obs.direction[ray]
-    to = landmarks.position[index] - obs.origin[ray]
-    distance = np.sqrt(np.einsum("ei,ei->e", to, to))
+    # The axis of x, y and z comes first, because NumPy is slow if the last axis is short.
+    direction = np.ascontiguousarray(obs.direction.take(ray, axis=0).T)
+    to = np.ascontiguousarray((landmarks.position.take(index, axis=0) - obs.origin.take(ray, axis=0)).T)
+    distance = np.sqrt(dots(to, to))
+    own = variance(obs, distance, landmarks.noise.take(index), ray)
+    if pose is None and not landmarks.covariance.any():  # Only the ray has noise, the same along both axes across it.
+        offset = to - dots(to, direction) * direction
+        deviation, vague, along = dots(offset, offset) / own, np.zeros(len(ray)), np.zeros(len(ray))
+    else:
+        covariance = _relative_covariance(to.T, landmarks.covariance[index], None if pose is None else pose[ray])
+        deviation, vague, along = _deviations(direction.T, to, own, covariance)
+    keep = np.flatnonzero(deviation <= gate)
+    keep = keep[np.argsort(ray[keep] * len(landmarks.noise) + index[keep])]
+    ray, deviation, vague = ray[keep], deviation[keep], vague[keep]
+    cost = deviation + vague + range_costs(obs, distance[keep], along[keep], ray)
+    return Edges(ray, index[keep], deviation, vague, cost)
+
+
+def _relative_covariance(to: Floats, landmark: Floats, pose: Floats | None) -> Floats:
+    """Return the covariance (E, 3, 3) m^2 of landmarks as seen from uncertain poses. to: (E, 3) m from the camera to the
+    landmark. landmark: (E, 3, 3) m^2. pose: (E, 6, 6) as in `gated_edges`."""
+    if pose is None:
+        return landmark
+    lever = skew(to)
+    jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2)
+    return landmark + jacobian @ pose @ np.swapaxes(jacobian, 1, 2)
+
+
+def _deviations(direction: Floats, to: Floats, own: Floats, covariance: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the deviation (E,) and the vagueness (E,) of `Edges`, and the variance (E,) m^2 of the landmark along the ray.
+
+    direction: (E, 3). to: (3, E) m. own: (E,) m^2, the ray's own variance. covariance: (E, 3, 3) m^2 of the landmark.
+    """
     axes = tangent_basis(direction)
-    x, y = np.einsum("eij,ej->ie", axes, to)
-    covariance = landmarks.covariance[index]
-    if pose is not None:
-        lever = skew(to)
-        jacobian = np.concatenate([lever, np.broadcast_to(-np.eye(3), lever.shape)], axis=2)
-        covariance = covariance + jacobian @ pose[ray] @ np.swapaxes(jacobian, 1, 2)
+    x, y = np.einsum("eij,je->ie", axes, to)
     spread = axes @ covariance @ np.swapaxes(axes, 1, 2)
-    own = variance(obs, distance, landmarks.noise[index], ray)
     a, b, c = spread[:, 0, 0] + own, spread[:, 0, 1], spread[:, 1, 1] + own
     determinant = a * c - b * b
     deviation = (c * x * x - 2 * b * x * y + a * y * y) / determinant
     along = np.einsum("ei,eij,ej->e", direction, covariance, direction)
-    vague = np.log(determinant / own**2)
-    cost = deviation + vague + range_costs(obs, distance, along, ray)
-    keep = np.flatnonzero(deviation <= gate)
-    keep = keep[np.lexsort((index[keep], ray[keep]))]
-    return Edges(ray[keep], index[keep], deviation[keep], vague[keep], cost[keep])
+    return deviation, np.log(determinant / own**2), along
 
 
 def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | None) -> tuple[Ints, Ints]:
@@ -86,26 +107,31 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
         ahead = np.einsum("ei,ei->e", landmarks.position[index] - obs.origin[ray], obs.direction[ray]) > MIN_DEPTH
         return ray[ahead], index[ahead]
-    spread = np.linalg.eigvalsh(landmarks.covariance)[:, -1]
-    turn, move = np.zeros((2, len(obs.label)))
+    # Rays of one label are side by side, and the axis of x, y and z comes first: scattered and short rows are slow.
+    labels = landmarks.accepts.shape[1]
+    order = order_by_group(obs.label, labels)
+    bounds = np.searchsorted(obs.label[order], np.arange(labels + 1)).tolist()
+    centre, one = obs.origin.mean(axis=0), np.ones(len(order))
+    m, n = (np.ascontiguousarray(rows.take(order, axis=0).T) for rows in (obs.origin - centre, obs.direction))
+    to_depth, to_distance2 = np.stack([*n, -dots(m, n)]), np.stack([*(-2 * m), one, dots(m, m)])
+    sigma2, spread = obs.sigma[order] ** 2, np.linalg.eigvalsh(landmarks.covariance)[:, -1]
+    turn, move = np.zeros((2, len(order)))
     if pose is not None:  # Twice its diagonal blocks are an upper bound of the covariance for any correlation.
-        turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[:, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
+        turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[order, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
-    centre = obs.origin.mean(axis=0)
-    for label in np.unique(obs.label):
-        mine, which = np.flatnonzero(obs.label == label), np.flatnonzero(landmarks.accepts[:, label])
-        p, noise2 = landmarks.position[which] - centre, landmarks.noise[which] ** 2
-        p2 = (p * p).sum(axis=1)
+    for label in np.flatnonzero(np.diff(bounds)).tolist():
+        which = np.flatnonzero(landmarks.accepts[:, label])
+        p, noise2 = landmarks.position[which] - centre, landmarks.noise[which, None] ** 2
+        p4, p5 = np.column_stack([p, np.ones(len(p))]), np.column_stack([p, (p * p).sum(axis=1), np.ones(len(p))])
+        fixed = obs.position_sigma**2 * noise2 + spread[which, None] + 1e-9  # The constant covers rounding errors.
         step = max(1, _PAIRS_AT_ONCE // max(len(which), 1))
-        for begin in range(0, len(mine), step):
-            r = mine[begin : begin + step]
-            m, n = obs.origin[r] - centre, obs.direction[r]
-            depth = n @ p.T - (m * n).sum(axis=1)[:, None]
-            distance2 = (m * m).sum(axis=1)[:, None] + p2 - 2 * m @ p.T
-            limit = distance2 * ((obs.sigma[r] ** 2)[:, None] * noise2 + turn[r, None]) + obs.position_sigma**2 * noise2
-            limit += spread[which] + move[r, None] + 1e-9  # The constant covers rounding errors.
-            a, b = np.nonzero((distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH))
-            rays.append(r[a])
+        for begin in range(bounds[label], bounds[label + 1], step):
+            r = slice(begin, min(begin + step, bounds[label + 1]))
+            depth, distance2 = p4 @ to_depth[:, r], p5 @ to_distance2[:, r]
+            limit = distance2 * (sigma2[r] * noise2 + turn[r]) + fixed + move[r]
+            at = np.flatnonzero((distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH))
+            b, a = np.divmod(at, r.stop - r.start)
+            rays.append(order[r][a])
             found.append(which[b])
     return np.concatenate(rays), np.concatenate(found)
 
@@ -132,7 +158,7 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     part = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)[ray]
     rest = np.arange(len(ray))
     for one, other in ((ray, place), (place, ray)):
-        best, apart = _best_of_each(one[rest], other[rest], landmark[rest], gain[rest], part[rest])
+        best, apart = _best_of_each(one[rest], other[rest], gain[rest], part[rest])
         taken = rest[best[apart[best]]]
         chosen[ray[taken]] = landmark[taken]
         rest = rest[~apart]
@@ -148,18 +174,22 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     return chosen
 
 
-def _best_of_each(one: Ints, other: Ints, landmark: Ints, gain: Floats, part: Ints) -> tuple[Ints, Bools]:
+def _best_of_each(one: Ints, other: Ints, gain: Floats, part: Ints) -> tuple[Ints, Bools]:
     """Return the best edge of each value of `one`, and (E,) whether each edge is in a part without conflicts.
 
     one, other: (E,) the ray and the landmark in the frame of each edge, or the reverse. In a part without conflicts, no two
-    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the landmark with the
-    lowest index wins.
+    best edges share a value of `other`. Then they are the best assignment of the part. Of equal gains, the first edge wins,
+    whose landmark has the lowest index.
     """
-    order = np.lexsort((landmark, -gain, one))
-    best = order[np.flatnonzero(np.diff(one[order], prepend=-1))]
-    by_other = best[np.argsort(other[best], kind="stable")]
-    twice = np.flatnonzero(np.diff(other[by_other]) == 0)
-    return best, ~np.isin(part, part[by_other[twice]])
+    order = np.argsort(one * len(one) + np.arange(len(one)))
+    first = np.flatnonzero(np.diff(one[order], prepend=-1))
+    top = np.maximum.reduceat(gain[order], first) if len(first) else gain
+    length = np.diff(first, append=len(one))
+    equal = order[np.flatnonzero(gain[order] == np.repeat(top, length))]
+    best = equal[np.flatnonzero(np.diff(one[equal], prepend=-1))]
+    conflict = np.zeros(int(part.max(initial=0)) + 1, dtype=bool)
+    conflict[part[best[np.bincount(other[best])[other[best]] > 1]]] = True
+    return best, ~conflict[part]
 
 
 def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tuple[Ints, Ints]:

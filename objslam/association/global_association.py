@@ -128,7 +128,8 @@ def associate_globally(
 def _learned(state: State) -> State:
     """Return the state with a ratio of appearances that is learnt from its present landmarks."""
     obs = state.obs
-    return replace(state, ratio=learn_ratio(obs, obs.frame, obs.track, state.matched, len(state.unassigned)))
+    ratio = learn_ratio(obs, obs.frame, obs.track, state.matched, len(state.unassigned))
+    return state if ratio is state.ratio is None else replace(state, ratio=ratio)  # A new state would compute all anew.
 
 
 def _annealed(task: _Task, state: State) -> State:

@@ -4,7 +4,7 @@ import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.core.arrays import Floats, Ints
-from objslam.core.statistics import HALF_RAY, grouped_quantiles
+from objslam.core.statistics import HALF_RAY, grouped_quantiles, order_by_group
 
 RANGE_GAIN = 6.0
 """A perfect range lowers the cost of a match by this, because another object would rarely have this range. A larger value
@@ -80,39 +80,45 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
     that its rays do not observe. noise: (N,) factor on the noise of the rays.
     """
     count = len(start)
-    order = np.argsort(index, kind="stable")
+    order = order_by_group(index, count)
     ray, index = ray[order], index[order]
     # The axis of x, y and z comes first, because NumPy is slow if the last axis is short.
-    origin, direction = np.ascontiguousarray(obs.origin[ray].T), np.ascontiguousarray(obs.direction[ray].T)
+    origin, direction = (np.ascontiguousarray(rows.take(ray, axis=0).T) for rows in (obs.origin, obs.direction))
     measured, range_sigma = obs.range[ray], obs.range_sigma[ray]
     ranged = np.isfinite(measured)
-    number = np.maximum(np.bincount(index, minlength=count), 1)
-    factor, position = noise[index], start.copy()
+    number, factor, position = np.bincount(index, minlength=count), noise[index], start.copy()
+    some = np.flatnonzero(number)
+    begin = (np.cumsum(number) - number)[some]
+    slope, floor = (factor * obs.sigma[ray]) ** 2, (factor * obs.position_sigma) ** 2  # As in `variance`.
+    # For each pair: six entries of a matrix, the pull of the ray, its weight, and the distance.
+    each, sums = np.empty((11, len(ray))), np.zeros((11, count))
     for _ in range(_ITERATIONS):
         to = position.T.take(index, axis=1) - origin
-        depth = _dot(to, direction)
-        offset = to - depth * direction
-        distance = np.maximum(np.sqrt(_dot(to, to)), 1e-6)
-        toward = to / distance
-        weight = 1 / (variance(obs, distance, factor, ray) + _dot(offset, offset) / HALF_RAY)
-        pull = weight * (_dot(toward, offset) * toward - offset)
-        each = -weight * toward[_FIRST] * toward[_SECOND]
-        each[:3] += weight
+        depth, distance2 = dots(to, direction), np.maximum(dots(to, to), 1e-12)
+        offset, each[10] = to - depth * direction, np.sqrt(distance2)
+        toward = to / each[10]
+        each[9] = weight = 1 / (slope * distance2 + floor + dots(offset, offset) / HALF_RAY)
+        each[6:9] = weight * (dots(toward, offset) * toward - offset)
+        toward_weighted = -weight * toward
+        for row, one, other in zip(each, _FIRST, _SECOND, strict=False):
+            np.multiply(toward_weighted[one], toward[other], out=row)
         if ranged.any():
             beyond = np.where(ranged, measured - depth, 0.0)
             along = np.where(ranged, 1 / range_sigma**2 / (1 + (beyond / range_sigma) ** 2 / _HALF_RANGE) ** 2, 0.0)
-            pull += along * beyond * direction
-            each += along * direction[_FIRST] * direction[_SECOND]
-        total = grouped_sums(each.T, index, count)[:, _MATRIX]
-        total += (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
-        step = np.linalg.solve(total, grouped_sums(pull.T, index, count)[:, :, None])[:, :, 0]
+            each[6:9] += along * beyond * direction
+            each[:6] += along * direction[_FIRST] * direction[_SECOND]
+        sums[:, some] = np.add.reduceat(each, begin, axis=1) if len(some) else 0.0
+        sums[:3] += sums[9]
+        total = sums[_MATRIX].transpose(2, 0, 1)
+        total = total + (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
+        step = np.linalg.solve(total, sums[6:9].T[:, :, None])[:, :, 0]
         # With little parallax, full steps are unreliable. So no step is longer than the mean distance of the point.
-        length, reach = np.linalg.norm(step, axis=1), np.bincount(index, distance, count) / number
+        length, reach = np.linalg.norm(step, axis=1), sums[10] / np.maximum(number, 1)
         position = position + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
     return position
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
+def dots(a: Floats, b: Floats) -> Floats:
     """Return the products (P,) of vectors (3, P)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 

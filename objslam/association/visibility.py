@@ -6,13 +6,13 @@ from functools import cached_property
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations
-from objslam.association.refinement import grouped_sums
+from objslam.association.refinement import dots, grouped_sums
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.geometry import evenly_spread
 from objslam.core.object_map import SeenFrom
-from objslam.core.statistics import grouped_median, grouped_quantile, grouped_quantiles
+from objslam.core.statistics import distinct, grouped_median, grouped_quantile, grouped_quantiles
 from objslam.core.types import Keyframes
 
 _PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
@@ -129,8 +129,10 @@ def detection_history(
     obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
     clear = ~_hidden(frame, away, pixel, obs, np.where(np.isfinite(obs.range), obs.range, distance))
     there = index * total + obs.frame[held]
-    key = np.union1d(obj[clear] * total + frame[clear], there)
-    return DetectionHistory(key // total, key % total, np.isin(key, there), inside)
+    key = distinct(np.concatenate([obj[clear] * total + frame[clear], there]))
+    detected = np.zeros(len(key), dtype=bool)
+    detected[np.searchsorted(key, there)] = True
+    return DetectionHistory(*np.divmod(key, total), detected, inside)
 
 
 def seen_from(position: Floats, origins: Floats) -> SeenFrom:
@@ -225,14 +227,15 @@ def _in_image(
     the distance up to which each object counts."""
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
-    point, origin, ahead = position - centre, poses[:, :3, 3] - centre, poses[:, :3, 2]
-    distance2 = (origin**2).sum(axis=1)[:, None] + (point**2).sum(axis=1) - 2 * origin @ point.T
-    depth = ahead @ point.T - (ahead * origin).sum(axis=1)[:, None]
+    point, origin, ahead = position - centre, (poses[:, :3, 3] - centre).T, poses[:, :3, 2].T
+    depth = point @ ahead - dots(ahead, origin)
+    distance2 = (-2 * point) @ origin + (dots(origin, origin) + (point**2).sum(axis=1)[:, None])
     # Most objects are outside the cone of view and need no projection.
-    bound = np.maximum(distance2, 0.0) * np.cos(camera.view_angle) ** 2
-    in_cone = (depth > 0) & (depth * depth >= bound) & (distance2 > MIN_DEPTH**2)
-    f, n = np.nonzero(in_cone & (distance2 <= (reach + 1e-6) ** 2))
-    local = np.einsum("vji,vj->vi", poses[f, :3, :3], position[n] - poses[f, :3, 3])
+    near = (distance2 > MIN_DEPTH**2) & (distance2 <= (reach[:, None] + 1e-6) ** 2) & (depth > 0)
+    near &= depth * depth >= np.maximum(distance2, 0.0) * np.cos(camera.view_angle) ** 2
+    n, f = np.divmod(np.flatnonzero(near), len(frames))
+    apart = position.take(n, axis=0) - poses[:, :3, 3].take(f, axis=0)
+    local = np.einsum("vji,vj->vi", poses[:, :3, :3].take(f, axis=0), apart)
     half = np.zeros((len(n), 2))
     if view.margin >= 0:
         box = extent[n] * np.diag(camera.matrix)[:2] / depths(camera, local)[:, None]

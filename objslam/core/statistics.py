@@ -59,6 +59,9 @@ near the noise of their class for longer."""
 POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
+_FEW_GROUPS = 1 << 16
+"""Up to this number of groups, their numbers fit into 16 bits, which numpy sorts several times as fast. It is the number of
+such values."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +119,8 @@ def grouped_quantile(values: Floats, index: Ints, count: int, share: float) -> F
 
 def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[float, ...]) -> list[Floats]:
     """Return the result of `grouped_quantile` for each share."""
-    ordered = values[np.lexsort((values, index))]
+    order = np.argsort(values)  # Two sorts are several times as fast as np.lexsort.
+    ordered = values[order[order_by_group(index[order], count)]]
     number = np.bincount(index, minlength=count)
     some = number > 0
     begin, number = (np.cumsum(number) - number)[some], number[some]
@@ -124,6 +128,23 @@ def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[flo
     for share, result in zip(shares, results, strict=True):
         result[some] = ordered[begin + np.minimum((share * number).astype(np.int64), number - 1)]
     return results
+
+
+def order_by_group(index: Ints, count: int) -> Ints:
+    """Return the order (R,) that brings the members of each group together. Members of one group keep their order.
+
+    index: (R,) the group of each member, from 0 to count - 1.
+    """
+    return np.argsort(index.astype(np.uint16) if count <= _FEW_GROUPS else index, kind="stable")
+
+
+def distinct(values: Ints) -> Ints:
+    """Return the different values (D,) among many integers (R,), ascending.
+
+    `np.unique` returns the same. It puts the values into a hash table, which takes up to 80 times as long as a sort.
+    """
+    ordered = np.sort(values)
+    return ordered[np.append(True, ordered[1:] != ordered[:-1])] if len(ordered) else ordered
 
 
 def quantile(values: Floats, share: float) -> float:

@@ -26,7 +26,9 @@ from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
 from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.posterior.evidence import log_evidence
 from objslam.graph.posterior.marginals import (
+    Solved,
     SolvedGraph,
+    SolvedMeasurements,
     correlated_factor,
     joint_covariances,
     largest_sigma,
@@ -169,16 +171,16 @@ def solve_joint(
     nothing = np.zeros(len(rays), dtype=bool)
     tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
     rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
-    found = reject_outliers(measured, association, map_T_camera, positions, nothing, nothing, trace, tolerance, rounds)
+    first = measured, association, map_T_camera, positions, nothing, nothing
+    found = reject_outliers(*first, trace, tolerance, rounds, close=places is not None)
     loose = keyframes.odom_T_base is not None and not keyframes.localized_every and places is None
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
         attempt = trace.aside() if trace is not None else None
         before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
         for limit in (1, rounds - 1):  # Returned rays that belong to their objects lower the misfit after the first round.
-            tried = reject_outliers(
-                measured, association, other.map_T_camera, other.positions, other.used, again, attempt, tolerance, limit
-            )
+            begin = measured, association, other.map_T_camera, other.positions, other.used, again
+            tried = reject_outliers(*begin, attempt, tolerance, limit, other.near, close=other is not found)
             other, again = replace(tried, iterations=other.iterations + tried.iterations), nothing
             if misfit(other.map_T_camera, other.positions, measured, association) >= before:
                 break
@@ -211,8 +213,10 @@ def solve_joint(
     weight[used] = _weights(settings.joint.loss, residual, optimum)
     covariance = np.full((association.count, 3, 3), np.nan)
     inliers = used & (weight > 0)
-    gaussian, _ = measured.whole(association.object, inliers, map_T_camera, positions, "gnc")
-    solved = SolvedGraph(gaussian, optimum.values)
+    at = association.object, inliers, map_T_camera, positions
+    solved: Solved = SolvedMeasurements(measured, association, *at[1:], found.near)
+    if tags is not None:
+        solved = SolvedGraph(measured.whole(*at, "gnc")[0], optimum.values)
     covariance[landmarks] = marginal_covariances(solved, landmarks, ledger)
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
     drift = correlated_factor(solved, known, covariance[known])

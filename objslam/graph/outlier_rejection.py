@@ -18,7 +18,7 @@ from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.graph.least_squares.normal_equations import NormalEquations
 from objslam.graph.optimizers import STILL, Optimum, optimize, trace_solve
 from objslam.graph.robust_cost import truncated_cost
-from objslam.graph.variables import make_values, read_poses, with_points
+from objslam.graph.variables import read_poses, with_points
 
 _BESIDE, _MOST = 5, 0.6
 """The stretch of a ray goes from `_BESIDE` rays before it to `_BESIDE` rays after it. A rejected ray gets a second chance if
@@ -37,10 +37,14 @@ _FEWEST = 6
 that of the settings. A larger number rejects more rays of noisy objects."""
 
 
+Near = tuple[Ints, NormalEquations]
+"""The landmarks (m,) of a graph with Huber's loss, and its normal equations near the optimum."""
+
+
 @dataclass(frozen=True)
 class JointSolution:
     """A solution for poses and objects. map_T_camera: (K, 4, 4). positions: (N, 3) m. used: (R,) whether a ray is an
-    inlier."""
+    inlier. near: the landmarks (m,) and the normal equations of the last solve on arrays, None if there was none."""
 
     map_T_camera: Floats
     positions: Floats
@@ -48,6 +52,7 @@ class JointSolution:
     optimum: Optimum
     cost_before: float
     iterations: int
+    near: Near | None = None
 
 
 def reject_outliers(
@@ -60,7 +65,8 @@ def reject_outliers(
     trace: Trace | None,
     tolerance: float = 1e-6,
     rounds: int = ROUNDS,
-    near: NormalEquations | None = None,
+    near: Near | None = None,
+    close: bool = False,
 ) -> JointSolution:
     """Solve, and test which rays agree with their objects, until the inliers stay the same, or at most `rounds` times.
 
@@ -68,13 +74,14 @@ def reject_outliers(
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the last
     solve ends if the cost decreases by less than this share. Earlier solves end at `_COARSE`, if that is larger. Inliers of
     an earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations of
-    a solve on arrays that ended near the start, with Huber's loss and the same variables. The solves go on from them.
+    a solve on arrays that ended near the start. Solves on arrays go on from them. close: whether the start is the solution
+    of nearly the same measurements, so that not even the first solve needs GTSAM.
     """
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)
     if measured.tags is not None:
         positions = measured.tags.placed(measured.rays, map_T_camera, positions)
-    solver = _Solver(measured, association, trace, None if near is None else (known_landmarks(positions), near))
+    solver = _Solver(measured, association, trace, near, close)
     for _ in range(rounds):
         moved, agreeing = second_opinion(measured, map_T_camera, association, positions, used)
         if optimum is None:
@@ -89,20 +96,23 @@ def reject_outliers(
     if tolerance < limit and measured.settings.joint.loss != "gnc":
         map_T_camera, positions, optimum = solver.solve(map_T_camera, positions, used, tolerance, optimum)
         iterations += optimum.iterations
-    return JointSolution(map_T_camera, positions, used, optimum, cost_before, iterations)
+    return JointSolution(map_T_camera, positions, used, optimum, cost_before, iterations, solver.near)
 
 
 @dataclass
 class _Solver:
     """Solves the graph of the same measurements for different inliers.
 
-    near: the landmarks of a solve on arrays, and its normal equations. None if GTSAM solves. graph: the last graph of GTSAM.
+    The first solve starts far from the optimum, so GTSAM solves it, by Levenberg-Marquardt. Later solves are on arrays. To
+    make a graph of GTSAM anew takes longer than such a solve. near: as in `JointSolution`. close: whether the next solve
+    starts near its optimum. graph: the last graph of GTSAM.
     """
 
     measured: Measurements
     association: Association
     trace: Trace | None
-    near: tuple[Ints, NormalEquations] | None
+    near: Near | None
+    close: bool
     graph: gtsam.NonlinearFactorGraph | None = None
 
     def solve(
@@ -110,17 +120,16 @@ class _Solver:
     ) -> tuple[Floats, Floats, Optimum]:
         """Return poses (K, 4, 4), positions (N, 3) and the optimum for the inliers `used` (R,).
 
-        A solve on arrays takes a fraction of the time, because it has the normal equations already. If it ends before an
-        optimum, GTSAM goes on from there, and names a variable that is not determined. last: the optimum of the same
-        inliers, where GTSAM goes on.
+        An optimum of arrays has no values. If a solve on arrays ends before an optimum, GTSAM goes on from there, and names
+        a variable that is not determined. last: the optimum of the same inliers, where GTSAM goes on.
         """
         steps, loss, settings = 0, self.measured.settings.joint.loss, self.measured.settings
-        if self.near is not None and np.array_equal(self.near[0], known_landmarks(positions)):
-            found, positions = self._on_arrays(map_T_camera, positions, used, tolerance, self.near[1])
+        if self.close and loss == "huber" and self.measured.tags is None:
+            found, positions = self._on_arrays(map_T_camera, positions, used, tolerance)
             map_T_camera, steps = found.map_T_camera, found.steps
             if found.ended:
-                values = make_values(map_T_camera, positions, known_landmarks(positions))
-                return map_T_camera, positions, Optimum(values, found.cost_before, found.cost_after, steps)
+                return map_T_camera, positions, Optimum(gtsam.Values(), found.cost_before, found.cost_after, steps)
+        self.close = True
         if last is None or self.graph is None:
             self.graph, values = self.measured.whole(self.association.object, used, map_T_camera, positions, loss)
         else:
@@ -131,11 +140,10 @@ class _Solver:
         optimum = replace(optimum, iterations=steps + optimum.iterations)
         return read_poses(optimum.values), with_points(positions, landmarks, optimum.values), optimum
 
-    def _on_arrays(
-        self, map_T_camera: Floats, positions: Floats, used: Bools, tolerance: float, normal: NormalEquations
-    ) -> tuple[Solution, Floats]:
+    def _on_arrays(self, map_T_camera: Floats, positions: Floats, used: Bools, tolerance: float) -> tuple[Solution, Floats]:
         """Return where the solve on arrays ends, and its positions (N, 3)."""
         graph = JointGraph.of(self.measured, self.association, used, positions)
+        normal = None if self.near is None or not np.array_equal(self.near[0], graph.landmarks) else self.near[1]
 
         def placed(landmarks: Floats) -> Floats:
             moved = positions.copy()
@@ -148,13 +156,19 @@ class _Solver:
 
         most = self.measured.settings.joint.max_iterations
         found = gauss_newton(graph, map_T_camera, normal, most, tolerance, STILL, on_step)
-        self.near, self.graph = (graph.landmarks, found.normal), None  # A graph of GTSAM had other inliers.
+        self.near = None if found.normal is None else (graph.landmarks, found.normal)
+        self.graph = None  # A graph of GTSAM had other inliers.
         return found, placed(found.landmarks)
 
 
 def known_landmarks(positions: Floats) -> Ints:
     """Return the landmarks (m,) with a position. An unknown position (N, 3) is NaN."""
     return np.flatnonzero(np.isfinite(positions[:, 0]))
+
+
+def order_near(near: Near | None, landmarks: Ints) -> Ints | None:
+    """Return the order of elimination (D,) of a solve that had these landmarks (m,). None if it had others."""
+    return near[1].order if near is not None and np.array_equal(near[0], landmarks) else None
 
 
 def rejected_stretches(rays: Rays, association: Association, found: JointSolution) -> Bools:

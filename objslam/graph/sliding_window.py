@@ -79,7 +79,8 @@ class SlidingWindow:
         landmarks, points = landmarks_in(optimum.values)
         self.map_T_camera[keyframes], self.positions[landmarks] = poses, points
         self._take_out(landmarks[_at_a_point(points, poses[:, :3, 3])])
-        self._move(max(self.end - _WINDOW, self._begin))
+        if self.end < len(self.map_T_camera):
+            self._move(max(self.end - _WINDOW, self._begin))
         return optimum
 
     def _take_out(self, landmarks: Ints) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from objslam.association.gating import Edges, best_assignment, gate_limit, gated_edges, tangent_basis, track_bonus
 from objslam.association.landmarks import Landmarks
 from objslam.association.nearest_neighbour import assign
-from objslam.association.observations import observe
+from objslam.association.observations import MIN_DEPTH, Observations, observe
 from objslam.core.geometry import exp_se3, lift_se2
 
 EVERY = np.ones((2, 1), dtype=bool)
@@ -188,6 +188,47 @@ def test_the_innovation_is_what_sampling_says():
         landmark = Landmarks(place[None], covariance[None], np.ones(1), np.ones((1, 1), dtype=bool))
         deviations.append(gated_edges(obs, landmark, 1e6, in_map).deviation)
     assert abs(np.mean(deviations) - 2.0) < 0.25
+
+
+@pytest.mark.parametrize("uncertain", ["rays", "landmarks", "poses"])
+def test_matches_within_the_gate_are_those_of_all_pairs(uncertain):
+    """So many pairs that a fast bound excludes most of them, against each pair alone."""
+    rng = np.random.default_rng(3)
+    rays, count, labels, gate = 300, 30, 3, 9.0
+    points = rng.uniform(-4, 4, (count, 3))
+    origin, seen = rng.uniform(-4, 4, (rays, 3)) + 100.0, rng.integers(count, size=rays)
+    direction = points[seen] + 100.0 - origin + rng.normal(0, 0.1, (rays, 3))
+    direction *= rng.choice([-1, 1, 1, 1], (rays, 1)) / np.linalg.norm(direction, axis=1, keepdims=True)
+    nan, label = np.full(rays, np.nan), rng.integers(labels, size=rays)
+    obs = Observations.of_lines(origin, direction, rng.uniform(0.005, 0.03, rays), nan, nan, label)
+    obs = replace(obs, position_sigma=0.02)
+    square = rng.normal(0, 0.05, (count, 3, 3)) if uncertain != "rays" else np.zeros((count, 3, 3))
+    accepts = rng.random((count, labels)) < 0.6
+    landmarks = Landmarks(points + 100.0, square @ square.mT, rng.uniform(1, 3, count), accepts)
+    turn = rng.normal(0, 0.02, (rays, 6, 6))
+    pose = turn @ turn.mT if uncertain == "poses" else None
+    edges = gated_edges(obs, landmarks, gate, pose)
+    found = {(i, j): (a, b) for i, j, a, b in zip(edges.ray, edges.landmark, edges.deviation, edges.vague, strict=True)}
+    expected = {}
+    for i, j in product(range(rays), range(count)):
+        to = landmarks.position[j] - origin[i]
+        if not accepts[j, label[i]] or to @ direction[i] <= MIN_DEPTH:
+            continue
+        covariance = landmarks.covariance[j]
+        if pose is not None:
+            jacobian = np.hstack([np.cross(np.eye(3), to), -np.eye(3)])  # Turns by a and moves by b: to x a - b.
+            covariance = covariance + jacobian @ pose[i] @ jacobian.T
+        across = np.linalg.svd(direction[i][None])[2][1:]
+        own = landmarks.noise[j] ** 2 * (obs.sigma[i] ** 2 * (to @ to) + obs.position_sigma**2)
+        spread = across @ covariance @ across.T + own * np.eye(2)
+        squared = across @ to @ np.linalg.solve(spread, across @ to)
+        if squared <= gate:
+            expected[i, j] = squared, np.log(np.linalg.det(spread) / own**2)
+    assert len(expected) > 100
+    assert list(found) == sorted(expected)
+    np.testing.assert_allclose(
+        [found[pair] for pair in sorted(expected)], [expected[p] for p in sorted(expected)], atol=1e-8
+    )
 
 
 def test_axes_across_a_direction():

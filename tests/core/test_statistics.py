@@ -15,7 +15,16 @@ from scipy.stats import chi2, norm, rayleigh
 
 import objslam
 from objslam.core import statistics
-from objslam.core.statistics import grouped_median, grouped_quantile, logistic, noise_factors, poisson_tail, quantile
+from objslam.core.statistics import (
+    distinct,
+    grouped_median,
+    grouped_quantile,
+    logistic,
+    noise_factors,
+    order_by_group,
+    poisson_tail,
+    quantile,
+)
 
 
 def test_they_are_the_quantiles_that_they_say():
@@ -68,6 +77,18 @@ def test_quantiles_of_groups(pairs, share):
             continue
         assert quantile[group] == mine[min(int(share * len(mine)), len(mine) - 1)]
         assert median[group] == mine[len(mine) // 2]
+
+
+@pytest.mark.parametrize("count", [1, 7, 1 << 16, (1 << 16) + 1, 1 << 20])
+def test_members_of_a_group_come_together_in_their_order(count):
+    index = np.random.default_rng(0).integers(count, size=5_000)
+    index[:2] = count - 1
+    assert order_by_group(index, count).tolist() == sorted(range(5_000), key=lambda i: (index[i], i))
+
+
+@given(npst.arrays(np.int64, st.integers(0, 50), elements=st.integers(-5, 5) | st.integers(-(1 << 62), 1 << 62)))
+def test_different_values(values):
+    assert distinct(values).tolist() == sorted(set(values.tolist()))
 
 
 def test_the_noise_of_each_group_is_that_of_its_median_ray():

@@ -30,7 +30,8 @@ def by_gtsam(graph, values, rows, columns):
 @pytest.mark.parametrize("factor", ["bearing", "point_to_line"])
 @pytest.mark.parametrize("localization", [None, PoseNoise()])
 @pytest.mark.parametrize("aside", [False, True])
-def test_the_rows_are_those_of_gtsam(factor, localization, aside):
+@pytest.mark.parametrize("loss", ["huber", "gnc"])
+def test_the_rows_are_those_of_gtsam(factor, localization, aside, loss):
     """Far from the optimum, where robust weights count, with and without rays that begin beside the camera."""
     settings = load_settings(None, ("mode=joint", f"joint.factor={factor}"))
     changes = {
@@ -52,10 +53,10 @@ def test_the_rows_are_those_of_gtsam(factor, localization, aside):
     poses = poses @ exp_se3(rng.normal(scale=0.02, size=(len(poses), 6)))
     places = made.points + rng.normal(scale=0.1, size=made.points.shape)
     landmarks, which = np.arange(len(places)), np.flatnonzero(used)
-    graph = build_graph(measured.factors(made.association.object, which, landmarks, made.points))
+    graph = build_graph(measured.factors(made.association.object, which, landmarks, made.points, loss))
     values = make_values(poses, places, landmarks)
 
-    rows = JointGraph.of(measured, made.association, used, made.points).rows(poses, places)
+    rows = JointGraph.of(measured, made.association, used, made.points, loss == "gnc").rows(poses, places)
     jacobian, residual = by_gtsam(graph, values, *rows.jacobian.shape)
     largest = np.abs(jacobian).max(axis=1, keepdims=True)
     # GTSAM's factors have sigmas of three digits, so that equal ones share a noise model.

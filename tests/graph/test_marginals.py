@@ -11,7 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.graph.factors.bearing import bearings
 from objslam.graph.optimizers import build_graph
-from objslam.graph.posterior import marginals as marginals_module
+from objslam.graph.posterior import inverse as inverse_module
 from objslam.graph.posterior.marginals import (
     SolvedGraph,
     correlated_factor,
@@ -67,7 +67,7 @@ def test_covariances_are_blocks_of_the_inverse_information():
 @pytest.mark.parametrize("dense", [2000, 12, 9, 0])
 def test_the_normal_equations_give_what_gtsam_gives(dense, monkeypatch):
     """Also if only some of the landmarks, or none, are in the dense block of the last columns."""
-    monkeypatch.setattr(marginals_module, "_DENSE", dense)
+    monkeypatch.setattr(inverse_module, "_DENSE", dense)
     graph = build_graph(sightings([(k, j) for k in range(3) for j in range(3)]), anchors(range(3)))
     values = make_values(CAMERAS, POINTS, np.arange(3))
     groups = [(L0 + 1,), (X0 + 2, L0 + 0), (L0 + 2,), (X0,)]

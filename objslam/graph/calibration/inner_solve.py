@@ -13,7 +13,7 @@ from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
 from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 from objslam.graph.optimizers import levenberg_marquardt
-from objslam.graph.outlier_rejection import supported
+from objslam.graph.outlier_rejection import Near, order_near, supported
 from objslam.graph.variables import read_poses, with_points
 
 _INNER = 4
@@ -52,9 +52,14 @@ class InnerSolve(Linearised):
         """The decrease of the cost by `step`, in the linear system."""
         return float(-(self.rows.jacobian.T @ self.rows.residual) @ self.step / 2)
 
-    def ordered(self) -> Self:
-        """Return the state with the order of elimination, which all later states share."""
-        return replace(self, order=elimination_order(self.rows.jacobian, self.graph.blocks), known=self.graph)
+    def ordered(self, near: Near | None) -> Self:
+        """Return the state with the order of elimination, which all later states share.
+
+        near: of a solve that may have had the same variables. Then its order is taken.
+        """
+        known = order_near(near, self.landmarks)
+        order = elimination_order(self.rows.jacobian, self.graph.blocks) if known is None else known
+        return replace(self, order=order, known=self.graph)
 
     def moved(self, change: Floats) -> Self:
         """Return the state after a change (D,) of its variables."""

@@ -96,7 +96,8 @@ def calibrate(
         SolveError: a linear system has no single solution.
     """
     fit = _Fit(errors, measure, trace)
-    state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used).ordered()
+    state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
+    state = state.ordered(found.near)
     nearly = bool(errors.unknown_noise) and len(theta) > 0 and errors.noise == NOMINAL  # Else, it is known from before.
     at = fit.shared_errors(state, theta, _NEARLY if nearly else _CONVERGED)
     state, theta, steps = at.state, at.theta, at.steps
@@ -114,17 +115,18 @@ def calibrate(
         if same:
             break
     nothing = np.zeros(len(state.used), dtype=bool)
-    near = state.factored if state.measured.settings.joint.loss == "huber" and state.measured.tags is None else None
+    near = state.landmarks, state.factored
     final = reject_outliers(
-        state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace, near=near
+        state.measured, association, state.map_T_camera, state.positions, state.used, nothing, trace, near=near, close=True
     )
-    state = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used).ordered()
-    system = linearise(state, fit.errors, theta, at.noise)
-    reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
-    covariance = _covariance(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
-    sensitivity = np.full((association.count, 3, len(theta)), np.nan)
-    by_landmark = (len(state.landmarks), 3, len(theta))
-    sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
+    covariance, sensitivity = np.zeros((0, 0)), np.full((association.count, 3, len(theta)), np.nan)
+    if len(theta):
+        state = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used).ordered(final.near)
+        system = linearise(state, fit.errors, theta, at.noise)
+        reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
+        covariance = _covariance(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
+        by_landmark = (len(state.landmarks), 3, len(theta))
+        sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
     calibration = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
     return CalibratedSolution(calibration, fit.errors, state.measured, final, sensitivity)

@@ -12,7 +12,7 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import exp_se3
 from objslam.errors import SolveError
 from objslam.graph.least_squares.joint_rows import JointGraph
-from objslam.graph.least_squares.normal_equations import NormalEquations
+from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 
 _SLOW = 0.5
 """Normal equations are made anew if a step promises more than this share of what the step before it promised. A larger share
@@ -28,7 +28,7 @@ class Solution:
 
     cost_before, cost_after: half the sums of the squared residuals, with the robust losses. steps: the number of steps.
     ended: whether the last step was as small as asked for. If not, no step lowered the cost, or the steps ran out, or the
-    linear system has no single solution. normal: the normal equations of the last steps.
+    linear system has no single solution. normal: the normal equations of the last steps, None if the first were singular.
     """
 
     map_T_camera: Floats
@@ -37,13 +37,13 @@ class Solution:
     cost_after: float
     steps: int
     ended: bool
-    normal: NormalEquations
+    normal: NormalEquations | None
 
 
 def gauss_newton(
     graph: JointGraph,
     map_T_camera: Floats,
-    normal: NormalEquations,
+    normal: NormalEquations | None,
     most: int,
     tolerance: float,
     still: float,
@@ -57,7 +57,7 @@ def gauss_newton(
     Args:
         graph: the measurements.
         map_T_camera: (P, 4, 4) the first poses.
-        normal: the normal equations of a solve that ended nearby, with the same variables.
+        normal: the normal equations of a solve that ended nearby, with the same variables. None means those of the start.
         most: the most steps.
         tolerance: the solve ends after a step that promises to decrease the cost by less than this share.
         still: it also ends after a step that promises a smaller decrease than this, for example `optimizers.STILL`.
@@ -65,14 +65,16 @@ def gauss_newton(
     """
     poses, landmarks = map_T_camera, graph.weak
     rows, promised, ended, steps = graph.rows(poses, landmarks), np.inf, False, 0
-    before, anew = rows.cost, False
+    before, anew = rows.cost, normal is None
     while steps < most and not ended and np.isfinite(rows.cost):
         gradient = rows.jacobian.T @ rows.residual
         if anew:
             try:
-                normal = NormalEquations.of(rows.jacobian, normal.order)
+                order = elimination_order(rows.jacobian, graph.blocks) if normal is None else normal.order
+                normal = NormalEquations.of(rows.jacobian, order)
             except SolveError:
                 break
+        assert normal is not None
         step = -normal.solve(gradient)
         decrease = float(-(gradient @ step)) / 2
         if not anew and decrease > _SLOW * promised:

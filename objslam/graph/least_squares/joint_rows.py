@@ -40,12 +40,12 @@ class JointRows:
 
 @dataclass(frozen=True)
 class JointGraph:
-    """The measurements of a joint solve with Huber's loss.
+    """The measurements of a joint solve with Huber's loss, or with bearings of Gaussian noise.
 
     measured: all measurements. which: (n,) the rays of `measured` that are in the graph. rays: these n rays. landmarks: (m,)
     the landmarks in the graph. landmark: (n,) the row of each ray's landmark in `landmarks`. weak: (m, 3) m, the means of
     the landmarks' weak priors. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each
-    row.
+    row. gaussian: whether bearings have no loss.
     """
 
     measured: Measurements
@@ -55,15 +55,18 @@ class JointGraph:
     landmark: Ints
     weak: Floats
     pattern: tuple[Ints, Ints]
+    gaussian: bool = False
 
     @classmethod
-    def of(cls, measured: Measurements, association: Association, used: Bools, positions: Floats) -> Self:
+    def of(
+        cls, measured: Measurements, association: Association, used: Bools, positions: Floats, gaussian: bool = False
+    ) -> Self:
         """Make the graph of the rays `used` (R,). Landmarks without a position (N, 3) are not in it."""
         which, landmarks = np.flatnonzero(used), np.flatnonzero(np.isfinite(positions[:, 0]))
         landmark = np.searchsorted(landmarks, association.object[which])
         rays = measured.rays.take(which)
         pattern = _pattern(measured, rays, landmark, landmarks)
-        return cls(measured, which, rays, landmarks, landmark, positions[landmarks], pattern)
+        return cls(measured, which, rays, landmarks, landmark, positions[landmarks], pattern, gaussian)
 
     def measuring(self, measured: Measurements) -> Self:
         """Return the graph of the same rays and landmarks with other measured values."""
@@ -143,9 +146,10 @@ class JointGraph:
         return ray_residuals(directions, to_landmark, axes, self._metric)
 
     def bearing_roots(self, residuals: Floats) -> tuple[Floats, Floats]:
-        """Return the factors (n, 1) that whiten residuals (n, 2), with the weights of Huber's loss, and their costs (n,)."""
+        """Return the factors (n, 1) that whiten residuals (n, 2), with the weights of their loss, and their costs (n,)."""
         sigma = np.full(len(self.rays), EQ1_SIGMA) if self._metric else self.rays.sigma
-        weight, cost = huber_roots(np.linalg.norm(residuals, axis=1) / sigma)
+        size = np.linalg.norm(residuals, axis=1) / sigma
+        weight, cost = (np.ones_like(size), size**2 / 2) if self.gaussian else huber_roots(size)
         return (weight / sigma)[:, None], cost
 
     def range_roots(self, distances: Floats) -> tuple[Floats, Floats]:

@@ -13,7 +13,7 @@ from objslam.core.statistics import CAUCHY_K
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
 from objslam.graph.factors.bearing import EQ1_SIGMA
-from objslam.graph.posterior.marginals import SolvedGraph
+from objslam.graph.posterior.marginals import Solved
 
 _VIEW = 1.0
 """The solid angle (sr) in which a stray ray may lie, about that of a camera. With a larger value, the number of agreeing
@@ -21,7 +21,7 @@ rays counts more, and their noise less."""
 
 
 def log_evidence(
-    measured: Measurements, association: Association, used: Bools, distance: Floats, solved: SolvedGraph, cost: float
+    measured: Measurements, association: Association, used: Bools, distance: Floats, solved: Solved, cost: float
 ) -> float:
     """Return the log evidence for an association, up to a constant that all associations of the same rays share.
 

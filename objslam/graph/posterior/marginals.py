@@ -3,19 +3,21 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import gtsam
 import numpy as np
 from scipy import sparse
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
 from objslam.core.rotation import skew
-from objslam.errors import SolveError
+from objslam.core.types import Association
+from objslam.graph.assembly import Measurements
 from objslam.graph.factors.priors import point_prior
-from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
+from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.graph.optimizers import indeterminate
+from objslam.graph.outlier_rejection import Near, order_near
+from objslam.graph.posterior.inverse import LEAST_PIVOT, Inverse
 from objslam.graph.variables import L0, X0
 
 HELD = 1.0
@@ -23,38 +25,77 @@ HELD = 1.0
 deviation of a landmark is still above half of this value, no measurement determines the landmark. A larger value constrains
 the landmarks less. With too large a value, the system stays indeterminate."""
 
-_LEAST_PIVOT = 1e-11
-"""A system has a single solution if every pivot of its information matrix, scaled to 1 on the diagonal, is at least this.
-Rounding leaves a pivot of about 1e-15 if a system has no single solution. A larger value refuses more systems that have a
-solution, but are badly conditioned."""
-
 _DIRECTIONS = 20
 """The number of directions in which correlations between landmarks are kept. The shift, turn and size of a map take seven.
 With a larger number, the bends of a long path count too, and the search takes longer."""
 _ITERATIONS = 3
 """The number of steps of the search for the directions in which correlations are kept. More steps are more exact, and take
 longer."""
-_COLUMNS = 48
-"""The number of columns of the inverse that are computed at once. A larger number takes more memory."""
-_DENSE, _EACH = 2000, 8
-"""The most columns of a dense block of the inverse: in all, and for each requested column. Beyond these limits, single
-columns take less time. With larger numbers, dense blocks are used more often."""
 
 
 @dataclass(frozen=True)
 class SolvedGraph:
-    """A graph at its solution. Its normal equations are factored only once."""
+    """A graph of GTSAM at its solution. Its normal equations are factored only once."""
 
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
 
     @cached_property
-    def inverse(self) -> "_Inverse | None":
+    def inverse(self) -> Inverse | None:
         """The inverse of the normal equations, None if the system is indeterminate."""
-        return _Inverse.of(self.graph.linearize(self.values), self.values)
+        system, keys, zero = self.graph.linearize(self.values), sorted(self.values.keys()), self.values.zeroVectors()
+        row, column, value = system.sparseJacobian_()
+        entries = (value, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))
+        variable = np.repeat(np.arange(len(keys)), [len(zero.at(key)) for key in keys])
+        jacobian = sparse.csr_matrix(entries, shape=(int(row.max()), len(variable) + 1))[:, :-1]  # Without the error.
+        return Inverse.of(jacobian, keys, variable)
 
 
-def marginal_covariances(solved: SolvedGraph, landmarks: Ints, ledger: Ledger) -> Floats:
+@dataclass(frozen=True)
+class SolvedMeasurements:
+    """The measurements of a log without fiducials at their solution, with bearings of Gaussian noise.
+
+    To make a graph of GTSAM takes longer than to factor the normal equations, so they are made from arrays.
+
+    measured, association: the measurements, and the landmark of each ray. used: (R,) the rays in the graph. map_T_camera:
+    (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. near: of a solve that may have had the same
+    variables. Then its order of elimination is taken.
+    """
+
+    measured: Measurements
+    association: Association
+    used: Bools
+    map_T_camera: Floats
+    positions: Floats
+    near: Near | None = None
+
+    @cached_property
+    def inverse(self) -> Inverse | None:
+        """The inverse of the normal equations, None if the system is indeterminate."""
+        graph = JointGraph.of(self.measured, self.association, self.used, self.positions, gaussian=True)
+        keys = [*(L0 + graph.landmarks).tolist(), *range(X0, X0 + len(self.map_T_camera))]
+        jacobian = graph.rows(self.map_T_camera, graph.weak).jacobian
+        return Inverse.of(jacobian, keys, graph.blocks, order_near(self.near, graph.landmarks))
+
+    @cached_property
+    def _whole(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        return self.measured.whole(self.association.object, self.used, self.map_T_camera, self.positions, "gnc")
+
+    @property
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """The same as a graph of GTSAM, which names a variable that is not determined."""
+        return self._whole[0]
+
+    @property
+    def values(self) -> gtsam.Values:
+        """The values of `graph`."""
+        return self._whole[1]
+
+
+Solved = SolvedGraph | SolvedMeasurements
+
+
+def marginal_covariances(solved: Solved, landmarks: Ints, ledger: Ledger) -> Floats:
     """Return the covariances (n, 3, 3), m^2, of the landmarks (n,).
 
     If the linear system is indeterminate, the ledger gets a warning, and every landmark gets a temporary prior with the
@@ -81,16 +122,17 @@ def marginal_covariances(solved: SolvedGraph, landmarks: Ints, ledger: Ledger) -
     return without_prior
 
 
-def seen_covariances(solved: SolvedGraph, landmarks: Ints, witnesses: Ints, ledger: Ledger) -> Floats:
+def seen_covariances(solved: Solved, landmarks: Ints, witnesses: Ints, ledger: Ledger) -> Floats:
     """Return the covariances (n, 3, 3), m^2, of landmarks (n,). Each is relative to one keyframe, its witness (n,).
 
     A covariance is in the camera frame of the witness, without the uncertainty of this camera's pose. In a map by odometry,
     far from its start, nearly all uncertainty of a landmark comes from the pose. If the linear system is indeterminate, the
     ledger gets a warning, and the remaining covariances are NaN.
     """
-    covariance, values = np.full((len(landmarks), 3, 3), np.nan), solved.values
+    covariance = np.full((len(landmarks), 3, 3), np.nan)
     if len(landmarks) == 0:
         return covariance
+    values = solved.values
     try:
         pairs = list(zip(landmarks.tolist(), witnesses.tolist(), strict=True))
         joint = joint_covariances(solved, [(X0 + k, L0 + j) for j, k in pairs])
@@ -123,14 +165,14 @@ def largest_sigma(covariances: Floats) -> Floats:
     return sigma
 
 
-def _marginals(solved: SolvedGraph, landmarks: Ints) -> Floats:
+def _marginals(solved: Solved, landmarks: Ints) -> Floats:
     covariance = np.array(joint_covariances(solved, [(L0 + j,) for j in landmarks.tolist()])).reshape(-1, 3, 3)
     if not np.isfinite(covariance).all():
         raise RuntimeError("a marginal covariance is not finite")
     return covariance
 
 
-def joint_covariances(solved: SolvedGraph, groups: Sequence[Sequence[int]]) -> list[Floats]:
+def joint_covariances(solved: Solved, groups: Sequence[Sequence[int]]) -> list[Floats]:
     """Return the covariance (d, d) of each group of variables, given by their keys, in the order of the keys.
 
     The normal equations are factored once for all groups. GTSAM eliminates the system again for each group, which takes 20
@@ -154,7 +196,7 @@ def in_order(joint: gtsam.JointMarginal, keys: Sequence[int]) -> Floats:
     return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
 
-def correlated_factor(solved: SolvedGraph, landmarks: Ints, covariance: Floats) -> Floats:
+def correlated_factor(solved: Solved, landmarks: Ints, covariance: Floats) -> Floats:
     """Return the correlated errors of landmarks (n,), as a factor (n, 3, m), m, of their joint covariance.
 
     covariance: (n, 3, 3) m^2 of the landmarks. A few products with the joint covariance find its strongest directions
@@ -183,90 +225,6 @@ def correlated_factor(solved: SolvedGraph, landmarks: Ints, covariance: Floats) 
     wide = product(basis)
     inner = basis.T @ wide
     size, axes = np.linalg.eigh((inner + inner.T) / 2)
-    good = size > _LEAST_PIVOT * size[-1]
+    good = size > LEAST_PIVOT * size[-1]
     factor = wide @ axes[:, good] / np.sqrt(size[good])
     return np.asarray(root @ factor.reshape(len(white), 3, -1))
-
-
-@dataclass(frozen=True)
-class _Inverse:
-    """The inverse of the normal equations of a graph, with a part for each variable.
-
-    normal: the normal equations, with columns of length 1. scale: (D,) the lengths of the columns before this scaling.
-    begin, end: the columns of each variable, by its key.
-    """
-
-    normal: NormalEquations
-    scale: Floats
-    begin: dict[int, int]
-    end: dict[int, int]
-
-    @classmethod
-    def of(cls, system: gtsam.GaussianFactorGraph, values: gtsam.Values) -> Self | None:
-        """Factor the normal equations. None if the system is indeterminate."""
-        keys, zero = sorted(values.keys()), values.zeroVectors()
-        size = np.array([len(zero.at(key)) for key in keys])
-        begin, end = np.cumsum(size) - size, np.cumsum(size)
-        row, column, value = system.sparseJacobian_()
-        entries = (value, (row.astype(np.int64) - 1, column.astype(np.int64) - 1))
-        shape = int(row.max()), int(end[-1]) + 1
-        jacobian = sparse.csr_matrix(entries, shape=shape)[:, :-1]  # The last column is the error.
-        scale = np.sqrt(np.asarray(jacobian.power(2).sum(axis=0)).ravel())
-        if not (np.isfinite(scale) & (scale > 0)).all():
-            return None
-        scaled = sparse.csr_matrix(jacobian @ sparse.diags_array(1 / scale))
-        try:
-            normal = NormalEquations.of(scaled, elimination_order(scaled, np.repeat(np.arange(len(keys)), size)))
-        except SolveError:
-            return None
-        if not normal.least_pivot > _LEAST_PIVOT:
-            return None
-        first, last = begin.tolist(), end.tolist()
-        return cls(normal, scale, dict(zip(keys, first, strict=True)), dict(zip(keys, last, strict=True)))
-
-    @property
-    def log_determinant(self) -> float:
-        """The log of the determinant of the normal equations."""
-        return self.normal.log_determinant + 2 * float(np.log(self.scale).sum())
-
-    def columns(self, keys: Sequence[int]) -> Ints:
-        """Return the columns of variables, in the order of the keys."""
-        return np.concatenate([np.arange(self.begin[key], self.end[key]) for key in keys])
-
-    def blocks(self, groups: Sequence[Sequence[int]]) -> list[Floats]:
-        """Return the block (d, d) of the inverse for each group of variables, in the order of their keys."""
-        asked = [self.columns(group) for group in groups]
-        every = np.unique(np.concatenate(asked)) if asked else np.zeros(0, dtype=np.int64)
-        late = self.normal.late(every, min(_DENSE, _EACH * len(every)))
-        dense = self.normal.last_block(late)
-        block = (dense + dense.T) / 2 / self.scale[late] / self.scale[late, None]
-        # A landmark that few poses see is eliminated early. It takes columns of its own, but the others still need none.
-        in_block = [bool(np.isin(own, late).all()) for own in asked]
-        alone = iter(self._by_columns([own for own, here in zip(asked, in_block, strict=True) if not here]))
-        places = [np.searchsorted(late, own) for own in asked]
-        return [block[np.ix_(at, at)] if here else next(alone) for at, here in zip(places, in_block, strict=True)]
-
-    def _by_columns(self, asked: Sequence[Ints]) -> list[Floats]:
-        """Return the block (d, d) of the inverse for each group of columns (d,), from whole columns of the inverse."""
-        found: list[Floats] = []
-        waiting: list[Ints] = []
-        for i in range(len(asked)):
-            waiting.append(asked[i])
-            if sum(map(len, waiting)) < _COLUMNS and i + 1 < len(asked):
-                continue
-            at = np.concatenate(waiting)
-            whole = np.zeros((len(self.scale), len(at)))
-            whole[at, np.arange(len(at))] = 1 / self.scale[at]
-            columns, first = self.normal.solve(whole), 0
-            for own in waiting:
-                block = columns[own, first : first + len(own)] / self.scale[own, None]
-                found.append((block + block.T) / 2)
-                first += len(own)
-            waiting = []
-        return found
-
-    def times(self, at: Ints, right: Floats) -> Floats:
-        """Return the part of the inverse at some columns (d,), times vectors (d, m)."""
-        whole = np.zeros((len(self.scale), right.shape[1]))
-        whole[at] = right / self.scale[at, None]
-        return np.asarray(self.normal.solve(whole)[at] / self.scale[at, None])

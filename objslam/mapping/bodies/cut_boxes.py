@@ -14,7 +14,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera, undistort
-from objslam.core.statistics import NORMAL_MEDIAN
+from objslam.core.statistics import NORMAL_MEDIAN, distinct
 from objslam.core.types import Keyframes, Rays
 from objslam.frontend.bearings import cut_edges
 from objslam.mapping.bodies.box_views import BoxViews
@@ -94,7 +94,7 @@ def _candidates(
     The first array has the boxes, the second the bodies.
     """
     association, held = solution.association, solution.association.object >= 0
-    whole = np.unique(solution.rays.keyframe[held] * association.count + association.object[held])
+    whole = distinct(solution.rays.keyframe[held] * association.count + association.object[held])
     sees_size = np.array([c.sees_size for c in boxes.cameras])[cut.camera]
     wide = (cut.box[:, 2:] > cut.box[:, :2]).all(axis=1)
     usable = np.flatnonzero((keyframe >= 0) & sees_size & wide)
@@ -103,7 +103,8 @@ def _candidates(
     found = [(none, none)]
     for at in np.flatnonzero(bodies.shape > 0).tolist():
         mine = np.flatnonzero(cut.label[usable] == association.label[objects[at]])
-        mine = mine[~np.isin(keyframe[usable[mine]] * association.count + objects[at], whole)]
+        wanted = keyframe[usable[mine]] * association.count + objects[at]
+        mine = mine[np.searchsorted(whole, wanted) == np.searchsorted(whole, wanted, side="right")]
         towards = bodies.axes[at, :3] - origin[mine]
         distance, reach = np.linalg.norm(towards, axis=1), np.linalg.norm(bodies.axes[at, 3:6])
         outside = np.flatnonzero(distance > reach)
