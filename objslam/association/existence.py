@@ -124,7 +124,7 @@ def stray_share(state: State, gate: float) -> Floats:
     angle2 = state.variance / np.maximum(state.distance, 1e-3) ** 2
     area = np.pi * gate * np.bincount(state.owner, angle2, state.count) / np.maximum(state.ray_count, 1)
     looks = np.maximum(state.history.inside, state.history.expected)
-    return looks * area / (max(len(state.view.camera), 1) * state.view.solid_angle)
+    return looks * area / (max(len(state.view.camera), 1) * state.view.solid_angle * state.obs.scale)
 
 
 def size_odds(state: State) -> Floats:

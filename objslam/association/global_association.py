@@ -23,6 +23,7 @@ from objslam.association.refinement import grouped_sums
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
+from objslam.core.ground.flattening import LEVEL, flattened_points
 from objslam.core.statistics import grouped_quantile
 from objslam.core.types import Association, Keyframes, Rays
 
@@ -75,6 +76,7 @@ def associate_globally(
     map_T_camera: Floats,
     sigma: Floats,
     position_sigma: float = 0.0,
+    flat_scale: float = LEVEL,
     seed: int = 0,
     guess: tuple[Association, Floats] | None = None,
     drifts: bool = False,
@@ -88,19 +90,19 @@ def associate_globally(
         keyframes: all observed frames. Frames without a box count as misses.
         map_T_camera: (K, 4, 4) of the keyframes.
         sigma: (R,) rad, the noise of the rays' angles, including the noise of the poses.
-        position_sigma: m, the noise of the rays' origins.
+        position_sigma: m, the noise of the rays' origins. flat_scale: as `Observations.scale`.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
     """
-    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
+    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma, flat_scale)
     view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
     if guess is not None:
         association, position = guess
-        landmarks = Landmarks.new(position, np.ones(len(position)), association.label, len(rays.label_names))
-        state = replace(state, landmarks=landmarks, matched=association.object[ray])
+        known = flattened_points(position, flat_scale), np.ones(len(position)), association.label
+        state = replace(state, landmarks=Landmarks.new(*known, len(rays.label_names)), matched=association.object[ray])
         state = _alternate(task, _learned(state.keep(_plausible(task, state))))
     state, refuted, moving = _search(task, state, nothing)
     if moving.count and keyframes.localized_every:  # At poses that drift, things at rest seem to move.
@@ -212,7 +214,7 @@ def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: L
         pool = obs.take(free)
         pool = replace(pool, sigma=pool.sigma * noise[label], position_sigma=pool.position_sigma * noise[label])
         # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
-        chance = np.pi * task.gate * float((pool.sigma**2).sum()) / state.view.solid_angle
+        chance = np.pi * task.gate * float((pool.sigma**2).sum()) / (state.view.solid_angle * obs.scale)
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
         search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device)
         points = discover(pool, search, rng, None if excluded is None else excluded.position[excluded.accepts[:, label]])

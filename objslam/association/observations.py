@@ -13,6 +13,7 @@ import numpy as np
 from objslam.core.appearance.features import FeatureTable
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
+from objslam.core.ground.flattening import LEVEL, flattened_lines
 from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 
@@ -41,7 +42,8 @@ class Observations:
     map. sigma: (R,) rad, noise along each perpendicular axis. position_sigma: m, noise of the origins. range: (R,) m, NaN if
     unknown. range_sigma: (R,) m. size: (R, 2) width and height of the object per metre of its distance. box: (R, 4) px.
     track: (R,) id of the track, -1 if unknown. feature: (R,) the row of the box's appearance vector in feature_table, -1
-    without one. feature and feature_table are None if no box has a vector."""
+    without one. feature and feature_table are None if no box has a vector. scale: lines, and so landmarks, are in a world
+    that is flattened along z by this factor (`core.ground.flattening`)."""
 
     frame: Ints
     label: Ints
@@ -56,6 +58,7 @@ class Observations:
     track: Ints
     feature: Ints | None = None
     feature_table: FeatureTable | None = None
+    scale: float = LEVEL
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -100,7 +103,13 @@ def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floa
 
 
 def observe(
-    rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...], map_T_camera: Floats, sigma: Floats, position_sigma: float
+    rays: Rays,
+    keyframes: Keyframes,
+    cameras: tuple[Camera, ...],
+    map_T_camera: Floats,
+    sigma: Floats,
+    position_sigma: float,
+    scale: float = LEVEL,
 ) -> tuple[Observations, Ints, Ints]:
     """Return the rays as observations, the ray (R,) of each observation, and the keyframe (K,) of each frame.
 
@@ -108,19 +117,19 @@ def observe(
     effect.
 
     map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, noise of the directions. position_sigma: m, noise of the
-    origins.
+    origins. scale: as in `Observations`.
     """
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
     frame = np.argsort(keyframe)[rays.keyframe]
     ray = np.lexsort((*rays.direction.T, rays.range, rays.score, *rays.box.T[::-1], rays.label, frame))
     rays, frame = rays.take(ray), frame[ray]
-    origin, direction = rays.in_map(map_T_camera)
+    origin, direction, longer = flattened_lines(*rays.in_map(map_T_camera), scale)
     known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
-    range_, range_sigma = (np.where(known, values, np.nan) for values in (rays.range, rays.range_sigma))
+    range_, range_sigma = (np.where(known, values * longer, np.nan) for values in (rays.range, rays.range_sigma))
     lines = Observations.of_lines(origin, direction, sigma[ray], range_, range_sigma, rays.label)
     size = size_per_metre(rays, keyframes, cameras)
     obs = replace(lines, frame=frame, position_sigma=position_sigma, size=size, box=rays.box, track=rays.track_id)
-    obs = replace(obs, feature=rays.feature, feature_table=rays.feature_table)
+    obs = replace(obs, feature=rays.feature, feature_table=rays.feature_table, scale=scale)
     return obs, ray, keyframe
 
 

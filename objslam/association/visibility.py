@@ -1,6 +1,6 @@
 """Find in which frames each object should be detected, and in which it is detected."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.geometry import evenly_spread
+from objslam.core.ground.flattening import raised_points
 from objslam.core.object_map import SeenFrom
 from objslam.core.statistics import distinct, grouped_median, grouped_quantile, grouped_quantiles
 from objslam.core.types import Keyframes
@@ -104,8 +105,11 @@ def detection_history(
 
     An object should be detected under four conditions. Its box lies in the image. Its distance is in the usual range of its
     class, extended to the median distance of its own boxes. No closer box hides it. The camera sees its front, if it has
-    one. matched: (R,) the object of each observation, -1 for none. position, label: (N, 3) m and (N,), of the objects.
+    one. matched: (R,) the object of each observation, -1 for none. position, label: (N, 3) m and (N,), of the objects, in
+    the world of the observations.
     """
+    position = raised_points(position, obs.scale)
+    obs = replace(obs, origin=raised_points(obs.origin, obs.scale))
     count = len(position)
     held = np.flatnonzero(matched >= 0)
     index = matched[held]

@@ -39,6 +39,7 @@ def doctor(
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.diagnosis import diagnose
     from objslam.mapping.fixed.sparse_noise import with_sparse_noise
+    from objslam.mapping.ground.uneven_ground import with_uneven_ground
     from objslam.mapping.pipeline import chosen_poses, with_mode_of
     from objslam.sources.camera_words import doubts_of
 
@@ -49,6 +50,7 @@ def doctor(
         chosen = chosen_poses(given, settings)
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
+        settings = with_uneven_ground(said, settings, ledger, show)
         found = diagnose(said, settings, ledger, show, thorough=True)
         settings, found = with_sparse_noise(said, settings, found, ledger, show)
         solved = _solved(given, settings, show) if found.refutable and settings.mode == "joint" else None

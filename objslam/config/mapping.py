@@ -76,12 +76,16 @@ class Odometry(Section):
 
 
 class Planar(Section):
-    """Configure how far each step may deviate from a planar path. A real floor is not perfectly flat."""
+    """Configure how far the robot deviates from a planar path. A real floor is not perfectly flat. The defaults are those of
+    a floor in a house. Grass, tracks and slopes deviate by far more, and a run estimates by how much (noise.ground)."""
 
     z: Positive = 1e-3
     """Standard deviation of the height in m."""
     tilt: Positive = 1e-3
     """Standard deviation of roll and of pitch in rad."""
+    seconds: NotNegative = 0.0
+    """Time in s after which the correlation of tilt, and of height, is 1/e. It counts in joint mode with a localisation. 0:
+    both are new in each pose. In fixed mode, it is estimated."""
 
 
 class Localization(Section):

@@ -29,6 +29,9 @@ class Noise(Section):
     fixed mode, it is estimated from frames that show several objects. In joint mode, it is estimated from odometry and rays,
     and how long errors last is estimated too, even if localization.* is set. false: in joint mode, the error of each pose is
     new."""
+    ground: Estimated = "auto"
+    """how far the robot rolls, pitches and rises on uneven ground, if the poses are planar: planar.tilt, planar.z and
+    planar.seconds. The first two are at least as in the settings. auto estimates them if planar.* has its defaults."""
     prior: Positive = 10.0
     """the weight of the noise in the settings, as a number of residuals. With a larger weight, short logs change the noise
     less."""

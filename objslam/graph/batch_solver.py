@@ -13,13 +13,14 @@ from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off
+from objslam.core.ground.flattening import flattened_lines, flattened_points, raised_covariances, raised_points
 from objslam.core.statistics import CAUCHY_K, HUBER_K
 from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.factors.odometry_motions import find_ties
-from objslam.graph.fixed_pose_triangulation import pose_noise
+from objslam.graph.fixed_pose_triangulation import flat_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
@@ -69,20 +70,24 @@ def solve_fixed(
     member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
     used = np.flatnonzero((start.weight > 0) & np.isin(association.object, np.flatnonzero(member)))
     landmark = association.object[used]
-    origins, n = (a[used] for a in rays.in_map(keyframes.map_T_camera))
     some = share_bias(rays, association, settings).take(used)
-    angle, place = pose_noise(some, keyframes, settings)
-    distance = _distances(origins, start.positions[landmark])
+    angle, place, scale = flat_noise(rays, keyframes, settings)
+    angle = angle[used]
+    # The solve is in the flattened world, where a ray has one noise in all directions.
+    origins, n, longer = flattened_lines(*some.in_map(keyframes.map_T_camera), scale)
+    some = replace(some, range=some.range * longer, range_sigma=some.range_sigma * longer)
+    flat = flattened_points(start.positions, scale)
+    distance = _distances(origins, flat[landmark])
     factors = fixed_pose_factors(some, origins, n, landmark, distance, (angle, place), loss)
     graph, landmarks = build_graph(factors), np.unique(landmark)
-    values = make_values(np.zeros((0, 4, 4)), start.positions, landmarks)
-    traced = trace_solve(trace, start.positions, landmarks, keyframes.map_T_camera)
+    values = make_values(np.zeros((0, 4, 4)), flat, landmarks)
+    traced = trace_solve(trace, flat, landmarks, keyframes.map_T_camera, scale)
     others = range(len(used), graph.size())
     optimum = optimize(graph, values, loss, settings, others, tolerance=1e-12, on_iteration=traced)
-    positions = with_points(start.positions, landmarks, optimum.values)
-    distance = _distances(origins, positions[landmark])
+    flat = with_points(flat, landmarks, optimum.values)
+    distance = _distances(origins, flat[landmark])
     across = np.hypot(angle * distance, place)
-    residual = angles_off(origins, n, positions[landmark]) * distance / across
+    residual = angles_off(origins, n, flat[landmark]) * distance / across
     weight = start.weight.copy()
     weight[used] = _weights(loss, residual, optimum)
     covariance = start.covariance
@@ -92,10 +97,11 @@ def solve_fixed(
         held = np.linalg.eigvalsh(information)[:, 0] > 0
         covariance = np.full((association.count, 3, 3), np.nan)
         covariance[held] = np.linalg.inv(information[held])
+        covariance = raised_covariances(covariance, scale)
         covariance *= widening(residual, landmark, association.count)[:, None, None]
     return Estimate(
         map_T_base=keyframes.map_T_base,
-        positions=positions,
+        positions=raised_points(flat, scale),
         covariance=covariance,
         seen_sigma=largest_sigma(covariance),
         solved=start.ok,

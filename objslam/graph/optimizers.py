@@ -9,6 +9,7 @@ import numpy as np
 
 from objslam.config import Loss, Settings
 from objslam.core.arrays import Floats, Ints
+from objslam.core.ground.flattening import LEVEL, raised_points
 from objslam.core.trace import Trace
 from objslam.errors import SolveError
 from objslam.graph.variables import read_poses, with_points
@@ -142,16 +143,19 @@ def indeterminate(error: RuntimeError) -> SolveError:
     )
 
 
-def trace_solve(trace: Trace | None, positions: Floats, landmarks: Ints, fixed: Floats | None = None) -> OnIteration | None:
+def trace_solve(
+    trace: Trace | None, positions: Floats, landmarks: Ints, fixed: Floats | None = None, scale: float = LEVEL
+) -> OnIteration | None:
     """Return a function that records each iteration of a solve in the trace, or None without a trace.
 
     landmarks: (n,) the solved rows of positions (N, 3). fixed: (K, 4, 4) camera poses that are not solved.
+    scale: the factor on z of the world of the solve (`core.ground.flattening`).
     """
     if trace is None:
         return None
 
     def on_iteration(cost: float, values: gtsam.Values) -> None:
         poses = read_poses(values) if fixed is None else fixed
-        trace.iteration("solve", cost, poses, with_points(positions, landmarks, values))
+        trace.iteration("solve", cost, poses, raised_points(with_points(positions, landmarks, values), scale))
 
     return on_iteration

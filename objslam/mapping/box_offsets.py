@@ -14,6 +14,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.geometry import evenly_spread, is_planar
+from objslam.core.ground.flattening import noise_of_ground
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
@@ -88,9 +89,10 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     seen = sides_of(rays, estimate.positions, plain=not joint and settings.fixed.loss == "l1")
     told = settings.noise.rays
     learnt = prior == type(settings.rays)().box_sigma if told == "auto" else told
-    # Solved poses move until the boxes fit. A planar pose cannot move up or down, so the offsets show in elevation.
+    # Solved poses move until the boxes fit. On a flat floor, a planar pose cannot move up or down, so the offsets show in
+    # elevation.
     if learnt and joint:
-        learnt = is_planar(solution.keyframes.map_T_base)
+        learnt = is_planar(solution.keyframes.map_T_base) and not any(noise_of_ground(settings))
     share = (
         _share([one.in_elevation() for one in seen.values()] if joint else list(seen.values()), prior) if learnt else prior
     )

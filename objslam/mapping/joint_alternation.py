@@ -12,6 +12,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
+from objslam.core.ground.flattening import LEVEL, flat_scale
 from objslam.core.trace import Trace, Why
 from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
@@ -274,7 +275,7 @@ class JointState:
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
         from objslam.association.global_association import associate_globally
-        from objslam.graph.fixed_pose_triangulation import noise_of_poses
+        from objslam.graph.fixed_pose_triangulation import noise_of_poses, noise_up
 
         frames, rays = self.frames, self.all_rays
         if self.errors is not None and self.theta is not None:
@@ -288,7 +289,9 @@ class JointState:
         yaw, place = scale * _SOLVED_YAW, scale * _SOLVED_XY
         if rough and mine.localized_every:  # The poses are those of the localisation.
             yaw, place = (max(pair) for pair in zip((yaw, place), noise_of_poses(mine, self.settings), strict=True))
-        sigma = np.hypot(rays.sigma, yaw)
+        sigma, flat = np.hypot(rays.sigma, yaw), LEVEL
+        if rough and mine.localized_every:  # A solve corrects tilt and height of the poses. Before it, rays have both.
+            flat = flat_scale(rays, (yaw, place), self.settings) if any(noise_up(mine, self.settings)) else LEVEL
         return associate_globally(
             rays,
             frames,
@@ -297,6 +300,7 @@ class JointState:
             map_T_camera=at @ frames.base_T_camera,
             sigma=sigma,
             position_sigma=place,
+            flat_scale=flat,
             seed=self.settings.seed,
             guess=guess,
             # The landmarks of a solve hold the path together. Before the first solve, only the odometry does.

@@ -33,6 +33,7 @@ from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.lasting_errors import with_lasting_errors
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
+from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.progress import Progress
 from objslam.mapping.refuted import without_refuted
@@ -64,6 +65,7 @@ def run(
         load_libraries()  # Loading is a stage of its own, because it takes longer than a small solve.
     diagnosis = Diagnosis()
     with _stage("rays", seconds, progress):
+        settings = with_uneven_ground(expected, settings, ledger, progress)
         if settings.checks.use:
             diagnosis = diagnose(expected, settings, ledger, progress)
             settings, diagnosis = with_sparse_noise(expected, settings, diagnosis, ledger, progress)

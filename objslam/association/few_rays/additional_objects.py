@@ -20,6 +20,7 @@ from objslam.association.observations import observe
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
+from objslam.core.ground.flattening import LEVEL, flattened_points
 from objslam.core.statistics import logistic
 from objslam.core.types import Association, Keyframes, Rays
 
@@ -48,13 +49,16 @@ def add_few_ray_objects(
     sigma: Floats,
     position_sigma: float,
     seed: int = 0,
+    flat_scale: float = LEVEL,
 ) -> Association:
     """Add the objects that can be found from a few unassigned rays. They come after the other objects.
 
     rays, keyframes: all observed frames and their rays. positions: (N, 3) m of the objects, NaN where unknown.
     map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, position_sigma: m, the noise of the rays' angles and origins.
+    flat_scale: as in `associate_globally`.
     """
-    few, ray = _few(rays, keyframes, cameras, settings, association, positions, map_T_camera, sigma, position_sigma)
+    noise = sigma, position_sigma, flat_scale
+    few, ray = _few(rays, keyframes, cameras, settings, association, positions, map_T_camera, noise)
     found = few.search(settings.association.min_existence, seed)
     old, new = association.count, found.count
     index = association.object.copy()
@@ -102,7 +106,8 @@ def few_ray_evidence(
     """Return the evidence of all objects that a search for few rays finds. Arguments are as in `add_few_ray_objects`."""
     nothing = Association(np.full(len(rays), -1), np.zeros(0, dtype=np.int64))
     positions = np.zeros((0, 3))
-    few, ray = _few(rays, keyframes, cameras, settings, nothing, positions, map_T_camera, sigma, position_sigma)
+    noise = sigma, position_sigma, LEVEL
+    few, ray = _few(rays, keyframes, cameras, settings, nothing, positions, map_T_camera, noise)
     found = few.joined(few.search(settings.association.min_existence, seed))
     members = ray[found.assigned], found.owner, found.landmarks.position
     if not found.count:
@@ -121,11 +126,12 @@ def _few(
     association: Association,
     positions: Floats,
     map_T_camera: Floats,
-    sigma: Floats,
-    position_sigma: float,
+    noise: tuple[Floats, float, float],
 ) -> tuple["_Few", Ints]:
-    """Return the search of `add_few_ray_objects`, and the index (P,) of the ray of each observation."""
-    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma)
+    """Return the search of `add_few_ray_objects`, and the index (P,) of the ray of each observation. noise: `sigma`,
+    `position_sigma` and `flat_scale`."""
+    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, *noise)
+    positions = flattened_points(positions, obs.scale)
     view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
     known = np.isfinite(positions).all(axis=1)
     labels = len(rays.label_names)

@@ -17,6 +17,7 @@ from objslam.association.observations import Observations
 from objslam.association.refinement import grouped_sums, range_costs, variance
 from objslam.association.visibility import CameraFrames
 from objslam.core.arrays import Floats, Ints
+from objslam.core.ground.flattening import raised_points
 from objslam.core.statistics import grouped_median
 
 MOST_ODDS = 20.0
@@ -115,14 +116,16 @@ class Strays:
         horizontal plane. Equal areas are equal solid angles. The coordinates count as independent. So boxes that all lie in
         one row need no special rule.
         """
-        x, y, z = np.einsum("rji,rj->ir", view.map_T_camera[obs.frame, :3, :3], obs.direction)
+        direction = raised_points(obs.direction, obs.scale)
+        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        x, y, z = np.einsum("rji,rj->ir", view.map_T_camera[obs.frame, :3, :3], direction)
         known = np.flatnonzero(np.isfinite(obs.range))
         angle = obs.sigma.copy()
         angle[known] = np.hypot(angle[known], obs.position_sigma / obs.range[known])
         noise = np.nan_to_num(grouped_median(angle, obs.label, labels))
         wide = min(max(camera.view_angle for camera in view.cameras), np.pi)
         columns = (np.arctan2(x, z), wide), (y, min(view.solid_angle / (4 * wide), 1.0))
-        image = np.ones(len(obs))
+        image = np.full(len(obs), 1 / obs.scale)  # In a flattened world, as many boxes fill a smaller solid angle.
         for column, reach in columns:
             image *= _Density.of(column, obs.label, labels, noise, reach).at(column, obs.label)
         if not len(known):

@@ -15,6 +15,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import adjoint, inverse, is_planar
+from objslam.core.ground.flattening import noise_of_ground
 from objslam.core.statistics import Lasting
 from objslam.core.types import Keyframes
 from objslam.graph.factors.noise import huber
@@ -26,6 +27,10 @@ A larger value tells less, and costs digits."""
 _LONGEST = 0.9999
 """The largest share of a lasting error that stays from one pose to the next. A larger share ties two poses of nearly the
 same time more closely, and costs digits."""
+
+
+Parts = Floats | float
+"""Standard deviations: one for all, or one for each."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +75,9 @@ def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: 
     If errors last, the poses have less information, and `localized_motions` has the rest. on_plane: whether the path is
     planar. If it is None, the poses decide.
     """
-    planar = settings.planar
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
     (yaw, _), (xy, _) = _chains(keyframes, settings)
-    tilt, z = (planar.tilt, planar.z) if on_plane else (yaw, xy)
+    tilt, z = _of_ground(keyframes, settings)[0] if on_plane else (yaw, xy)
     parts = (tilt, tilt, yaw, xy, xy, z)
     s = np.stack([np.broadcast_to(np.square(part), len(keyframes)) for part in parts], axis=1) * keyframes.localized_every
     return _in_camera(keyframes.base_T_camera, s)
@@ -85,13 +89,18 @@ def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool |
     A motion is known in the frame of the robot, whose heading errs. The error of the heading turns the motion to a side. The
     error of the heading may last too. So it counts with the noise of the absolute heading.
     """
-    if not keyframes.localized_every or not any(one.share for one in keyframes.lasting) or len(keyframes) < 2:
+    if not keyframes.localized_every or len(keyframes) < 2:
         return None
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
+    lasts = any(one.share for one in keyframes.lasting) or (on_plane and settings.planar.seconds > 0)
+    if not lasts:
+        return None
     (heading, yaw), (_, xy) = _chains(keyframes, settings)
     way = np.linalg.norm(np.diff(keyframes.map_T_base[:, :3, 3], axis=0), axis=1)
     xy, every = np.hypot(xy, way * heading[:-1]), keyframes.localized_every
-    tilt, z = (_UNTOLD, _UNTOLD) if on_plane else (yaw, xy)
+    tilt, z = _of_ground(keyframes, settings)[1] if on_plane else (yaw, xy)
+    if on_plane:  # A base that tilts moves up or down along its own axes.
+        z = np.hypot(z, way * noise_of_ground(settings)[0])
     parts = (tilt, tilt, yaw, xy, xy, z)
     s = np.stack([np.broadcast_to(np.square(part), len(way)) for part in parts], axis=1) / every
     poses = keyframes.map_T_camera
@@ -102,6 +111,20 @@ def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool |
         inverse(poses[:-1]) @ poses[1:],
         _in_camera(keyframes.base_T_camera[1:], np.minimum(s, _UNTOLD**2)),
     )
+
+
+def _of_ground(keyframes: Keyframes, settings: Settings) -> tuple[tuple[Parts, Parts], tuple[Parts, Parts]]:
+    """Return, of tilt (rad) and height (m), the standard deviations (K,) of poses, and those (K-1,) of motions.
+
+    Uneven ground moves a robot as a lasting error would. If `planar.seconds` is 0, motions tell nothing. Poses that share a
+    measurement share its information, and not that of the ground, so the standard deviations undo what it is divided by.
+    """
+    of, root = settings.planar, np.sqrt(keyframes.localized_every)
+    if not of.seconds:
+        return (of.tilt, of.z), (_UNTOLD, _UNTOLD)
+    gaps = np.maximum(np.diff(keyframes.stamps), 0.0)
+    (tilt, turned), (z, raised) = (chain(gaps, sigma, Lasting(1.0, of.seconds)) for sigma in (of.tilt, of.z))
+    return (tilt / root, z / root), (turned * root, raised * root)
 
 
 def _in_camera(base_T_camera: Floats, variances: Floats) -> Floats:

@@ -6,6 +6,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse, is_planar
+from objslam.core.ground.flattening import noise_of_ground
 from objslam.core.types import Keyframes
 from objslam.graph.variables import X0
 
@@ -40,12 +41,25 @@ def motions(
     odom_T_camera, every = odom_T_base @ keyframes.base_T_camera, np.arange(len(keyframes))
     before, after = (every[:-1], every[1:]) if pairs is None else pairs
     floor = motion_floor(keyframes.base_T_camera[after], settings, on_plane) * (after - before)[:, None, None]
+    if on_plane and (tilt := noise_of_ground(settings)[0]):
+        floor += _climb(keyframes, odom_T_base, before, after, tilt)
     gathered = drift[after] - drift[before]
     if keyframes.wander is not None:
         gathered += wander(keyframes, before, after)
     camera_T_odom = inverse(odom_T_camera)
     covariance = motion_covariance(gathered, adjoint(camera_T_odom[after]), floor)
     return camera_T_odom[before] @ odom_T_camera[after], covariance
+
+
+def _climb(keyframes: Keyframes, odom_T_base: Floats, before: Ints, after: Ints, tilt: float) -> Floats:
+    """Return the covariances (M, 6, 6) of motions of a base that moves up or down along its own axes, in the camera frame.
+
+    A planar odometry does not say in which plane the robot moves. On a slope, a tilted base moves along its own axes. A base
+    that tilts on its suspension does not. So its motion may leave its plane by the angle `tilt`, rad.
+    """
+    way = np.linalg.norm(odom_T_base[after, :3, 3] - odom_T_base[before, :3, 3], axis=1)
+    up = adjoint(inverse(keyframes.base_T_camera[after]))[:, :, 5] * (way * tilt)[:, None]
+    return np.asarray(up[:, :, None] * up[:, None, :])
 
 
 def wander(keyframes: Keyframes, before: Ints, after: Ints, walk: bool = False) -> Floats:

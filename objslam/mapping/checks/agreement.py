@@ -12,6 +12,8 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import is_planar
+from objslam.core.ground.flattening import LEVEL, flat_scale, flattened_lines, noise_of_ground, raised_points
 from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays
 from objslam.errors import LogError
 from objslam.frontend.bearings import build_rays
@@ -116,12 +118,14 @@ def bounded_part(log: Log, settings: Settings) -> Part:
 
 @dataclass(frozen=True)
 class _Measured:
-    """The measurements of a log, as input of `fit_points`. label: (R,) a number for each label and window."""
+    """The measurements of a log, as input of `fit_points`. origins, directions: (R, 3) in a world that is flattened by the
+    factor `scale`. label: (R,) a number for each label and window."""
 
     keyframes: Keyframes
     rays: Rays
     origins: Floats
     directions: Floats
+    scale: float
     label: Ints
 
 
@@ -159,13 +163,15 @@ def _measure(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] 
         own = keyframes.camera == index
         of_keyframe[own] = mine[keyframes.frame[own]]
     label = rays.label + len(rays.label_names) * of_keyframe[rays.keyframe]
-    return _Measured(keyframes, rays, *rays.in_map(keyframes.map_T_camera), label)
+    scale = flat_scale(rays, _level_noise(part, settings), settings) if is_planar(keyframes.map_T_base) else LEVEL
+    lines = flattened_lines(*rays.in_map(keyframes.map_T_camera), scale)
+    return _Measured(keyframes, rays, *lines[:2], scale, label)
 
 
 def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Iterator[Agreement | None]:
     known = [one for one in logs if one is not None]
     if known:
-        yaw, place = pose_noise(part, settings)
+        yaw, place = _level_noise(part, settings)
         begin = np.cumsum([0, *(one.label.max(initial=-1) + 1 for one in known)])
         label = np.concatenate([one.label + first for one, first in zip(known, begin[:-1], strict=True)])
         origins = np.concatenate([one.origins for one in known])
@@ -185,11 +191,18 @@ def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Ite
         score = (fit.sum() - _COST * len(number)) / total
         share = float((own >= 0).sum() / total)
         of_log = total, one.keyframes, one.rays
-        yield Agreement(share, float(score), *of_log, own, met.points[number], fit, met.narrow[mine])
+        points = raised_points(met.points[number], one.scale)
+        yield Agreement(share, float(score), *of_log, own, points, fit, met.narrow[mine])
 
 
 def pose_noise(part: Part, settings: Settings) -> tuple[float, float]:
-    """Return the pose errors (rad, m) that a ray may have."""
+    """Return the pose errors (rad, m) that a ray may have, in any direction."""
+    (yaw, place), (tilt, z) = _level_noise(part, settings), noise_of_ground(settings)
+    return float(np.hypot(yaw, tilt)), float(np.hypot(place, z))
+
+
+def _level_noise(part: Part, settings: Settings) -> tuple[float, float]:
+    """Return the errors of headings, rad, and of x and y, m, that poses may have."""
     if part.drifts:
         return _DRIFT_YAW, _DRIFT_XY
     return settings.localization.yaw, settings.localization.xy

@@ -89,12 +89,12 @@ class FixedPoses:
     def associate(self, more: Floats | float = 0.0) -> Association:
         """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses."""
         from objslam.association.global_association import associate_globally
-        from objslam.graph.fixed_pose_triangulation import pose_noise
+        from objslam.graph.fixed_pose_triangulation import flat_noise
 
         settings = self.settings
         if settings.association.method == "by_label":
             return associate_by_label(self.rays_seen)
-        sigma, place = pose_noise(self.rays, self.frames, settings)
+        sigma, place, scale = flat_noise(self.rays, self.frames, settings)
         return associate_globally(
             self.rays,
             self.frames,
@@ -104,6 +104,7 @@ class FixedPoses:
             sigma=np.hypot(sigma, more),
             position_sigma=place,
             seed=settings.seed,
+            flat_scale=scale,
         )
 
     def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
@@ -111,12 +112,12 @@ class FixedPoses:
 
         estimate: the estimate of the objects, None if there are none. more: as in `associate`."""
         from objslam.association.few_rays.additional_objects import add_few_ray_objects
-        from objslam.graph.fixed_pose_triangulation import pose_noise
+        from objslam.graph.fixed_pose_triangulation import flat_noise
 
         settings = self.settings
         if association.existence is None or not (settings.association.few_rays and self.frames.localized_every):
             return association
-        sigma, place = pose_noise(self.rays, self.frames, settings)
+        sigma, place, scale = flat_noise(self.rays, self.frames, settings)
         placed = np.zeros((0, 3)) if estimate is None else np.where(estimate.solved[:, None], estimate.positions, np.nan)
         return add_few_ray_objects(
             self.rays,
@@ -129,6 +130,7 @@ class FixedPoses:
             sigma=np.hypot(sigma, more),
             position_sigma=place,
             seed=settings.seed,
+            flat_scale=scale,
         )
 
     def solve(self, association: Association, trace: Trace | None, parameters: Parameters | None = None) -> Estimate:
@@ -192,7 +194,7 @@ def calibrate_fixed(
     were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors, turned_by_errors
-    from objslam.graph.fixed_pose_triangulation import noise_of_poses
+    from objslam.graph.fixed_pose_triangulation import largest_noise
 
     calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     every = errors.take(at.frames, at.rays)
@@ -208,7 +210,7 @@ def calibrate_fixed(
         rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
-        placed, noise = _placed(estimate), noise_of_poses(now.seen, now.settings)
+        placed, noise = _placed(estimate), largest_noise(now.seen, now.settings)
         try:
             found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
         except SolveError as error:
@@ -236,7 +238,7 @@ def calibrate_fixed(
     if every_object.count > association.count:
         association = every_object
         estimate = now.solve(association, trace, _parameters(calibration))
-        noise = noise_of_poses(now.seen, now.settings)
+        noise = largest_noise(now.seen, now.settings)
         sensitivity = calibrate_at_poses(errors, association, _placed(estimate), calibration.values, noise).sensitivity
         found = replace(found, sensitivity=sensitivity)
     return now, association, _with_noise(_with_covariance(estimate, found), now), rounds

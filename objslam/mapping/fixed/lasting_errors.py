@@ -12,9 +12,11 @@ from objslam.association.observations import MIN_DEPTH
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import is_planar
+from objslam.core.ground.flattening import flattened_lines, flattened_points, raised_points
+from objslam.core.ground.rise import rise_of
 from objslam.core.rotation import cross
 from objslam.frontend.up import upright
-from objslam.graph.fixed_pose_triangulation import noise_of_poses
+from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, noise_up
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.solution import Solution
 
@@ -63,23 +65,28 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
     """Return the solution of a run at given poses with their lasting errors added to its covariances.
 
     A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
-    poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. The size of the errors
-    is `localization` times a factor with a half-normal prior of 1. Their correlation falls exponentially over time. The
-    factor and the correlation time are estimated by restricted maximum likelihood (Patterson and Thompson 1971), and
-    averaged over their posterior.
+    poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. On uneven ground, planar
+    poses turn rays up and down by `planar` times a factor of its own, and ground whose tilt lasts also rises (`rise_of`).
+    The size of the errors is `localization` times a factor with a half-normal prior of 1. Their correlation falls
+    exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood (Patterson
+    and Thompson 1971), and averaged over their posterior.
     """
     if not solution.keyframes.localized_every:
         return solution
     seen = _cells_of(solution, settings)
-    if not seen:
+    if not any(seen):
         return solution
     from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
 
-    variance = lasting_variances([cells for _, cells in seen])
     covariance = solution.estimate.covariance.copy()
-    for j, cells in seen:
-        kernel = sum(v * cells.alike(time) for v, time in zip(variance.tolist(), _TIMES, strict=True))
-        covariance[j] += cells.pull.T @ kernel @ cells.pull
+    for alike in seen:
+        variance = lasting_variances([cells for _, cells in alike])
+        for j, cells in alike:
+            kernel = sum(v * cells.alike(time) for v, time in zip(variance.tolist(), _TIMES, strict=True))
+            covariance[j] += cells.pull.T @ kernel @ cells.pull
+    if (tilt := noise_up(solution.keyframes, settings)[0]) > 0:  # The variance of the last list is that of the ground.
+        at = solution.keyframes
+        covariance[:, 2, 2] += rise_of(at.stamps, at.map_T_base, tilt * np.sqrt(variance), np.array(_TIMES)) ** 2
     wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
     return replace(solution, estimate=wider)
 
@@ -106,9 +113,9 @@ def lasting_variances(seen: list[Cells]) -> Floats:
     return np.asarray((weight * _FACTORS**2).sum(axis=1) / weight.sum())
 
 
-def _cells_of(solution: Solution, settings: Settings) -> list[tuple[int, Cells]]:
+def _cells_of(solution: Solution, settings: Settings) -> list[list[tuple[int, Cells]]]:
     """Return the index of an object and its cells along one axis, for each object with a covariance and each axis. Rejected
-    rays, and ranges, do not count."""
+    rays, and ranges, do not count. The errors of one list have one size and one correlation time."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
@@ -124,23 +131,30 @@ def _cells_of(solution: Solution, settings: Settings) -> list[tuple[int, Cells]]
     left = np.column_stack([-to[:, 1], to[:, 0], np.zeros(len(to))]) / level[:, None]
     yaw, place = noise_of_poses(keyframes, settings)
 
-    across = np.hypot(np.hypot(rays.sigma, yaw) * distance, place)
+    tilt, z = noise_up(keyframes, settings)
+    sigma, _, scale = flat_noise(rays, keyframes, settings)
+    across = np.hypot(sigma * distance, place)
     strength = 1 / across if settings.fixed.loss == "l1" else across**-2
     along = np.where(np.isfinite(rays.range), rays.range_sigma**-2, 0.0)
-    information = ray_information(direction, strength, along, owner, count)
+    # The solve is in a flattened world on uneven ground, so a ray has more weight to the sides than up and down.
+    information = ray_information(flattened_lines(origin, direction, scale)[1], strength, along, owner, count)
     held = np.linalg.eigvalsh(information)[:, 0] > 0
     inverse = np.zeros_like(information)
     inverse[held] = np.linalg.inv(information[held])
+    inverse = raised_points(flattened_points(inverse, scale).swapaxes(1, 2), scale).swapaxes(1, 2)
 
     times = keyframes.stamps[rays.keyframe]
     turned = np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
     miss = (direction * left).sum(axis=1) / turned
-    found = _by_cell(times, owner, miss, rays.sigma * distance / level, left, level, (yaw, place), strength, inverse)
-    if not is_planar(keyframes.map_T_base):
+    found = [_by_cell(times, owner, miss, rays.sigma * distance / level, left, level, (yaw, place), strength, inverse)]
+    in_space, uneven = not is_planar(keyframes.map_T_base), tilt > 0 or z > 0
+    if in_space or uneven:
         above = cross(to / distance[:, None], left)
         miss = (direction * above).sum(axis=1)
-        found += _by_cell(times, owner, miss, rays.sigma, above, distance, (yaw, place), strength, inverse)
-    return [(number, replace(cells, pull=cells.pull @ up)) for number, cells in found]
+        noise = (yaw, place) if in_space else (tilt, z)
+        raised = _by_cell(times, owner, miss, rays.sigma, above, distance, noise, strength, inverse)
+        found = [found[0] + raised] if in_space else [*found, raised]
+    return [[(number, replace(cells, pull=cells.pull @ up)) for number, cells in alike] for alike in found]
 
 
 def _by_cell(

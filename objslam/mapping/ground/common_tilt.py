@@ -1,0 +1,246 @@
+"""The roll, pitch and height that planar poses lack, from the errors that all rays of a pose share.
+
+A robot that pitches lifts or lowers all rays of its pose, one that rolls lifts those on one side, and one that stands higher
+than its pose lowers near rays more than far ones. The noise of boxes does none of these. So poses that show several things
+tell how uneven the ground is.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Self
+
+import numpy as np
+
+from objslam.association.observations import MIN_DEPTH
+from objslam.core.arrays import Floats, Ints
+from objslam.core.types import Keyframes, Rays
+from objslam.mapping.fixed.pose_noise import least_cost
+
+_MOST_POSES = 300
+"""The most poses that count, spread evenly. More poses are more exact and slower."""
+_HEIGHT = 3.0
+"""The prior standard deviation (m) of the error of the height of a thing. With a larger value, the rays decide more."""
+_MOUNT = 0.1
+"""The prior standard deviation (rad) of the roll and tilt of a camera on the robot. A larger value takes more of a constant
+tilt for an error of the camera."""
+_PLACE = 0.1
+"""The prior standard deviation (m) of x and of y of a pose. A robot that is nearer to its things than its pose says sees
+them farther up or down. A larger value takes more of the tilt for such errors."""
+_BOUNDS = np.log([[0.3, 1e-4, 1e-4], [5.0, 0.35, 10.0]])
+"""The logarithms of the least and largest factor on the noise of rays, tilt (rad) and height (m). Wider bounds allow rougher
+ground."""
+_TILTS, _HEIGHTS = (0.003, 0.01, 0.03, 0.1), (1e-4, 0.1)
+"""The tilts (rad) and heights (m) among which the search begins at the likeliest. More are slower."""
+_STRAY = 3.5
+"""The deviation of a stray ray, in standard deviations of the noise that remains. A larger number lets false boxes raise the
+tilt."""
+_MOST_LASTING, _RUN = 150, 10
+"""The most poses that tell how long the tilt lasts, and how many of them follow each other. More poses are more exact, and
+the time grows with their cube. Longer runs see shorter times less often."""
+_TIMES = tuple(0.25 * 2.0**k for k in range(9))
+"""The tried times (s) for which tilt lasts. The shortest fits a bump, the longest a slope. More are finer and slower."""
+_LARGER = (1.0, 1.5, 2.25)
+"""The tried sizes of tilt that lasts, as multiples of the size of tilt that is new in each pose. More are finer and
+slower."""
+_CHANCE = 1e-3
+"""The chance of a false alarm: flat ground is found uneven. With a larger value, shorter logs can show uneven ground."""
+SIGNIFICANT = -2 * np.log(_CHANCE)
+"""The ground counts as uneven if tilt and height lower -2 ln of the likelihood by at least this value. It is the quantile of
+chi-squared that is exceeded with the probability `_CHANCE`. The 2 degrees of freedom are tilt and height."""
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Sums over the rays of K poses, for P effects that do not differ from pose to pose. Rays are in units of their noise,
+    effects of their priors.
+
+    shared: (K, n, n) the information about roll, pitch (rad), height (m), and perhaps x and y (m), so n is 3 or 5. pulled:
+    (K, n) this information times the error that fits best. crossed: (K, n, P) between the errors of a pose and the effects.
+    information: (P, P), vector: (P,) the same for the effects. squares: the sum of the squared misses. rays: the number of
+    rays. prior: as `Noise.prior`.
+    """
+
+    shared: Floats
+    pulled: Floats
+    crossed: Floats
+    information: Floats
+    vector: Floats
+    squares: float
+    rays: int
+    prior: float
+
+    @classmethod
+    def of(cls, miss: Floats, by_pose: Floats, effects: Floats, pose: Ints, prior: float) -> Self:
+        """Sum over rays. miss: (R,), by_pose: (R, n), effects: (R, P) derivatives. pose: (R,) the pose of each ray."""
+        begin = np.flatnonzero(np.diff(pose, prepend=-1))
+        return cls(
+            shared=np.add.reduceat(by_pose[:, :, None] * by_pose[:, None, :], begin),
+            pulled=np.add.reduceat(by_pose * miss[:, None], begin),
+            crossed=np.add.reduceat(by_pose[:, :, None] * effects[:, None, :], begin),
+            information=effects.T @ effects,
+            vector=effects.T @ miss,
+            squares=float(miss @ miss),
+            rays=len(miss),
+            prior=prior,
+        )
+
+    def solve(self, logarithms: Floats, alike: Floats | None = None) -> tuple[float, Floats, Floats]:
+        """Return -2 ln of the restricted likelihood, the effects (P,), and the errors of the poses (K, n).
+
+        logarithms: (3,) of the factor on the noise of rays, of the tilt, rad, and of the height, m. alike: (K, K) the
+        correlation of the errors of two poses, None if they are independent.
+        """
+        factor, tilt, height = np.exp(logarithms)
+        sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[: self.pulled.shape[1]] / factor
+        told = np.concatenate([self.pulled[:, :, None], self.crossed], axis=2) * sigma[:, None]
+        inner = sigma[:, None] * self.shared * sigma
+        if alike is not None:  # All poses become one, in which the errors of each kind are sums of independent numbers.
+            root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(alike)))
+            told = np.einsum("kl,kip->lip", root, told).reshape(1, -1, told.shape[2])
+            inner = np.einsum("kl,kij,km->limj", root, inner, root, optimize=True).reshape(1, told.shape[1], -1)
+        inner = inner + np.eye(inner.shape[1])
+        half = np.linalg.solve(np.linalg.cholesky(inner), told)
+        flat = half.reshape(-1, half.shape[2])
+        gram = flat.T @ flat
+        total = self.information - gram[1:, 1:] + np.eye(len(self.vector)) * factor**2
+        vector = self.vector - gram[1:, 0]
+        found = np.linalg.solve(total, vector)
+        squares = (self.squares - gram[0, 0] - vector @ found) / factor**2
+        cost = squares + np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(total)[1]
+        cost += 2 * (self.rays - len(found)) * logarithms[0] + self.prior * (2 * logarithms[0] + factor**-2.0)
+        left = told[:, :, 0] - told[:, :, 1:] @ found
+        errors = np.linalg.solve(inner, left[:, :, None])[:, :, 0]
+        if alike is not None:
+            errors = np.einsum("kl,li->ki", root, errors.reshape(len(root), -1))
+        return float(cost), found, errors * sigma
+
+    def cost(self, logarithms: Floats) -> float:
+        """Return -2 ln of the restricted likelihood."""
+        return self.solve(logarithms)[0]
+
+
+@dataclass(frozen=True)
+class Uneven:
+    """How uneven the ground is.
+
+    tilt: rad, the standard deviation of roll and of pitch. height: m, that of the height. seconds: s, the time after which
+    the correlation of both is 1/e, 0 if both are new in each pose. share: the noise of a usual ray by tilt and height, as a
+    multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
+    """
+
+    tilt: float
+    height: float
+    seconds: float = 0.0
+    share: float = 0.0
+    gain: float = 0.0
+
+
+@dataclass(frozen=True)
+class CommonTilt:
+    """The fit of a variance component model to the elevations of rays. Rays are in units of their noise.
+
+    ground: its tilt and height, new in each pose. logarithms: (3,) as in `_Poses.solve`. stamps: (R,) s. pose: (R,) the pose
+    of each ray. miss: (R,), by_pose: (R, 5), effects: (R, P) as in `_Poses.of`. prior: as `Noise.prior`.
+    """
+
+    ground: Uneven
+    logarithms: Floats
+    stamps: Floats
+    pose: Ints
+    miss: Floats
+    by_pose: Floats
+    effects: Floats
+    prior: float
+
+    def lasting(self) -> Uneven:
+        """Return the ground with the time for which its tilt lasts, and the size with which it lasts that long.
+
+        Tilt that lasts lifts a thing in all its rays, so rays show less of it, and its size is larger than it seems.
+        """
+        poses = np.unique(self.pose)
+        every = -(-len(poses) // _MOST_LASTING)
+        some = np.isin(self.pose, poses[np.arange(len(poses)) // _RUN % every == 0])
+        index = np.unique(self.pose[some], return_inverse=True)[1]
+        sums = _Poses.of(self.miss[some], self.by_pose[some, :3], self.effects[some], index, self.prior)
+        stamps = self.stamps[some][np.flatnonzero(np.diff(index, prepend=-1))]
+        gaps = np.abs(stamps[:, None] - stamps)
+        tried = [(sums.solve(self.logarithms)[0], 0.0, 1.0)]
+        for seconds in _TIMES:
+            alike = np.exp(-gaps / seconds)
+            larger = [self.logarithms + np.log([1.0, times, times]) for times in _LARGER]
+            costs = [sums.solve(logarithms, alike)[0] for logarithms in larger]
+            tried += [(cost, seconds, times) for cost, times in zip(costs, _LARGER, strict=True)]
+        _, seconds, times = min(tried)
+        return replace(self.ground, tilt=self.ground.tilt * times, height=self.ground.height * times, seconds=seconds)
+
+
+def common_tilt(keyframes: Keyframes, rays: Rays, point: Ints, points: Floats, prior: float) -> CommonTilt | None:
+    """Return how uneven the ground is below planar poses, None if no pose has several rays, or none shares an error.
+
+    A variance component model (Searle, Casella and McCulloch 1992): the elevation of a ray above its thing is a sum of the
+    noise of the ray, the errors of its pose (roll, pitch, height, x, y), the error of the height of the thing, and constant
+    errors of its camera (roll, tilt). The sizes are those of the largest restricted likelihood.
+
+    point: (R,) the thing of each ray, -1 for none. points: (N, 3) m, the things. prior: the weight of the nominal noise of
+    rays, as a number of residuals.
+    """
+    held = np.flatnonzero(point >= 0)
+    pose = np.unique(keyframes.stamps, return_inverse=True)[1][rays.keyframe[held]]
+    several = np.flatnonzero(np.bincount(pose) > 1)
+    some = np.isin(pose, several[:: -(-len(several) // _MOST_POSES) or 1])
+    held, pose = held[some], pose[some]
+    order = np.argsort(pose, kind="stable")
+    held, pose = held[order], pose[order]
+    if not len(held):
+        return None
+    miss, by_pose, effects = _derivatives(keyframes, rays, held, point, points)
+    white = rays.sigma[held]
+    miss, by_pose, effects = miss / white, by_pose / white[:, None], effects / white[:, None]
+    near = np.ones(len(held), dtype=bool)
+    for last in (False, True):
+        index = np.unique(pose[near], return_inverse=True)[1]
+        sums = _Poses.of(miss[near], by_pose[near], effects[near], index, prior)
+        level, flat = least_cost(sums.cost, np.array([True, False, False]), np.array([0.0, *_BOUNDS[0, 1:]]), _BOUNDS)
+        if not last:
+            starts = [np.array([size, *np.log(one)]) for one in product(_TILTS, _HEIGHTS) for size in (level[0], 0.0)]
+            found = min(starts, key=sums.cost)
+            if sums.cost(found) > flat:
+                return None
+        found, cost = least_cost(sums.cost, np.ones(3, dtype=bool), found, _BOUNDS)
+        if last:
+            break
+        _, shared, own = sums.solve(found)
+        left = np.full(len(miss), np.inf)
+        left[near] = miss[near] - effects[near] @ shared - (by_pose[near] * own[index]).sum(axis=1)
+        near = np.abs(left) < _STRAY * np.exp(found[0])
+        near &= np.bincount(pose, near)[pose] > 1
+        if not near.any():
+            return None
+    tilt, height = np.exp(found[1:]).tolist()
+    moved = np.hypot(tilt * np.hypot(by_pose[:, 0], by_pose[:, 1]) / np.sqrt(2), height * by_pose[:, 2])
+    ground = Uneven(tilt, height, share=float(np.median(moved)), gain=flat - cost)
+    stamps = keyframes.stamps[rays.keyframe[held[near]]]
+    return CommonTilt(ground, found, stamps, pose[near], miss[near], by_pose[near], effects[near], prior)
+
+
+def _derivatives(keyframes: Keyframes, rays: Rays, held: Ints, point: Ints, points: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return by how much rays pass above their things (R,), rad, and its derivatives by roll, pitch, height, x and y of the
+    pose (R, 5), and by the heights of the things and the errors of the cameras (R, P)."""
+    origin, direction = (values[held] for values in rays.in_map(keyframes.map_T_camera))
+    to = points[point[held]] - origin
+    level = np.maximum(np.hypot(to[:, 0], to[:, 1]), MIN_DEPTH)
+    across = np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
+    ahead = direction[:, :2] / across[:, None]
+    miss = np.arctan2(direction[:, 2], across) - np.arctan2(to[:, 2], level)
+    by_height = level / np.maximum(level**2 + to[:, 2] ** 2, MIN_DEPTH**2)
+    nearer = to[:, 2:] / np.maximum(level**2 + to[:, 2] ** 2, MIN_DEPTH**2)[:, None] * to[:, :2] / level[:, None]
+    by_pose = np.column_stack([-ahead[:, 1], ahead[:, 0], by_height, nearer])
+    of_base = np.einsum("rji,rj->ri", keyframes.map_T_base[rays.keyframe[held], :2, :2], ahead)
+    things, index = np.unique(point[held], return_inverse=True)
+    camera = keyframes.camera[rays.keyframe[held]]
+    effects = np.zeros((len(held), len(things) + 2 * (int(camera.max()) + 1)))
+    row = np.arange(len(held))
+    effects[row, index] = -_HEIGHT * by_height
+    for column, values in enumerate((of_base[:, 0], of_base[:, 1])):
+        effects[row, len(things) + 2 * camera + column] = _MOUNT * values
+    return miss, by_pose, effects

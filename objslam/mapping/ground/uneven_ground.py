@@ -1,0 +1,94 @@
+"""Find uneven ground below planar poses before the objects are known, and allow for it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import is_planar
+from objslam.core.ground.rise import rise_of
+from objslam.core.types import Log
+from objslam.frontend.known_errors import coarse
+from objslam.mapping.checks.agreement import agreement, bounded_part
+from objslam.mapping.ground.common_tilt import SIGNIFICANT, Uneven, common_tilt
+from objslam.mapping.progress import Progress
+
+_FIRST = Uneven(np.radians(4.0), 0.2)
+"""The ground that is allowed for before the first estimate. A larger tilt finds rougher ground, and confuses things above
+each other."""
+_ROUNDS = 5
+"""The most estimates. More rounds are more exact and take longer."""
+_SAME = 0.05
+"""The rounds end if the noise by the ground changes by at most this share. A larger share ends sooner."""
+_FEWEST = 60
+"""The fewest boxes of a log that tell of the ground. Fewer boxes agree by chance."""
+_CROWD = 5.0
+"""In a larger crowd (`Part.crowd`), rays meet anywhere, and show nothing. A larger value examines more logs."""
+_LEAST = 0.5
+"""The least noise of rays by the ground, as a multiple of their other noise. Less hardly changes a map. A larger number
+allows for uneven ground less often."""
+_EXPLAINED = 0.4
+"""The least share of the boxes that must fit a point on the ground that was found. With wrong input, fewer fit, and what
+their poses share is not the ground. A larger share finds uneven ground in fewer logs."""
+
+
+def with_uneven_ground(log: Log, settings: Settings, ledger: Ledger, progress: Progress) -> Settings:
+    """Return settings whose `planar` has the unevenness of the ground that the boxes show, if it moves rays.
+
+    The ledger gets a warning. The settings stay as they are if the poses are not planar or not localised, if `noise.ground`
+    does not allow the estimate, or if the boxes do not show it clearly.
+    """
+    use, usual = settings.noise.ground, settings.planar == type(settings.planar)()
+    if not (usual if use == "auto" else use) or (settings.mode == "fixed" and coarse(settings)):
+        return settings
+    progress("tilt of the robot", 0, 0)
+    found = uneven_ground(log, settings)
+    if found is None:
+        return settings
+    if settings.mode == "joint" and log.localization is not None:  # In fixed mode, the lasting errors contain the rise.
+        path = log.localization
+        rise = rise_of(path.stamps, path.poses, np.array([found.tilt]), np.array([found.seconds]))
+        found = replace(found, height=float(np.hypot(found.height, rise)))
+    with_ground = _with(settings, found)
+    tilt, z = (float(f"{value:.2g}") for value in (np.degrees(with_ground.planar.tilt), with_ground.planar.z))
+    ledger.warn(
+        f"the ground is uneven: the robot rolls and pitches by about {tilt:g} deg and rises by about {z:g} m, which its "
+        "planar poses do not say. The sigmas allow for it; poses in 3D would be more exact"
+    )
+    return with_ground
+
+
+def uneven_ground(log: Log, settings: Settings) -> Uneven | None:
+    """Return how uneven the ground is below the localised poses of a log, None if they are not planar or nothing shows it.
+
+    Things are searched as points where rays meet, in a world that is flattened along z, so that the tilt hardly matters.
+    The tilt is estimated from these points (`common_tilt`), and the points are searched again with this tilt.
+    """
+    path = log.localization
+    found = [one.detections for one in log.cameras if one.detections is not None and len(one.detections.frame_stamps)]
+    if path is None or not found or not is_planar(path.poses):
+        return None
+    part = bounded_part(log, settings)
+    if part.boxes < _FEWEST or part.crowd > _CROWD:
+        return None
+    now, fit = _FIRST, None
+    for _ in range(_ROUNDS):
+        at = agreement(part, part.log, _with(settings, now))
+        if at is None or at.share < _EXPLAINED:
+            return None
+        fit = common_tilt(at.keyframes, at.rays, at.point, at.points, settings.noise.prior)
+        if fit is None or fit.ground.gain < SIGNIFICANT or fit.ground.share < _LEAST:
+            return None
+        settled = abs(np.log(fit.ground.share / max(now.share, 1e-9))) < _SAME
+        now = fit.ground
+        if settled:
+            break
+    return None if fit is None else fit.lasting()
+
+
+def _with(settings: Settings, ground: Uneven) -> Settings:
+    """Return settings with at least this unevenness."""
+    of = settings.planar
+    planar = {"tilt": max(of.tilt, ground.tilt), "z": max(of.z, ground.height), "seconds": ground.seconds}
+    return settings.model_copy(update={"planar": of.model_copy(update=planar)})

@@ -1,0 +1,119 @@
+"""Uneven ground below planar poses: its size and its memory against what was drawn, and the maps with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from uneven_drives import uneven_drive
+
+from objslam.config import Settings, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.core.ground.flattening import flattened_lines, flattened_points, raised_covariances, raised_points
+from objslam.core.ground.rise import rise_of
+from objslam.core.result import RunResult
+from objslam.core.types import Log
+from objslam.mapping import pipeline
+from objslam.mapping.checks.agreement import agreement, bounded_part
+from objslam.mapping.ground.uneven_ground import uneven_ground, with_uneven_ground
+
+QUIET = ("output.recording=false", "output.picture=false")
+
+
+def mapped(log: Log, *told: str) -> tuple[RunResult, Ledger]:
+    ledger = Ledger()
+    return pipeline.run(log, load_settings(None, (*told, *QUIET)), ledger), ledger
+
+
+def heights_off(result: RunResult, log: Log) -> tuple[np.ndarray, np.ndarray]:
+    """The errors of the heights of the resolved objects, m, and their standard deviations."""
+    true = {item.label: item.position for item in log.truth.objects}
+    found = [item for item in result.map.resolved() if item.covariance is not None]
+    assert len(found) >= 18
+    off = np.array([item.position[2] - true[item.label][2] for item in found])
+    return off, np.sqrt([item.covariance[2, 2] for item in found])
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("degrees", [1.0, 2.0, 4.0])
+def test_the_drawn_tilt_is_found(degrees, seed):
+    found = uneven_ground(uneven_drive(np.radians(degrees), 0.0, seed), Settings(mode="fixed"))
+    assert np.degrees(found.tilt) == pytest.approx(degrees, rel=0.25)
+    assert found.height < 0.1
+    assert found.seconds <= 0.5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_memory_of_the_tilt_is_found(seed):
+    found = uneven_ground(uneven_drive(0.03, 2.0, seed), Settings(mode="fixed"))
+    assert 1.0 <= found.seconds <= 4.0
+    assert found.tilt == pytest.approx(0.03, rel=0.6)
+
+
+@pytest.mark.parametrize("mount", [0.0, 0.05])
+@pytest.mark.parametrize("seed", range(3))
+def test_flat_ground_is_not_found_uneven_whatever_the_mount(mount, seed):
+    settings, ledger = Settings(mode="fixed"), Ledger()
+    log = uneven_drive(0.0, seed=seed, mount=mount)
+    assert with_uneven_ground(log, settings, ledger, lambda stage, done, total: None) == settings
+    assert not ledger.warnings
+
+
+def test_the_user_may_know_better():
+    log, ledger = uneven_drive(0.03), Ledger()
+    for told in ("noise.ground=false", "planar.tilt=0.01"):
+        settings = load_settings(None, ("mode=fixed", told))
+        assert with_uneven_ground(log, settings, ledger, lambda stage, done, total: None) == settings
+
+
+@pytest.mark.parametrize("seconds", [0.0, 4.0])
+def test_a_map_at_given_poses_is_honest_on_uneven_ground(seconds):
+    log = uneven_drive(0.035, seconds, 1)
+    result, ledger = mapped(log, "mode=fixed")
+    off, sigma = heights_off(result, log)
+    assert (np.abs(off) < 1.96 * sigma).mean() >= 0.85
+    assert result.summary["assessment"]["level"] != "bad"
+    assert any("the ground is uneven: the robot rolls and pitches by about" in line for line in ledger.warnings)
+
+
+def test_boxes_agree_better_if_the_tilt_of_rough_ground_is_allowed_for():
+    """The checks call an input wrong whose boxes agree too badly."""
+    log, settings = uneven_drive(0.07, 1.0, 1), Settings(mode="fixed")
+    allowed = with_uneven_ground(log, settings, Ledger(), lambda stage, done, total: None)
+    part = bounded_part(log, settings)
+    before, after = (agreement(part, part.log, told) for told in (settings, allowed))
+    assert after.score > before.score + 0.2
+
+
+def test_a_joint_solve_corrects_the_tilt():
+    log = uneven_drive(0.035, 4.0, 1)
+    result, _ = mapped(log, "mode=joint")
+    off, sigma = heights_off(result, log)
+    fixed, _ = heights_off(mapped(log, "mode=fixed")[0], log)
+    assert np.sqrt((off**2).mean()) < 0.7 * np.sqrt((fixed**2).mean())
+    assert (np.abs(off) < 1.96 * sigma).mean() >= 0.85
+    at = np.searchsorted(log.truth.trajectory.stamps, result.keyframes.stamps)
+    left = result.map_T_base[:, 2, :2] - log.truth.trajectory.poses[at, 2, :2]
+    assert np.sqrt((left**2).mean()) < 0.6 * 0.035
+
+
+def test_lines_that_meet_also_meet_in_a_flattened_world():
+    rng = np.random.default_rng(0)
+    point, origins = np.array([2.0, 1.0, 3.0]), rng.normal(size=(5, 3))
+    ways = np.linalg.norm(point - origins, axis=1)
+    flat, directions, longer = flattened_lines(origins, (point - origins) / ways[:, None], 0.2)
+    ends = flat + directions * (ways * longer)[:, None]
+    np.testing.assert_allclose(ends, np.broadcast_to(flattened_points(point, 0.2), ends.shape))
+    np.testing.assert_allclose(raised_points(ends, 0.2), np.broadcast_to(point, ends.shape))
+    root = rng.normal(size=(3, 3))
+    several = rng.normal(size=(200_000, 3)) @ root.T
+    told = raised_covariances(root @ root.T, 0.2)
+    np.testing.assert_allclose(np.cov(raised_points(several, 0.2).T), told, atol=0.02 * np.abs(told).max())
+
+
+def test_ground_that_tilts_rises_over_its_way_but_not_over_more_than_the_site():
+    stamps = np.arange(101.0)
+    line = lift_se2(np.column_stack([stamps, 0 * stamps, 0 * stamps]))  # 1 m/s, 100 m
+    assert rise_of(stamps, line, np.array([0.01]), np.array([5.0])) == pytest.approx(0.05)
+    assert rise_of(stamps, line, np.array([0.01]), np.array([1e4])) == pytest.approx(0.01 * stamps.std(), rel=1e-6)
+    assert rise_of(stamps, line, np.array([0.03, 0.04]), np.array([1.0, 1.0])) == pytest.approx(0.05)
