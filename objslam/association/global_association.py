@@ -89,8 +89,7 @@ def associate_globally(
     Args:
         keyframes: all observed frames. Frames without a box count as misses.
         map_T_camera: (K, 4, 4) of the keyframes.
-        sigma: (R,) rad, the noise of the rays' angles, including the noise of the poses.
-        position_sigma: m, the noise of the rays' origins. flat_scale: as `Observations.scale`.
+        sigma: (R,) rad, position_sigma: m, the noise of rays and poses. flat_scale: as `Observations.scale`.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
     """
