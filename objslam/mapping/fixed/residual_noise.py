@@ -42,8 +42,9 @@ def noise_of_residuals(searched: Searched, unknown: tuple[bool, bool, bool], pri
     known, own = residuals.known, residuals.own
     place = searched.found.moment if shared else np.arange(len(searched.found.owner))
     system, now = residuals.system(place), residuals.now
-    bounds = np.log([np.ones(3), _MOST])
-    factors = np.clip(np.log([searched.noise.place, searched.noise.ranges, searched.noise.rays]), *bounds)
+    bounds = np.log([(1.0, 1.0, 1.0), _MOST])
+    noise = searched.noise
+    factors = np.clip(np.log([noise.place, noise.ranges, noise.rays]), bounds[0], bounds[1])
 
     counted = known
     for number in range(_ROUNDS if shared else 1):
@@ -143,11 +144,11 @@ class _System:
         block = grouped_sums(each.reshape(-1, 4), self.place, self.places).reshape(-1, 2, 2) + eye / prior
         inverse, of_place = np.linalg.inv(block), grouped_sums(pull, self.place, self.places)
         own = grouped_sums(each.reshape(-1, 4), self.owner, self.objects).reshape(-1, 2, 2) + eye / self.far
-        matrix = np.zeros((self.objects, 2, self.objects, 2))
-        matrix[np.arange(self.objects), :, np.arange(self.objects)] = own
         both = each[self.first] @ inverse[self.place[self.first]] @ each[self.second]
-        np.subtract.at(matrix, (self.owner[self.first], slice(None), self.owner[self.second]), both)
-        matrix = matrix.reshape(2 * self.objects, -1)
+        pair = self.owner[self.first] * self.objects + self.owner[self.second]
+        blocks = -grouped_sums(both.reshape(-1, 4), pair, self.objects**2).reshape(self.objects, self.objects, 2, 2)
+        blocks[np.arange(self.objects), np.arange(self.objects)] += own
+        matrix = blocks.transpose(0, 2, 1, 3).reshape(2 * self.objects, -1)
         through = (inverse @ of_place[:, :, None])[:, :, 0]
         right = grouped_sums(pull - (each @ through[self.place][:, :, None])[:, :, 0], self.owner, self.objects).ravel()
         moved = np.linalg.solve(matrix, right)
