@@ -54,6 +54,10 @@ _FEWEST = 20
 _NEAR = 30.0
 """The log odds, below those of the likeliest noise, from which a noise is a start. With a larger number, more starts are
 tried, and each takes about a second."""
+_NOISY = 3.0
+"""The least factor on `localization.xy` of noisy places. A noise with exact places counts only if each start leads to one.
+Boxes that err by far more explain few boxes as well, but they are rare, and the sigmas are then too small. With a larger
+factor, a good GPS is taken for a bad detector."""
 _SETTLED = 2
 """How often the objects are searched with the noise of their residuals. A third time gave the same objects on 15 simulated
 streets. A larger number takes longer."""
@@ -135,6 +139,7 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
     near = [one for one in sorted(searched, key=lambda one: one.value) if one.value > best.value - _NEAR]
     starts = {one.noise.place: one for one in near}
     settled = [_settled(part, settings, one, (places, depths, boxes)) for one in starts.values()]
+    settled = [one for one in settled if one.noise.place >= _NOISY] or settled
     evidence = [one.value + gain_of_shared_places(one) for one in settled]
     likely = settled[int(np.argmax(evidence))].noise
     # Of two noises that are about as likely, the one with noisier places gives the larger sigmas.
