@@ -61,6 +61,9 @@ factor, a good GPS is taken for a bad detector."""
 _SETTLED = 2
 """How often the objects are searched with the noise of their residuals. A third time gave the same objects on 15 simulated
 streets. A larger number takes longer."""
+_OTHERS = 2
+"""The number of likeliest noises that are tried if the log with the first one has wrong input. With a larger number, wrong
+input is sooner taken for noise."""
 _CLEAR = 20.0
 """The least growth of the log odds over stray boxes. Dozens of noises are tried, so the odds must grow by far more than by
 chance. With a larger value, a street needs more boxes."""
@@ -109,8 +112,8 @@ def with_sparse_noise(
 def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tuple[SparseNoise, ...], float]:
     """Return the noise of a log's places, depths and boxes with which its boxes show objects at the given poses.
 
-    Also return its lead, in log odds, over the log with turned cameras. The likeliest noise comes last. If a noise that is
-    about as likely has noisier places, it comes first. There is none if no noise explains most of the boxes, far better
+    Also return its lead, in log odds, over the log with turned cameras. The likeliest noise comes first, after one that is
+    about as likely and has the noisiest places. There is none if no noise explains most of the boxes, far better
     than chance and than the noise in the settings. Only noise that the settings let a run estimate is changed. Without
     depths, the noise in the settings is the only one: with noisy places, bearings meet anywhere.
     """
@@ -138,18 +141,19 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
     # The first search hardly tells noises apart. So each noise of places that is about as likely is a start.
     near = [one for one in sorted(searched, key=lambda one: one.value) if one.value > best.value - _NEAR]
     starts = {one.noise.place: one for one in near}
-    settled = [_settled(part, settings, one, (places, depths, boxes)) for one in starts.values()]
-    settled = [one for one in settled if one.noise.place >= _NOISY] or settled
-    evidence = [one.value + gain_of_shared_places(one) for one in settled]
-    likely = settled[int(np.argmax(evidence))].noise
-    # Of two noises that are about as likely, the one with noisier places gives the larger sigmas.
-    others = [one.noise for one, value in zip(settled, evidence, strict=True) if value > max(evidence) - _LEAD]
-    noisy = max(others, key=lambda one: one.place)
-    return ((noisy, likely) if noisy.place > likely.place else (likely,)), lead
+    found = [each for one in starts.values() for each in _settled(part, settings, one, (places, depths, boxes))]
+    found = [one for one in found if one.noise.place >= _NOISY] or found
+    found.sort(key=lambda one: -one.value - gain_of_shared_places(one))
+    evidence = [one.value + gain_of_shared_places(one) for one in found]
+    # Of noises that are about as likely, the one with the noisiest places gives the largest sigmas.
+    about = [one.noise for one, value in zip(found, evidence, strict=True) if value > evidence[0] - _LEAD]
+    noisiest = max(about, key=lambda one: one.place)
+    return (noisiest, *[one.noise for one in found[:_OTHERS] if one.noise != noisiest]), lead
 
 
-def _settled(part: Log, settings: Settings, searched: Searched, unknown: tuple[bool, bool, bool]) -> Searched:
-    """Return the objects of a part of a log with the noise of their residuals. Search and noise are found in turns.
+def _settled(part: Log, settings: Settings, searched: Searched, unknown: tuple[bool, bool, bool]) -> list[Searched]:
+    """Return the objects of a part of a log with the noise of their residuals. Search and noise are found in turns, and the
+    result of each turn is returned, because the noise of boxes may grow until it replaces the noise of places.
 
     A search with too little noise leaves out the rays that miss by much. So the first estimate takes the errors of a place
     as if each ray had its own. This estimate is rather too large, and the next search finds the errors of the places.
@@ -157,12 +161,13 @@ def _settled(part: Log, settings: Settings, searched: Searched, unknown: tuple[b
     """
     prior = settings.noise.prior
     noise = noise_of_residuals(searched, (True, False, False), prior, shared=False)
-    again = search_objects(part, settings, noise, correct_places=True)
-    for _ in range(_SETTLED):
-        if len(again.found.ray):
-            noise = noise_of_residuals(again, unknown, prior, shared=True)
-            again = search_objects(part, settings, noise, correct_places=True)
-    return again
+    turns = [search_objects(part, settings, noise, correct_places=True)]
+    for _ in range(_SETTLED if len(turns[0].found.ray) else 0):
+        noise = noise_of_residuals(turns[-1], unknown, prior, shared=True)
+        turns.append(search_objects(part, settings, noise, correct_places=True))
+        if not len(turns[-1].found.ray):
+            break
+    return turns[1:] or turns
 
 
 def _turned_cameras(log: Log, settings: Settings, progress: Progress) -> Finding | None:
