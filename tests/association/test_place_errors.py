@@ -62,3 +62,12 @@ def test_a_place_whose_rays_have_no_landmark_stays():
     assert np.abs(found.offset[7]).max() < 1e-9
     assert found.sigma[7] == pytest.approx(GPS)
     assert np.array_equal(moments(state), state.obs.frame)
+
+
+def test_many_landmarks_give_the_same_places(monkeypatch):
+    state, _ = street(3)
+    few = place_errors(state)
+    monkeypatch.setattr("objslam.association.few_rays.place_errors._DENSE", 0)
+    many = place_errors(state)
+    np.testing.assert_allclose(many.offset, few.offset, atol=1e-8)
+    np.testing.assert_allclose(many.sigma, few.sigma, rtol=1e-8)
