@@ -96,9 +96,9 @@ MOST_NOISE = 20.0
 """The largest estimated factor on a noise. With a larger factor, wrong units or axes of measurements are taken for noise.
 Real robots have up to 6.3, for odometry that is only the commanded speed."""
 
-MOST_POSE_NOISE = 100.0
-"""The largest estimated factor on `localization.xy` and `localization.yaw`, in joint mode. With the defaults of these
-settings, it allows 2 m, as of a GPS without corrections, and half a radian. With a larger factor, wrong units of a path are
+MOST_POSE_NOISE = 300.0
+"""The largest estimated factor on `localization.xy` and `localization.yaw`. With the defaults of these settings, it allows
+6 m, as of a GPS between houses, and any heading. With a larger factor, wrong units of a path are
 taken for noise."""
 
 NOMINAL = NoiseFactors()

@@ -13,7 +13,7 @@ from objslam.core.estimate import Estimate
 from objslam.core.geometry import inverse
 from objslam.core.types import Association
 
-Why = Literal["fixed", "labels", "association", "merge", "split", "bodies"]
+Why = Literal["fixed", "labels", "association", "merge", "split", "few rays", "bodies"]
 Stage = Literal["grow", "solve"]
 
 
@@ -48,8 +48,8 @@ class Round:
     """One association and the estimate from it.
 
     why: `fixed` for fixed poses, `labels` for one object per label, `association` for a new association at the current
-    poses, `merge` for merged copies of one object, `split` for objects that may be two, `bodies` for bearings to bodies'
-    centres. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) of each ray.
+    poses, `merge` for merged copies of one object, `split` for objects that may be two, `few rays` for objects that few rays
+    show, `bodies` for bearings to bodies' centres. map_T_base: (K, 4, 4). positions: (N, 3) m. weight: (R,) of each ray.
     """
 
     why: Why

@@ -5,13 +5,17 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import in_view
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import interpolate, inverse
+from objslam.core.geometry import evenly_spread, interpolate, inverse
 from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.odometry_bridge import OdometryBridge
 from objslam.frontend.odometry_drift import gathered_drift
+
+_DIRECTIONS = 400
+"""The number of directions in which the views of several cameras are compared. A larger number is more exact and slower."""
 
 
 def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
@@ -89,12 +93,31 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
         base_T_camera=base_T_camera,
         map_T_base=map_T_base,
         localized_every=localized_every,
+        overlap=_overlap(log, camera[valid]),
         odom_T_base=odom_T_base,
         drift=drift,
         stretch=stretch,
         step=step,
         wander=wander,
     ).take(valid)
+
+
+def _overlap(log: Log, camera: Ints) -> float:
+    """Return the share of the images of one moment that can show the same thing. camera: (K,) of each image.
+
+    Of the images that show a direction, seen from far away, this is the share that a mean image has beside it, itself
+    included. A camera that moves on the robot counts as if it were at its `base_T_camera`.
+    """
+    images = np.bincount(camera, minlength=len(log.cameras)) / len(camera)
+    used = np.flatnonzero(images)
+    if len(used) == 1:
+        return 1.0
+    shows = np.zeros(_DIRECTIONS)
+    for index in used.tolist():
+        one = log.cameras[index].camera
+        seen, _ = in_view(one, evenly_spread(_DIRECTIONS) @ one.base_T_camera[:3, :3])
+        shows[seen] += images[index]
+    return float((shows**2).sum() / shows.sum()) if shows.any() else 1.0
 
 
 def with_given_stamps(frames: Keyframes, log: Log) -> Keyframes:

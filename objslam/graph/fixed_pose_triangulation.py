@@ -79,10 +79,12 @@ def noise_up(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
 def noise_of_poses(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
     """Return the standard deviations of localised poses: of headings, rad, and of places, m. 0 without a localisation.
 
-    Keyframes that share one measured pose share its error, so its variance is multiplied by their number. The noise is from
-    the settings, or the larger noise that the log shows.
+    Keyframes that share one measured pose share its error. So its variance is multiplied by the number of those that can
+    show the same thing. The noise is from the settings, or the larger noise that the log shows.
     """
-    share, (yaw, place) = float(np.sqrt(keyframes.localized_every)), keyframes.pose_noise
+    if not keyframes.localized_every:
+        return 0.0, 0.0
+    share, (yaw, place) = float(np.sqrt(max(keyframes.localized_every * keyframes.overlap, 1.0))), keyframes.pose_noise
     return settings.localization.yaw * share * yaw, settings.localization.xy * share * place
 
 

@@ -273,10 +273,11 @@ class JointState:
         assert self.estimate is not None
         return self.estimate.log_evidence
 
-    def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
-        from objslam.association.global_association import associate_globally
-        from objslam.graph.fixed_pose_triangulation import noise_of_poses, noise_up
+    def every_frame(self, map_T_base: Floats) -> tuple[Keyframes, Rays, Floats]:
+        """Return all keyframes (F of them), also without rays, all rays, and map_T_camera (F, 4, 4) of the keyframes.
 
+        Keyframes and rays are corrected by the present shared errors. map_T_base: (K, 4, 4) of the keyframes that have a
+        ray."""
         frames, rays = self.frames, self.all_rays
         if self.errors is not None and self.theta is not None:
             frames, rays, _ = self.errors.take(frames, rays).at(self.theta, drift=False)
@@ -285,6 +286,14 @@ class JointState:
             rays = replace(rays, sigma=np.maximum(rays.sigma, self.all_rays.sigma))
         mine = self.keyframes
         at = correct_poses(frames.stamps, frames.map_T_base, mine.stamps, mine.map_T_base, map_T_base)
+        return frames, rays, at @ frames.base_T_camera
+
+    def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
+        from objslam.association.global_association import associate_globally
+        from objslam.graph.fixed_pose_triangulation import noise_of_poses, noise_up
+
+        frames, rays, map_T_camera = self.every_frame(map_T_base)
+        mine = self.keyframes
         scale = _FIRST if rough else 1.0
         yaw, place = scale * _SOLVED_YAW, scale * _SOLVED_XY
         if rough and mine.localized_every:  # The poses are those of the localisation.
@@ -297,7 +306,7 @@ class JointState:
             frames,
             self.cameras,
             self.settings,
-            map_T_camera=at @ frames.base_T_camera,
+            map_T_camera=map_T_camera,
             sigma=sigma,
             position_sigma=place,
             flat_scale=flat,

@@ -107,7 +107,36 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     assert state.association is not None
     if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
-    return state
+    return _with_few_rays(state)
+
+
+def _with_few_rays(state: JointState) -> JointState:
+    """Return the state with the objects that can be found from few rays.
+
+    Few rays hardly correct the poses before these objects are known. So the search allows for all the noise that the
+    localisation had."""
+    from objslam.association.few_rays.additional_objects import add_few_ray_objects
+    from objslam.graph.fixed_pose_triangulation import flat_noise
+
+    association, estimate = state.association, state.estimate
+    assert association is not None
+    assert estimate is not None
+    frames, rays, map_T_camera = state.every_frame(estimate.map_T_base)
+    sigma, place, scale = flat_noise(rays, frames, state.settings)
+    found = add_few_ray_objects(
+        rays,
+        frames,
+        state.cameras,
+        state.settings,
+        association,
+        np.where(estimate.solved[:, None], estimate.positions, np.nan),
+        map_T_camera=map_T_camera,
+        sigma=sigma,
+        position_sigma=place,
+        seed=state.settings.seed,
+        flat_scale=scale,
+    )
+    return state if found.count == association.count else state.counted(found).solve("few rays", found, state.solved_poses)
 
 
 def _with_clocks(state: JointState) -> JointState:

@@ -12,11 +12,13 @@ from objslam.config import Odometry, Settings
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import adjoint, exp_se3, interpolate, inverse, lift_se2, log_se3, make_pose
+from objslam.core.rotation import rotation_from_vector
 from objslam.core.trajectory import correct_path
 from objslam.core.types import CameraLog, Detections, Log, Trajectory
 from objslam.errors import LogError
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.odometry_drift import add_step, gathered_drift, step_drift
+from objslam.graph.fixed_pose_triangulation import noise_of_poses
 
 FIXED, JOINT = Settings(), Settings(mode="joint")
 MATRIX = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -234,6 +236,25 @@ def test_localized_every_says_how_many_keyframes_share_a_pose(rate, expected):
     log = Log("log", (camera_log("front", 5 + np.arange(200) / 10),), localization=line(np.arange(0, 40 + 1e-9, 1 / rate)))
     settings = Settings.model_validate({"poses": {"max_gap": 3}})
     assert build_keyframes(log, settings, Ledger()).localized_every == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("turns", "expected"), [([0], 1.0), ([0, 0], 1.0), ([0, 90, 180, 270], 0.25), ([0, 0, 180, 180], 0.5)]
+)
+def test_overlap_is_the_share_of_the_cameras_that_see_the_same(turns, expected):
+    """Cameras that look to one side, or to sides that do not overlap. Ten images a second of each, and ten poses."""
+    stamps = 5 + np.arange(200) / 10
+    mounts = [make_pose(rotation_from_vector(np.radians([0.0, float(turn), 0.0])), np.zeros(3)) for turn in turns]
+    log = Log(
+        "log",
+        tuple(camera_log(f"camera{number}", stamps, place=mount) for number, mount in enumerate(mounts)),
+        localization=line(np.arange(0, 40 + 1e-9, 0.1)),
+    )
+    keyframes = build_keyframes(log, Settings(), Ledger())
+    assert keyframes.overlap == pytest.approx(expected)
+    # Of the images that share a measured pose, those of the cameras that see the same thing share its error for this thing.
+    beside = max(len(turns) * expected, 1.0)
+    assert noise_of_poses(keyframes, Settings())[1] == pytest.approx(0.02 * np.sqrt(beside), rel=0.05)
 
 
 NOISY = Odometry(x_per_m=0.03, y_per_m=0.01, xy_per_rad=0.02, yaw_per_m=0.02, yaw_per_rad=0.04)

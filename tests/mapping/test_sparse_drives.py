@@ -28,6 +28,11 @@ def test_a_sparse_drive_has_more_objects_and_hardly_more_false_ones():
     assert found[1] <= without[1] + 0.2 * (found[0] - without[0])
 
 
-def test_joint_mode_does_not_search_for_few_rays():
+def test_joint_mode_finds_them_too():
     log = simulate(preset("demo", **SPARSE, localization=PoseNoise(xy=0.03, yaw=0.01)), 0)
-    assert run(log, "mode=joint").association.few_rays is None
+    found, without = (run(log, "mode=joint", f"association.few_rays={setting}") for setting in ("true", "false"))
+    assert found.association.few_rays.any()
+    assert without.association.few_rays is None
+    more, fewer = (evaluate(one.map, log.truth, align="none", radius=1.0).to_dict() for one in (found, without))
+    assert more["matched"] > fewer["matched"]
+    assert more["false"] <= fewer["false"] + 1

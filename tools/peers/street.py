@@ -53,7 +53,7 @@ class Street:
     def settings(self, told: bool) -> Settings:
         """Return the settings of a run. told: whether they say the true noise. Else they say that of the defaults."""
         noise = {
-            "localization": {"xy": self.gps / np.sqrt(len(_TURNS)), "yaw": 1e-3},
+            "localization": {"xy": self.gps, "yaw": 1e-3},
             "rays": {"pixel_sigma": self.bearing * _FOCAL, "box_sigma": 0.0},
             "depth": {"sigma": 1e-3, "sigma_per_m": _DEPTH, "bias": 0.0},
         }

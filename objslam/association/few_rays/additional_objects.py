@@ -63,10 +63,15 @@ def add_few_ray_objects(
 ) -> Association:
     """Add the objects that can be found from a few unassigned rays. They come after the other objects.
 
+    The association stays as it is if the poses are not localised, if the settings do not allow the search, or if the
+    association has no probability that its objects exist.
+
     rays, keyframes: all observed frames and their rays. positions: (N, 3) m of the objects, NaN where unknown.
     map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, position_sigma: m, the noise of the rays' angles and origins.
     flat_scale: as in `associate_globally`.
     """
+    if association.existence is None or not (settings.association.few_rays and keyframes.localized_every):
+        return association
     noise = sigma, position_sigma, flat_scale
     few, ray = _few(rays, keyframes, cameras, settings, association, positions, map_T_camera, noise)
     few, found = few.search(settings.association.min_existence, seed)
@@ -74,13 +79,13 @@ def add_few_ray_objects(
     index = association.object.copy()
     index[ray[few.free]] = np.where(found.matched < 0, -1, found.matched + old)
     weights = found.label_count / np.maximum(found.ray_count, 1)[:, None]
-    before = association.label_weights, association.existence
+    shares = association.label_weights
     return replace(
         association,
         object=index,
         label=np.append(association.label, found.label),
-        label_weights=None if before[0] is None else np.concatenate([before[0], weights]),
-        existence=None if before[1] is None else np.append(before[1], few.existence(found)),
+        label_weights=None if shares is None else np.concatenate([shares, weights]),
+        existence=np.append(association.existence, few.existence(found)),
         few_rays=np.arange(old + new) >= old,
     )
 

@@ -124,7 +124,7 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
     if not any(len(c.detections.frame_stamps) for c in log.cameras if c.detections is not None):
         return Diagnosis(tuple(findings))
     part = bounded_part(log, settings)
-    if part.crowd > _CROWD or (settings.mode == "fixed" and coarse(settings)):
+    if part.crowd > _CROWD or (log.localization is not None and coarse(settings)):
         return Diagnosis(tuple(findings))
     found = agreement(part, part.log, settings)
     trials: list[Trial] = []

@@ -108,15 +108,13 @@ class FixedPoses:
         )
 
     def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
-        """Add the objects that can be found from few rays, if the poses are localised and the settings allow it.
+        """Add the objects that can be found from few rays.
 
         estimate: the estimate of the objects, None if there are none. more: as in `associate`."""
         from objslam.association.few_rays.additional_objects import add_few_ray_objects
         from objslam.graph.fixed_pose_triangulation import flat_noise
 
         settings = self.settings
-        if association.existence is None or not (settings.association.few_rays and self.frames.localized_every):
-            return association
         sigma, place, scale = flat_noise(self.rays, self.frames, settings)
         placed = np.zeros((0, 3)) if estimate is None else np.where(estimate.solved[:, None], estimate.positions, np.nan)
         return add_few_ray_objects(

@@ -9,6 +9,7 @@ residuals of the objects (`residual_noise`), from several starts.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -27,8 +28,10 @@ from objslam.mapping.fixed.few_box_search import Searched, SparseNoise, middle, 
 from objslam.mapping.fixed.residual_noise import gain_of_shared_places, noise_of_residuals
 from objslam.mapping.progress import Progress
 
-_PLACES = (1.0, 3.0, 10.0, 30.0, 100.0)
+_PLACES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 """The factors on `localization.xy` that are tried first. More factors find more, and take longer."""
+_BETWEEN = (0.55, 1.8)
+"""The factors on the likeliest noise of places that are tried as well, halfway to its neighbours among `_PLACES`."""
 _RANGES = (1.0, 3.0, 8.0)
 """The factors on the noise of depths that are tried first."""
 _RAYS = (1.0, 4.0)
@@ -80,7 +83,7 @@ def with_sparse_noise(
     Otherwise the settings and the diagnosis are returned unchanged.
     """
     boxes = sum(len(one.detections) for one in log.cameras if one.detections is not None)
-    if settings.mode != "fixed" or diagnosis.certain or log.localization is None or boxes < _FEWEST:
+    if diagnosis.certain or log.localization is None or boxes < _FEWEST:
         return settings, diagnosis
     accused = any(one.name == DISAGREE for one in diagnosis.findings)
     if diagnosis.spoilt if coarse(settings) else not accused:
@@ -139,6 +142,8 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
     if nominal or not places:
         return (best.noise,), lead
     # The first search hardly tells noises apart. So each noise of places that is about as likely is a start.
+    between = [replace(best.noise, place=max(best.noise.place * factor, 1.0)) for factor in _BETWEEN]
+    searched += [search_objects(part, settings, noise) for noise in between]
     near = [one for one in sorted(searched, key=lambda one: one.value) if one.value > best.value - _NEAR]
     starts = {one.noise.place: one for one in near}
     found = [each for one in starts.values() for each in _settled(part, settings, one, (places, depths, boxes))]

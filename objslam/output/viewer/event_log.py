@@ -23,6 +23,7 @@ _WHY = {
     "association": "association at the latest poses",
     "merge": "merge of objects that the new poses move together",
     "split": "split of objects that may be two",
+    "few rays": "objects that few rays show",
     "bodies": "bearings to the centres of bodies",
 }
 """The words that the log shows for the reason of each round."""
