@@ -12,7 +12,8 @@ from objslam.core.types import Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.unexplained import warn_of_unexplained
-from objslam.mapping.fixed.fixed_poses import FixedPoses, associate_fixed, calibrate_fixed
+from objslam.mapping.fixed.camera_calibration import calibrate_fixed
+from objslam.mapping.fixed.fixed_poses import FixedPoses, associate_fixed
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, seen_something, without_errors
 

@@ -19,7 +19,12 @@ from objslam.errors import SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
-from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, linearise_points, noise_of_errors
+from objslam.graph.calibration.fixed_pose_calibration import (
+    calibrate_at_poses,
+    linearise_points,
+    noise_beside_objects,
+    noise_of_errors,
+)
 from objslam.graph.fixed_pose_triangulation import noise_of_poses, triangulate_at
 from objslam.simulation import PoseNoise, make_camera, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
@@ -160,6 +165,38 @@ def test_the_rays_vary_as_the_errors_do():
     found = noise_of_errors(errors, Calibration(names, np.zeros(4), covariance, np.ones(4)))
     directions = errors.rays.in_map(errors.keyframes.map_T_camera)[1]
     assert_allclose(found, 0.02 * np.linalg.norm(directions[:, :2], axis=1), rtol=1e-3)  # about the vertical axis
+
+
+def test_an_error_that_only_moves_the_map_lets_no_ray_miss_its_object():
+    """On a straight drive, a clock that is off turns rays in the map, but all objects move with them."""
+    errors, association, start = parts(straight(0.1))
+    found = calibrate_at_poses(errors, association, start, errors.mean, noise(errors))
+    positions = start + found.sensitivity @ (found.calibration.values - errors.mean)
+    beside, turned = noise_beside_objects(errors, found, association, positions), noise_of_errors(errors, found.calibration)
+    assert np.median(beside) < 0.25 * np.median(turned)
+    alone = replace(association, object=np.where(np.arange(len(errors.rays)) % 2, association.object, -1))
+    half = noise_beside_objects(errors, found, alone, positions)
+    assert_allclose(half[1::2], beside[1::2])
+    assert_allclose(half[::2], np.sqrt(np.median(beside[1::2] ** 2)))
+
+
+def test_what_is_left_scatters_rays_beside_their_objects_as_it_says():
+    """The misses of the rays, if the errors are drawn from their covariance, and the objects follow."""
+    errors, association, start = parts(straight(0.0))
+    found = calibrate_at_poses(errors, association, start, errors.mean, noise(errors))
+    values, rng = found.calibration.values, np.random.default_rng(0)
+    positions = start + found.sensitivity @ (values - errors.mean)
+    told, squares = noise_beside_objects(errors, found, association, positions), np.zeros(len(errors.rays))
+
+    def misses(step):
+        keyframes, rays, _ = errors.at(values + step, drift=False)
+        origins, directions = rays.in_map(keyframes.map_T_camera)
+        to = (positions + found.sensitivity @ step)[association.object] - origins
+        return directions - to / np.linalg.norm(to, axis=1, keepdims=True)
+
+    for step in rng.multivariate_normal(np.zeros(len(values)), found.calibration.covariance, 400):
+        squares += ((misses(step) - misses(0 * step)) ** 2).sum(axis=1) / 400
+    assert_allclose(np.median(told), np.median(np.sqrt(squares)), rtol=0.15)
 
 
 def test_rays_that_err_together_count_less():

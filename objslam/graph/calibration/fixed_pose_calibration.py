@@ -111,6 +111,35 @@ def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) ->
     return np.sqrt(variance)
 
 
+def noise_beside_objects(
+    errors: CalibratedMeasurements, found: FixedCalibration, association: Association, positions: Floats
+) -> Floats:
+    """Return the standard deviations (R,), rad, with which rays miss their objects because of the errors that are left.
+
+    The objects move with the errors, as far as they can: if the camera is turned, all objects turn with it, and their rays
+    still meet. So this is far less than `noise_of_errors` if an error only moves the map. A ray without an object gets the
+    median of the other rays. positions: (N, 3) m at the calibrated errors, NaN for an object without a position.
+    """
+    values, owner = found.calibration.values, association.object
+    held = np.append(np.isfinite(positions[:, 0]), False)[owner]  # Index -1 (no object) takes the last entry.
+    if not held.any():
+        return noise_of_errors(errors, found.calibration)
+
+    def missed(step: Floats) -> Floats:
+        keyframes, rays, _ = errors.at(values + step, drift=False)
+        origins, directions = rays.in_map(keyframes.map_T_camera)
+        to = (positions + found.sensitivity @ step)[owner[held]] - origins[held]
+        return np.asarray(directions[held] - to / np.linalg.norm(to, axis=1, keepdims=True))
+
+    size, axes = np.linalg.eigh(found.calibration.covariance)
+    variance = np.zeros(int(held.sum()))
+    for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
+        variance += ((missed(step) - missed(-step)) ** 2).sum(axis=1) / 4
+    every = np.full(len(held), float(np.median(variance)))
+    every[held] = variance
+    return np.sqrt(every)
+
+
 def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
     """Return the small angles (R,), rad, by which rays in map turn between two values (P,) of the shared errors."""
     ends = []

@@ -1,4 +1,4 @@
-"""Find objects and their positions at given poses. A calibration of the cameras can alternate with this."""
+"""Find objects and their positions at given poses."""
 
 from __future__ import annotations
 
@@ -10,25 +10,21 @@ import numpy as np
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.config import Settings
 from objslam.core.arrays import Floats
-from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
-from objslam.core.diagnostics import Ledger
 from objslam.core.noise import NoiseFactors
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.fixed.pose_noise import noise_in_frames
 from objslam.mapping.progress import Progress
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
-    from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
-_ROUNDS = 12
+MOST_ROUNDS = 12
 """The most rounds of association and calibration. Two or three are usual. A clock that is off by a second moves by 0.03 s in
 a round, so it reaches its bound after ten rounds. A larger number is slower for logs that do not settle."""
-_SAME = 0.05
+SAME = 0.05
 """An association is repeated only if ray directions or their noise are new: they differ from each earlier round by more than
 this share of the noise. A smaller change moves hardly any ray across a gate, and a cycle of rounds repeats itself. A larger
 share ends sooner. A limit in standard deviations of the shared errors does not work: with precise errors, the association
@@ -37,10 +33,6 @@ _FIRST = 0.05
 """The noise (rad) of ray directions that is added to the noise in the settings, for the association from which the noise of
 the poses is taken. The priors of the shared errors of a camera allow errors of about this size. With a larger value, near
 objects become one, and then their rays show nothing of the poses."""
-_EXPLAINED = 0.5
-"""If an association with wide gates explains at most this share of the rays, a second association with narrow gates is
-tried. The second is taken if the first explains less than this share of the rays that the second explains. With a larger
-share, the second is tried and taken more often."""
 
 
 @dataclass(frozen=True)
@@ -163,137 +155,36 @@ def associate_fixed(
         progress("association, first", 0, 0)
         wide = at.associate(_FIRST)
         solved = at.solve(wide, None)
-        at = at.with_noise_of_poses(at.noise_of_poses(wide, _placed(solved), solved.weight))
-    for number in range(_ROUNDS):
+        at = at.with_noise_of_poses(at.noise_of_poses(wide, placed_objects(solved), solved.weight))
+    for number in range(MOST_ROUNDS):
         progress("association" if number == 0 else f"association, round {number + 1}", 0, 0)
         association = at.associate()
         rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = at.solve(association, trace)
         earlier.append(at.seen.pose_noise)
-        found = at.noise_of_poses(association, _placed(estimate), estimate.weight)
+        found = at.noise_of_poses(association, placed_objects(estimate), estimate.weight)
         if any(_same_noise(found, before) for before in earlier):
             break
         at = at.with_noise_of_poses(found)
     every_object = at.add_few(association, estimate)
     if every_object.count > association.count:
         association, estimate = every_object, at.solve(every_object, trace)
-    return at, association, _with_noise(estimate, at), rounds if len(rounds) > 1 else ()
+    return at, association, with_noise_of(estimate, at), rounds if len(rounds) > 1 else ()
 
 
-def calibrate_fixed(
-    at: FixedPoses, errors: SharedErrors, ledger: Ledger, progress: Progress, trace: Trace | None
-) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
-    """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
-
-    The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
-    The covariance of the errors is added to the covariance of the objects. Returns the input without the errors, the
-    association, the estimate, and the number of objects in each round. If the errors cannot be estimated, they stay as they
-    were, and the ledger gets a warning.
-    """
-    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses, noise_of_errors, turned_by_errors
-    from objslam.graph.fixed_pose_triangulation import largest_noise
-
-    calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
-    every = errors.take(at.frames, at.rays)
-    told = noise_of_errors(every, calibration)
-    rounds: tuple[dict[str, int], ...] = ()
-    earlier: list[tuple[Floats, Floats]] = []
-    for number in range(_ROUNDS):
-        progress(f"association, round {number + 1}", 0, 0)
-        now = at.without(errors, calibration.values)
-        association = now.associate(told)
-        if (plain := _explains_far_more(now, association)) is not None:
-            association = plain
-        rounds = (*rounds, {"objects": association.count})
-        progress("solve", 0, 0)
-        estimate = now.solve(association, trace, _parameters(calibration))
-        placed, noise = _placed(estimate), largest_noise(now.seen, now.settings)
-        try:
-            found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
-        except SolveError as error:
-            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
-            every_object = now.add_few(association, estimate, told)
-            if every_object.count > association.count:
-                association, estimate = every_object, now.solve(every_object, trace, _parameters(calibration))
-            return now, association, replace(estimate, calibration=calibration), rounds
-        earlier.append((calibration.values, np.hypot(_own(now), told)))
-        moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
-        calibration, told = found.calibration, noise_of_errors(every, found.calibration)
-        corrected = at.without(errors, calibration.values)
-        at = at.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
-        allowed = np.hypot(_own(at), told)
-        if any(
-            _rms(turned_by_errors(every, values, calibration.values) / before) < _SAME and _rms(allowed / before - 1) < _SAME
-            for values, before in earlier
-        ):
-            break
-    else:
-        ledger.warn(f"the shared errors still change after {_ROUNDS} rounds of association")
-    now = at.without(errors, calibration.values)
-    estimate = now.solve(association, trace, _parameters(calibration))
-    every_object = now.add_few(association, estimate, told)
-    if every_object.count > association.count:
-        association = every_object
-        estimate = now.solve(association, trace, _parameters(calibration))
-        noise = largest_noise(now.seen, now.settings)
-        sensitivity = calibrate_at_poses(errors, association, _placed(estimate), calibration.values, noise).sensitivity
-        found = replace(found, sensitivity=sensitivity)
-    return now, association, _with_noise(_with_covariance(estimate, found), now), rounds
-
-
-def _placed(estimate: Estimate) -> Floats:
+def placed_objects(estimate: Estimate) -> Floats:
     """Return the positions (N, 3), m, NaN for an object without one."""
     return np.where(estimate.solved[:, None], estimate.positions, np.nan)
 
 
-def _own(at: FixedPoses) -> Floats:
-    """Return the standard deviations (R,), rad, of ray directions, from the noise of rays and of headings."""
-    from objslam.graph.fixed_pose_triangulation import pose_noise
-
-    return pose_noise(at.rays_seen, at.seen, at.settings)[0]
-
-
 def _same_noise(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    return all(abs(a - b) < _SAME * b for a, b in zip(one, other, strict=True))
+    return all(abs(a - b) < SAME * b for a, b in zip(one, other, strict=True))
 
 
-def _with_noise(estimate: Estimate, at: FixedPoses) -> Estimate:
+def with_noise_of(estimate: Estimate, at: FixedPoses) -> Estimate:
     """Return an estimate that names the noise of the poses, if the log shows more than the settings say."""
     heading, place = at.seen.pose_noise
     if heading == place == 1.0:
         return estimate
     return replace(estimate, noise=NoiseFactors(heading=heading, place=place))
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt((values**2).mean()))
-
-
-def _explains_far_more(at: FixedPoses, wide: Association) -> Association | None:
-    """Return an association that allows for no shared errors, if it explains far more rays than the association `wide`.
-
-    None if it does not, or if `wide` explains more than half of the rays (`_EXPLAINED`). `wide` allows for shared errors,
-    which may be many times the noise of a ray. On a short drive among many objects of one label, such wide gates confuse all
-    objects. If the true errors are small, the objects are found without this allowance.
-    """
-    explained = (wide.object >= 0).sum()
-    if explained > _EXPLAINED * len(wide.object):
-        return None
-    plain = at.associate()
-    return plain if (plain.object >= 0).sum() > explained / _EXPLAINED else None
-
-
-def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
-    """Return an estimate with the covariance of the shared errors added to its objects."""
-    from objslam.graph.posterior.marginals import largest_sigma
-
-    told = found.calibration
-    covariance = estimate.covariance + found.sensitivity @ told.covariance @ np.swapaxes(found.sensitivity, 1, 2)
-    covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
-    sigma, correlated = largest_sigma(covariance), np.nan_to_num(found.sensitivity @ told.root)
-    return replace(estimate, covariance=covariance, seen_sigma=sigma, calibration=told, correlated=correlated)
-
-
-def _parameters(calibration: Calibration) -> Parameters:
-    return Parameters(calibration.names, calibration.values, calibration.sigma)

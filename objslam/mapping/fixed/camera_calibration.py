@@ -1,0 +1,195 @@
+"""Calibrate the cameras at known poses, in turns with the search for objects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.calibration import Calibration
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import angles_off
+from objslam.core.trace import Parameters, Trace
+from objslam.core.types import Association
+from objslam.errors import SolveError
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.fixed.fixed_poses import MOST_ROUNDS, SAME, FixedPoses, placed_objects, with_noise_of
+from objslam.mapping.progress import Progress
+
+if TYPE_CHECKING:
+    from objslam.core.estimate import Estimate
+    from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
+
+_NARROWER = (0.3, 0.0)
+"""What narrower first associations allow for, as shares of the uncertainty of the errors. They are tried on logs that fit
+poorly. Each share more takes as long as an association."""
+_FITS = 2.0
+"""The mean squared miss of a ray, in variances of its noise, up to which the widest association is taken without trying
+others. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take the time
+for others, and rows of equal things are confused more often."""
+_CLEARLY = 1.0
+"""By how much a narrower association must lower -2 ln of the probability of a mean ray, to be taken. The right one lowers it
+by 2.1 to 6.1 in simulated orchards and shelves. Noisy poses let one thing look like several. There, a wrong one lowers it by
+up to 0.8. With a smaller value, noisy poses split more things."""
+_OUTLIER = 13.8
+"""The squared miss of a ray without an object, and the largest one of others. Of rays with the noise of the settings, one in
+a thousand misses by more. A larger value favours associations with more rays."""
+
+
+def calibrate_fixed(
+    at: FixedPoses, errors: SharedErrors, ledger: Ledger, progress: Progress, trace: Trace | None
+) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
+    """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
+
+    The association allows for the present uncertainty of the errors: first their prior, then what the covariance of the last
+    fit moves rays off their objects. The covariance of the errors is added to the covariance of the objects. Returns the
+    input without the errors, the association, the estimate, and the number of objects in each round. If the errors cannot be
+    estimated, they stay as they were, and the ledger gets a warning.
+    """
+    from objslam.graph.calibration.fixed_pose_calibration import (
+        calibrate_at_poses,
+        noise_beside_objects,
+        noise_of_errors,
+        turned_by_errors,
+    )
+    from objslam.graph.fixed_pose_triangulation import largest_noise
+
+    calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
+    every = errors.take(at.frames, at.rays)
+    told = noise_of_errors(every, calibration)
+    rounds: tuple[dict[str, int], ...] = ()
+    earlier: list[tuple[Floats, Floats]] = []
+    for number in range(MOST_ROUNDS):
+        progress(f"association, round {number + 1}", 0, 0)
+        now = at.without(errors, calibration.values)
+        association = now.associate(told) if number else _first_association(at, errors, calibration, told)
+        rounds = (*rounds, {"objects": association.count})
+        progress("solve", 0, 0)
+        estimate = now.solve(association, trace, _parameters(calibration))
+        placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
+        try:
+            found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
+        except SolveError as error:
+            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+            every_object = now.add_few(association, estimate, told)
+            if every_object.count > association.count:
+                association, estimate = every_object, now.solve(every_object, trace, _parameters(calibration))
+            return now, association, replace(estimate, calibration=calibration), rounds
+        earlier.append((calibration.values, np.hypot(_own(now), told)))
+        moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
+        calibration, told = found.calibration, noise_beside_objects(errors, found, association, moved)
+        corrected = at.without(errors, calibration.values)
+        at = at.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
+        allowed = np.hypot(_own(at), told)
+        if any(
+            _rms(turned_by_errors(every, values, calibration.values) / before) < SAME and _rms(allowed / before - 1) < SAME
+            for values, before in earlier
+        ):
+            break
+    else:
+        ledger.warn(f"the shared errors still change after {MOST_ROUNDS} rounds of association")
+    now = at.without(errors, calibration.values)
+    estimate = now.solve(association, trace, _parameters(calibration))
+    every_object = now.add_few(association, estimate, told)
+    if every_object.count > association.count:
+        association = every_object
+        estimate = now.solve(association, trace, _parameters(calibration))
+        noise = largest_noise(now.seen, now.settings)
+        sensitivity = calibrate_at_poses(
+            errors, association, placed_objects(estimate), calibration.values, noise
+        ).sensitivity
+        found = replace(found, sensitivity=sensitivity)
+    return now, association, with_noise_of(_with_covariance(estimate, found), now), rounds
+
+
+def _first_association(at: FixedPoses, errors: SharedErrors, calibration: Calibration, told: Floats) -> Association:
+    """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
+
+    told: (R,) rad, the uncertainty of ray directions because of the errors. An association that allows for it is right if
+    things are far apart. In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a
+    wrong distance. Then a narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the
+    associations are compared by how likely the rays are after a calibration. A narrower one has to be clearly better.
+    """
+    now = at.without(errors, calibration.values)
+    wide = now.associate(told)
+    best = wide
+    missed, least = _left_calibrated(at, errors, calibration, wide)
+    if missed <= _FITS:
+        return wide
+    least -= _CLEARLY
+    for share in _NARROWER:
+        narrow = now.associate(share * told)
+        _, left = _left_calibrated(at, errors, calibration, narrow)
+        if left < least:
+            best, least = narrow, left
+    return best
+
+
+def _left_calibrated(
+    at: FixedPoses, errors: SharedErrors, calibration: Calibration, association: Association
+) -> tuple[float, float]:
+    """Return what a calibration by an association leaves (`_left`). Infinities if the association does not allow it."""
+    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
+    from objslam.graph.fixed_pose_triangulation import largest_noise
+
+    now = at.without(errors, calibration.values)
+    estimate = now.solve(association, None)
+    placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
+    try:
+        found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
+    except SolveError:
+        return float("inf"), float("inf")
+    moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
+    then = at.without(errors, found.calibration.values)
+    return _left(then.with_noise_of_poses(then.noise_of_poses(association, moved, estimate.weight)), association, moved)
+
+
+def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:
+    """Return the squared miss, in variances, and -2 ln of the probability, up to a constant, of a mean ray.
+
+    More noise than the settings say counts as a miss, as in the normal distribution. If there are more objects of a label,
+    its rays can belong to more of them, and each is less likely. An object costs as in the Bayesian information criterion
+    (Schwarz 1978). at: with the noise of the poses. positions: (N, 3) m, NaN for an object without a position.
+    """
+    from objslam.graph.fixed_pose_triangulation import pose_noise
+
+    of_ray = np.append(positions, np.full((1, 3), np.nan), axis=0)[association.object]  # Index -1 (no object): the last one.
+    origin, direction = at.rays_seen.in_map(at.seen.map_T_camera)
+    distance = np.maximum(np.linalg.norm(of_ray - origin, axis=1), 1e-9)
+    usual = replace(at.seen, pose_noise=(1.0, 1.0))
+    noises = [pose_noise(at.rays_seen, frames, at.settings) for frames in (at.seen, usual)]
+    sigma, least = (np.hypot(angle, place / distance) for angle, place in noises)
+    squared = (angles_off(origin, direction, of_ray) / sigma) ** 2 + 4 * np.log(sigma / least)
+    missed = np.fmin(squared, _OUTLIER)
+    number = np.bincount(association.object[association.object >= 0], minlength=association.count)
+    choices = np.append(np.bincount(association.label)[association.label], 1)[association.object] if len(number) else 1
+    cost = missed.sum() + 2 * np.log(choices).sum() + 3 * np.log(np.maximum(number, 1)).sum()
+    return float(missed.mean()), float(cost / len(missed))
+
+
+def _own(at: FixedPoses) -> Floats:
+    """Return the standard deviations (R,), rad, of ray directions, from the noise of rays and of headings."""
+    from objslam.graph.fixed_pose_triangulation import pose_noise
+
+    return pose_noise(at.rays_seen, at.seen, at.settings)[0]
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt((values**2).mean()))
+
+
+def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
+    """Return an estimate with the covariance of the shared errors added to its objects."""
+    from objslam.graph.posterior.marginals import largest_sigma
+
+    told = found.calibration
+    covariance = estimate.covariance + found.sensitivity @ told.covariance @ np.swapaxes(found.sensitivity, 1, 2)
+    covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
+    sigma, correlated = largest_sigma(covariance), np.nan_to_num(found.sensitivity @ told.root)
+    return replace(estimate, covariance=covariance, seen_sigma=sigma, calibration=told, correlated=correlated)
+
+
+def _parameters(calibration: Calibration) -> Parameters:
+    return Parameters(calibration.names, calibration.values, calibration.sigma)
