@@ -86,9 +86,6 @@ def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: L
     if settings.mode == "fixed" and log.localization is None:
         hint = "the log needs localisation, or give --mode joint"
         raise ConfigError("nothing to calibrate", where=str(path), hint=hint)
-    if log.odometry is None and settings.calibration.use == "auto":
-        hint = "the log needs odometry, or give --set calibration.use=true"
-        raise ConfigError("nothing to calibrate", where=str(path), hint=hint)
     result = pipeline.run(log, settings, ledger, show)
     if result.calibration is None:
         raise SolveError("nothing was calibrated", where=str(path), hint="; ".join(ledger.warnings) or None)

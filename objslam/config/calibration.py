@@ -10,9 +10,9 @@ class CalibrationSettings(Section):
     error. With 0, the error is not estimated: it is 0, or the value in `file`."""
 
     use: Literal["auto"] | bool = "auto"
-    """auto: in joint mode, estimate all errors if the log has odometry. In fixed mode, estimate the errors of cameras if the
-    log has a localisation. If base_T_camera is the identity, the poses are those of the camera, so its rotation and place
-    are not estimated. true: estimate them too, and in joint mode also without odometry. false: never estimate."""
+    """auto: in joint mode, estimate all errors. In fixed mode, estimate the errors of cameras if the log has a localisation
+    that is not coarse. If base_T_camera is the identity, the poses are those of the camera, so its rotation and place are
+    not estimated. true: estimate them too, and in fixed mode also from coarse poses. false: never estimate."""
     file: str | None = None
     """a file of `objslam calibrate`, or the summary.json of a run. Its values and covariance are the prior of its errors. An
     error of the file that is not estimated keeps its value from the file."""
@@ -34,7 +34,8 @@ class CalibrationSettings(Section):
     roll: NotNegative = 0.02
     """rad; the rotation of each camera on the base about the forward axis."""
     translation: Literal["auto"] | NotNegative = "auto"
-    """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode, 0 in joint mode."""
+    """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode, and in joint mode
+    without odometry, else 0."""
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
     tag_scale: NotNegative = 0.01

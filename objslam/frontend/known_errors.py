@@ -16,12 +16,12 @@ from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
 from objslam.io.calibration_yaml import load_calibration
 
 _PRIORS = {"translation": 0.05, "focal": 0.02, "centre": 0.02}
-"""The prior standard deviations that `auto` means in fixed mode. The first (m) is for a place that was measured with a
-ruler. The second (a share) is for a field of view from a data sheet. The third (a share of the focal length) is for an image
-centre that is assumed in the middle of the image. A calibrated camera errs less. With larger values, a log must show more
-before an error counts as known."""
+"""The prior standard deviations that `auto` means: the first in fixed mode and in joint mode without odometry, the others in
+fixed mode. The first (m) is for a place that was measured with a ruler. The second (a share) is for a field of view from a
+data sheet. The third (a share of the focal length) is for an image centre that is assumed in the middle of the image. A
+calibrated camera errs less. With larger values, a log must show more before an error counts as known."""
 COARSE = 0.3
-"""Given poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
+"""Fixed poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
 
@@ -33,35 +33,46 @@ def error_names(log: Log) -> tuple[str, ...]:
     return (*odometry, *cameras, "range_scale", "tag_scale")
 
 
-def prior_sigma(name: str, settings: Settings) -> float:
+def against_given_poses(log: Log, settings: Settings) -> bool:
+    """Return whether the errors of cameras are found against the poses of a localisation alone.
+
+    So it is in fixed mode, and in joint mode without odometry. Then a wrong place of a camera moves all objects.
+    """
+    return settings.mode == "fixed" or (log.odometry is None and log.localization is not None)
+
+
+def prior_sigma(name: str, settings: Settings, given_poses: bool) -> float:
     """Return the prior standard deviation of an error in the settings, in the unit of the error, 0 if the error is fixed.
 
-    In fixed mode, the errors are estimated from bearings and given poses. So errors of lengths and of odometry are fixed.
+    In fixed mode, the errors are estimated from bearings and given poses. So errors of lengths and of odometry are fixed. In
+    joint mode, "auto" fixes the lens: poses that may move also explain what a lens does, and a lens that may err makes a
+    wrong association fit. given_poses: what `against_given_poses` returns for the log.
     """
-    what = kind(name)
-    if settings.mode == "fixed" and (name in ODOMETRY or what in ("range_scale", "tag_scale")):
+    what, fixed = kind(name), settings.mode == "fixed"
+    if fixed and (name in ODOMETRY or what in ("range_scale", "tag_scale")):
         return 0.0
     setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
     sigma = getattr(settings.calibration, setting)
     if sigma == "auto":
-        return _PRIORS[setting] if settings.mode == "fixed" else 0.0
+        return _PRIORS[setting] if (given_poses if setting == "translation" else fixed) else 0.0
     return float(sigma)
 
 
 def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
     """Return whether the shared errors of a log are estimated.
 
-    odometry: whether it is used. localized: whether there is a localisation. In fixed mode, errors are estimated from known
-    poses, which only a localisation gives. In joint mode, calibration.use decides, and "auto" needs odometry.
+    odometry: whether it is used. localized: whether there is a localisation. calibration.use decides. With "auto", fixed
+    mode needs a localisation that is not coarse. In joint mode, each pose counts by its noise, so a coarse localisation
+    tells little, but nothing wrong.
     """
     use = settings.calibration.use
     if settings.mode == "fixed":
         return localized and (use is True or (use == "auto" and not coarse(settings)))
-    return odometry if use == "auto" else use
+    return (odometry or localized) if use == "auto" else use
 
 
 def coarse(settings: Settings) -> bool:
-    """Return whether given poses err too much to reveal an error of a camera."""
+    """Return whether fixed poses err too much to reveal an error of a camera."""
     return settings.localization.xy >= COARSE
 
 
@@ -72,10 +83,10 @@ def possible(log: Log, settings: Settings) -> list[str]:
     position have no errors, unless settings.calibration.use is true. In fixed mode its lens has no errors either, because
     such poses come from images of this lens, or were calibrated with it.
     """
-    asked = settings.calibration.use is True
+    asked, given_poses = settings.calibration.use is True, against_given_poses(log, settings)
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
     mounted = (*AXES, "x", "y", "z", *(LENS if settings.mode == "fixed" else ()))
-    names = [n for n in error_names(log) if prior_sigma(n, settings) > 0]
+    names = [n for n in error_names(log) if prior_sigma(n, settings, given_poses) > 0]
     return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
 
 

@@ -23,7 +23,7 @@ from objslam.frontend.corrected_log import (
     refocused,
     take_out,
 )
-from objslam.frontend.known_errors import estimates, known_errors, possible, prior_sigma
+from objslam.frontend.known_errors import against_given_poses, estimates, known_errors, possible, prior_sigma
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
 
@@ -333,7 +333,8 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
         }
         names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
     mean = np.zeros(len(names))
-    prior = np.diag([prior_sigma(name, settings) ** 2 for name in names]).reshape(len(names), len(names))
+    sigma = np.array([prior_sigma(name, settings, against_given_poses(log, settings)) for name in names])
+    prior = np.diag(sigma**2).reshape(len(names), len(names))
     known = known_errors(settings) if names else None
     if known is not None:
         here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T

@@ -944,13 +944,15 @@ def test_a_calibration_of_before_is_no_news(objslam, tmp_path, late_camera):
     np.testing.assert_allclose((again.sigma / known.sigma)[:-1][told], np.sqrt(0.5), atol=0.1)
 
 
-def test_calibrate_without_odometry_says_what_it_needs(objslam, tmp_path):
+def test_calibrate_in_joint_mode_needs_no_odometry(objslam, tmp_path):
     log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
-    write_log_folder(log, tmp_path / "log")
-    done = objslam("calibrate", str(tmp_path / "log"), "-o", str(tmp_path / "robot.yaml"))
-    assert done.code == 2
-    assert "nothing to calibrate" in done.err
-    assert not (tmp_path / "robot.yaml").exists()
+    write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / "log")
+    file = tmp_path / "robot.yaml"
+    done = objslam("calibrate", str(tmp_path / "log"), "-o", str(file))
+    assert done.code == 0, done.err
+    found = load_calibration(file)
+    clock = found.names.index("front.clock")
+    assert abs(found.values[clock] - 0.15) < 4 * found.sigma[clock]
 
 
 def test_calibrate_at_known_poses_and_run_with_what_it_found(objslam, tmp_path):

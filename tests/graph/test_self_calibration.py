@@ -231,6 +231,21 @@ def test_below_ties_the_path_is_the_instrument_of_the_clock():
     assert 0.2 < found[7][1] <= found[7][0] <= 1
 
 
+def test_a_longer_focal_length_is_not_asked_for_by_misfit():
+    """The slope of the cost of rays that fit badly, against the costs at two focal lengths of the same poses and points."""
+    made, errors = drive({}, overrides=("calibration.focal=0.02",), frames=200, false=0.0, pixel_sigma=12.0)
+    theta, every = np.zeros(len(errors.names)), np.ones(len(made.rays), dtype=bool)
+    k, true = errors.names.index("front.focal"), made.map_T_base @ made.keyframes.base_T_camera
+
+    def at(values):
+        return Linearised(Measurements.of(*errors.at(values)), made.association, true, made.points, every)
+
+    system = linearise(at(theta), errors, theta)
+    step = 1e-4 * np.eye(len(theta))[k]
+    slope = (at(theta + step).rows.cost - at(theta - step).rows.cost) / 2e-4
+    assert system.residual @ system.sides[:, k] == pytest.approx(slope, rel=0.02)
+
+
 @pytest.mark.parametrize("localized", [False, True])
 def test_products_with_instruments_need_no_columns(localized):
     """A clock whose images are half of all, against the product with the columns themselves."""

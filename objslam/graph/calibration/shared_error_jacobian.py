@@ -159,7 +159,7 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
     The measurements are smooth functions of the other parameters. So a difference over a short step (`_SHORT`) is exact
     enough there.
     """
-    parts, joined = _parts(of), of.measured.multiframes
+    joined = of.measured.multiframes
     result = np.zeros((len(of.rows.residual), len(theta)))
     moved: dict[int, Bools] = {}
 
@@ -168,6 +168,7 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
         return joined.keyframes(images), joined.rays(images, rays.take(of.which)), settings
 
     here = measured(theta)
+    parts = _parts(of, here[1].sigma)
     values = [part.measured(*here) for part in parts]
     residuals = [part.residuals(*value) if value else np.zeros(0) for part, value in zip(parts, values, strict=True)]
     for k, name in enumerate(errors.names):
@@ -198,8 +199,8 @@ class _Part:
     residuals: Callable[..., Floats]
 
 
-def _parts(of: Linearised) -> tuple[_Part, ...]:
-    """Return the kinds of measurements that shared errors may change."""
+def _parts(of: Linearised, usual: Floats) -> tuple[_Part, ...]:
+    """Return the kinds of measurements that shared errors may change. usual: (n,) rad, the present sigmas of the rays."""
     graph, map_T_camera = of.graph, of.map_T_camera
     (before, after), ranged = graph.moves, graph.ranged
     seen = graph.seen(map_T_camera, of.positions[of.landmarks])
@@ -214,8 +215,10 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
     _, absolute_root, _ = graph.absolute_roots(map_T_camera)
     absolute = map_T_camera[: len(absolute_root)]
 
-    def bearings(direction: Floats, to_landmark: Floats) -> Floats:
-        return bearing_root * graph.bearing_residuals(direction, to_landmark, axes)
+    def bearings(direction: Floats, sigma: Floats, to_landmark: Floats) -> Floats:
+        # A longer focal length makes all angles smaller, and the noise of directions too (`SharedErrors.at`). Without the
+        # noise, every log would ask for a longer focal length.
+        return bearing_root * graph.bearing_residuals(direction, to_landmark, axes) * (usual / sigma)[:, None]
 
     def distances(measured: Floats, to_landmark: Floats) -> Floats:
         return np.asarray(range_root * (np.linalg.norm(to_landmark, axis=1) - measured) / (measured / range_))
@@ -253,7 +256,7 @@ def _parts(of: Linearised) -> tuple[_Part, ...]:
         return np.einsum("kij,kj->ki", localized.weighted_roots(map_T_camera), off)
 
     return (
-        _Part(0, lambda _, rays, settings: (rays.direction, from_origins(rays, seen)), bearings),
+        _Part(0, lambda _, rays, settings: (rays.direction, rays.sigma, from_origins(rays, seen)), bearings),
         _Part(
             graph.first_range,
             lambda _, rays, settings: (rays.range[ranged], from_origins(rays, seen)[ranged]),

@@ -87,7 +87,7 @@ class SmallErrors:
         """Return the errors that the run estimates, but that are far larger than their priors, with their sizes. "" if there
         are none."""
         found = zip(self.names, self.values.tolist(), strict=True)
-        far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings))
+        far = (n for n, v in found if n in self.estimated and abs(v) > _UNUSUAL * prior_sigma(n, settings, True))
         return self._words_of(tuple(far))
 
     def _words_of(self, names: Collection[str]) -> str:
@@ -105,7 +105,7 @@ class SmallErrors:
     def remedy(self, settings: Settings) -> str:
         """Return the options with which a run estimates the harmful errors. settings: the settings of a run without these
         options."""
-        held = [kind(name) for name in self.harmful if prior_sigma(name, settings) == 0]
+        held = [kind(name) for name in self.harmful if prior_sigma(name, settings, True) == 0]
         given = dict.fromkeys("translation" if what in ("x", "y") else what for what in held)
         options = ["calibration.use=true", *(f"calibration.{what}={_USUAL[what]}" for what in given if what in _USUAL)]
         return " ".join(f"--set {option}" for option in options)
@@ -119,8 +119,8 @@ def shared(
     log: Log, keyframes: Keyframes, rays: Rays, settings: Settings, priors: Mapping[str, float] = _PRIORS
 ) -> SharedErrors:
     """Return the examined errors, as parameters of the measurements. priors: standard deviations (s, rad, share, m)."""
-    fixed = dict.fromkeys(("scale", "turn_scale", "turn_bias", "range_scale", "tag_scale"), 0.0)
-    of = settings.calibration.model_copy(update={**priors, **fixed, "use": True, "file": None})
+    fixed = dict.fromkeys(("scale", "turn_scale", "turn_bias", "range_scale", "tag_scale", "centre"), 0.0)
+    of = settings.calibration.model_copy(update={**fixed, **priors, "use": True, "file": None})
     wide = settings.model_copy(update={"calibration": of, "mode": "joint"})
     found = shared_errors(log, keyframes, rays, wide)
     assert found is not None  # Every log has a camera, and every camera has a clock.

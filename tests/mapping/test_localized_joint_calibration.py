@@ -1,0 +1,68 @@
+"""Joint mode with a localisation and no odometry: the errors of cameras are found, and the covariances have the rest."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from objslam.config import load_settings
+from objslam.core.arrays import Floats
+from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
+from objslam.core.types import Log
+from objslam.mapping import pipeline
+from objslam.simulation import preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
+
+PRIORS = {"clock": 0.1, "roll": 0.02, "tilt": 0.02, "yaw": 0.03, "x": 0.05, "y": 0.05, "z": 0.05}
+
+
+def drive(seed: int, errors: dict[str, float]) -> Log:
+    """A localised drive past 12 objects of 12 labels, with these errors of its camera."""
+    log = simulate(preset("demo", frames=200, pixel_sigma=3.0, objects=12, classes=12, odometry=None), seed)
+    return add_shared_errors(log, {f"front.{name}": value for name, value in errors.items()})
+
+
+def mapped(log: Log, *changes: str) -> tuple[RunResult, Floats, Floats]:
+    """The result in joint mode, and the errors (n, 3) m and covariances (n, 3, 3) of its objects."""
+    result = pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false", *changes)), Ledger())
+    assert log.truth is not None
+    true = {one.label: one.position for one in log.truth.objects}
+    found = result.map.resolved()
+    assert sorted(one.label for one in found) == sorted(true)
+    return result, np.array([one.position - true[one.label] for one in found]), np.array([one.covariance for one in found])
+
+
+def test_errors_drawn_from_their_priors_are_found_and_the_map_is_honest() -> None:
+    squared = []
+    for seed in range(4):
+        rng = np.random.default_rng((seed, 7))
+        errors = {name: sigma * rng.standard_normal() for name, sigma in PRIORS.items()}
+        result, off, covariance = mapped(drive(seed, errors))
+        found = result.calibration
+        assert found is not None
+        assert set(found.names) == {f"front.{name}" for name in PRIORS}
+        true = np.array([errors[name.partition(".")[2]] for name in found.names])
+        assert (np.abs(found.values - true) < 3 * found.sigma).all()
+        # The rotation and the clock are told by the log. The height of the camera is not: it moves all objects.
+        sigma = dict(zip(found.names, found.sigma.tolist(), strict=True))
+        assert all(sigma[f"front.{name}"] < PRIORS[name] / 2 for name in ("clock", "tilt", "yaw"))
+        assert np.sqrt(covariance[:, 2, 2]).min() > 0.9 * PRIORS["z"]
+        squared.append(np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0]))
+    assert np.mean(np.concatenate(squared) < chi2.ppf(0.95, 3)) >= 0.95
+
+
+def test_a_coarse_localisation_leaves_what_it_does_not_tell_to_the_prior() -> None:
+    coarse, _, _ = mapped(drive(1, {"clock": 0.1, "tilt": 0.02}), "localization.xy=0.4")
+    fine, _, _ = mapped(drive(1, {"clock": 0.1, "tilt": 0.02}))
+    assert coarse.calibration is not None
+    assert fine.calibration is not None
+    clock = fine.calibration.names.index("front.clock")
+    assert coarse.calibration.sigma[clock] > 3 * fine.calibration.sigma[clock]
+
+
+def test_a_lens_that_may_err_is_found_too() -> None:
+    result, _, _ = mapped(drive(3, {"focal": 0.03, "yaw": 0.02}), "calibration.focal=0.02")
+    found = result.calibration
+    assert found is not None
+    focal = found.names.index("front.focal")
+    assert found.sigma[focal] < 0.01
+    assert abs(found.values[focal] - 0.03) < 3 * found.sigma[focal]
