@@ -332,9 +332,8 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
             "tag_scale": _sized_tags(rays, settings),
         }
         names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
-    mean = np.zeros(len(names))
-    sigma = np.array([prior_sigma(name, settings, against_given_poses(log, settings)) for name in names])
-    prior = np.diag(sigma**2).reshape(len(names), len(names))
+    mean, given_poses = np.zeros(len(names)), against_given_poses(log, settings)
+    prior = np.diag([prior_sigma(name, settings, given_poses) ** 2 for name in names]).reshape(len(names), len(names))
     known = known_errors(settings) if names else None
     if known is not None:
         here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
@@ -347,5 +346,5 @@ def _sized_tags(rays: Rays, settings: Settings) -> bool:
     """Return whether any ray is to a fiducial whose size is given."""
     if rays.corner_sigma is None:
         return False
-    labels = np.unique(rays.label[np.isfinite(rays.corner_sigma)]).tolist()
-    return any(settings.tags.size_of(rays.label_names[i]) is not None for i in labels)
+    names = (rays.label_names[i] for i in np.unique(rays.label[np.isfinite(rays.corner_sigma)]).tolist())
+    return any(settings.tags.size_of(name) is not None for name in names)

@@ -11,6 +11,7 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import angles_off
+from objslam.core.statistics import STRAY_RAY
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association
 from objslam.errors import SolveError
@@ -33,9 +34,6 @@ _CLEARLY = 1.0
 """By how much a narrower association must lower -2 ln of the probability of a mean ray, to be taken. The right one lowers it
 by 2.1 to 6.1 in simulated orchards and shelves. Noisy poses let one thing look like several. There, a wrong one lowers it by
 up to 0.8. With a smaller value, noisy poses split more things."""
-_OUTLIER = 13.8
-"""The squared miss of a ray without an object, and the largest one of others. Of rays with the noise of the settings, one in
-a thousand misses by more. A larger value favours associations with more rays."""
 
 
 def calibrate_fixed(
@@ -162,7 +160,7 @@ def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[
     noises = [pose_noise(at.rays_seen, frames, at.settings) for frames in (at.seen, usual)]
     sigma, least = (np.hypot(angle, place / distance) for angle, place in noises)
     squared = (angles_off(origin, direction, of_ray) / sigma) ** 2 + 4 * np.log(sigma / least)
-    missed = np.fmin(squared, _OUTLIER)
+    missed = np.fmin(squared, STRAY_RAY)
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)
     choices = np.append(np.bincount(association.label)[association.label], 1)[association.object] if len(number) else 1
     cost = missed.sum() + 2 * np.log(choices).sum() + 3 * np.log(np.maximum(number, 1)).sum()
