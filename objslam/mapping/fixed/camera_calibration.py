@@ -41,10 +41,10 @@ def calibrate_fixed(
 ) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
     """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
 
-    The association allows for the present uncertainty of the errors: first their prior, then what the covariance of the last
-    fit moves rays off their objects. The covariance of the errors is added to the covariance of the objects. Returns the
-    input without the errors, the association, the estimate, and the number of objects in each round. If the errors cannot be
-    estimated, they stay as they were, and the ledger gets a warning.
+    The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit,
+    and in rows of equal things only what moves rays off their objects. The covariance of the errors is added to the
+    covariance of the objects. Returns the input without the errors, the association, the estimate, and the number of objects
+    in each round. If the errors cannot be estimated, they stay as they were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import (
         calibrate_at_poses,
@@ -59,10 +59,14 @@ def calibrate_fixed(
     told = noise_of_errors(every, calibration)
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[Floats, Floats]] = []
+    in_rows = False
     for number in range(MOST_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         now = at.without(errors, calibration.values)
-        association = now.associate(told) if number else _first_association(at, errors, calibration, told)
+        if number:
+            association = now.associate(told)
+        else:
+            association, in_rows = _first_association(at, errors, calibration, told)
         rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
@@ -77,7 +81,9 @@ def calibrate_fixed(
             return now, association, replace(estimate, calibration=calibration), rounds
         earlier.append((calibration.values, np.hypot(_own(now), told)))
         moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
-        calibration, told = found.calibration, noise_beside_objects(errors, found, association, moved)
+        calibration = found.calibration
+        # Wide gates also hold the rays of poses whose errors last. In rows of equal things they hold those of neighbours.
+        told = noise_beside_objects(errors, found, association, moved) if in_rows else noise_of_errors(every, calibration)
         corrected = at.without(errors, calibration.values)
         at = at.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
         allowed = np.hypot(_own(at), told)
@@ -102,27 +108,30 @@ def calibrate_fixed(
     return now, association, with_noise_of(_with_covariance(estimate, found), now), rounds
 
 
-def _first_association(at: FixedPoses, errors: SharedErrors, calibration: Calibration, told: Floats) -> Association:
+def _first_association(
+    at: FixedPoses, errors: SharedErrors, calibration: Calibration, told: Floats
+) -> tuple[Association, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
     told: (R,) rad, the uncertainty of ray directions because of the errors. An association that allows for it is right if
     things are far apart. In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a
     wrong distance. Then a narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the
-    associations are compared by how likely the rays are after a calibration. A narrower one has to be clearly better.
+    associations are compared by how likely the rays are after a calibration. A narrower one has to be clearly better. Also
+    return whether it is.
     """
     now = at.without(errors, calibration.values)
     wide = now.associate(told)
     best = wide
     missed, least = _left_calibrated(at, errors, calibration, wide)
     if missed <= _FITS:
-        return wide
+        return wide, False
     least -= _CLEARLY
     for share in _NARROWER:
         narrow = now.associate(share * told)
         _, left = _left_calibrated(at, errors, calibration, narrow)
         if left < least:
             best, least = narrow, left
-    return best
+    return best, best is not wide
 
 
 def _left_calibrated(

@@ -9,7 +9,6 @@ residuals of the objects (`residual_noise`), from several starts.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -28,10 +27,8 @@ from objslam.mapping.fixed.few_box_search import Searched, SparseNoise, middle, 
 from objslam.mapping.fixed.residual_noise import gain_of_shared_places, noise_of_residuals
 from objslam.mapping.progress import Progress
 
-_PLACES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+_PLACES = (1.0, 2.0, 6.0, 20.0, 60.0, 200.0)
 """The factors on `localization.xy` that are tried first. More factors find more, and take longer."""
-_BETWEEN = (0.55, 1.8)
-"""The factors on the likeliest noise of places that are tried as well, halfway to its neighbours among `_PLACES`."""
 _RANGES = (1.0, 3.0, 8.0)
 """The factors on the noise of depths that are tried first."""
 _RAYS = (1.0, 4.0)
@@ -142,8 +139,6 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
     if nominal or not places:
         return (best.noise,), lead
     # The first search hardly tells noises apart. So each noise of places that is about as likely is a start.
-    between = [replace(best.noise, place=max(best.noise.place * factor, 1.0)) for factor in _BETWEEN]
-    searched += [search_objects(part, settings, noise) for noise in between]
     near = [one for one in sorted(searched, key=lambda one: one.value) if one.value > best.value - _NEAR]
     starts = {one.noise.place: one for one in near}
     found = [each for one in starts.values() for each in _settled(part, settings, one, (places, depths, boxes))]
