@@ -30,10 +30,10 @@ _FITS = 2.0
 """The mean squared miss of a ray, in variances of its noise, up to which the widest association is taken without trying
 others. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take the time
 for others, and rows of equal things are confused more often."""
-_CLEARLY = 1.0
+_CLEARLY = 1.75
 """By how much a narrower association must lower -2 ln of the probability of a mean ray, to be taken. The right one lowers it
 by 2.1 to 6.1 in simulated orchards and shelves. Noisy poses let one thing look like several. There, a wrong one lowers it by
-up to 0.8. With a smaller value, noisy poses split more things."""
+up to 1.4 (poses that err for seconds). With a smaller value, noisy poses split more things."""
 
 
 def calibrate_fixed(
