@@ -23,6 +23,8 @@ from objslam.mapping.doubted_labels import (
     has_several,
     needs_noisy_boxes,
 )
+from objslam.mapping.fixed.camera_calibration import associate_rows
+from objslam.mapping.fixed.fixed_poses import FixedPoses
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.labels import (
     angles_to_objects,
@@ -33,6 +35,7 @@ from objslam.mapping.labels import (
     shows_second_object,
     warn_of_noise,
 )
+from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
@@ -92,7 +95,8 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
 def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve from a known start, or from an exploration of the log."""
     if start is not None or state.keyframes.localized_every:
-        state = _improved(_from_start(state, start), JointState.relocalized)
+        found = _improved(_from_start(state, start), JointState.relocalized)
+        state = _without_confused_rows(state, found) if start is None else found
     else:
         begin = _with_turns(state)
         explored = _from_start(*_explored(begin))
@@ -174,6 +178,24 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
     map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
     guess = None if start is None else (start.association, start.positions)
     return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
+
+
+def _without_confused_rows(begin: JointState, state: JointState) -> JointState:
+    """Return the state, or one from the association of the fixed mode if the log shows rows of equal things.
+
+    The first association at localised poses has wide gates, because the poses have noise. In such rows, these gates hold the
+    rays of neighbours. The later rounds keep these rays, because the poses were bent to fit them. begin: before the first
+    association. state: after the rounds that began there.
+    """
+    if begin.errors is None:
+        return state
+    measured = begin.frames, begin.all_rays, *seen_something(begin.frames, begin.all_rays)
+    found = associate_rows(FixedPoses(*measured, begin.cameras, begin.settings), begin.errors.log, begin.progress)
+    if found is None:
+        return state
+    attempt = begin.attempt().counted(found).solve("association", found)
+    assert attempt.estimate is not None
+    return state.better(attempt.alternated(attempt.estimate.map_T_base, (found, attempt.estimate.positions)))
 
 
 def _improved(state: JointState, step: Callable[[JointState], JointState]) -> JointState:

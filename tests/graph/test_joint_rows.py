@@ -9,9 +9,10 @@ from numpy.testing import assert_allclose
 from scipy import sparse
 
 from objslam.config import Odometry, load_settings
-from objslam.core.geometry import exp_se3
+from objslam.core.geometry import adjoint, exp_se3
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
+from objslam.graph.factors.residual_algebra import whitening
 from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 from objslam.graph.optimizers import build_graph
@@ -63,6 +64,19 @@ def test_the_rows_are_those_of_gtsam(factor, localization, aside, loss):
     assert_allclose(rows.jacobian.toarray() / largest, jacobian / largest, atol=5e-3)
     assert_allclose(rows.residual, residual, atol=5e-3 * np.abs(residual).max())
     assert rows.cost == pytest.approx(graph.error(values), rel=2e-3)
+
+
+def test_poses_that_are_hardly_known_beside_a_known_height_are_whitened():
+    """A camera metres from the base mixes variances that differ by a factor of 4e10."""
+    sigma = np.array([1e-3, 1e-3, 50.0, 200.0, 200.0, 1e-3])
+    rng = np.random.default_rng(0)
+    camera_T_base = exp_se3(np.hstack([rng.normal(scale=2.0, size=(200, 3)), rng.normal(scale=3.0, size=(200, 3))]))
+    root = adjoint(camera_T_base) * sigma
+    covariance = root @ np.swapaxes(root, 1, 2)
+    whitened = whitening((covariance + np.swapaxes(covariance, 1, 2)) / 2)
+    assert_allclose(np.tril(whitened, -1), 0.0, atol=0.0)
+    turned = whitened @ root  # A whitened root is orthogonal.
+    assert_allclose(turned @ np.swapaxes(turned, 1, 2), np.broadcast_to(np.eye(6), (200, 6, 6)), atol=1e-3)
 
 
 def test_normal_equations_are_solved_in_any_order():

@@ -1,5 +1,7 @@
 """Rows of equal things, such as those on a shelf, seen from the side. The camera's prior is wider than the gaps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,17 +55,18 @@ def shelf(yaw: float = 0.0, pixels: float = 0.5) -> tuple[Log, np.ndarray]:
     return Log("shelf", (CameraLog(said, found),), localization=Trajectory(stamps, path)), places
 
 
-def counted(log: Log, places: np.ndarray) -> tuple[int, int]:
+def counted(log: Log, places: np.ndarray, mode: str) -> tuple[int, int]:
     """The things with an object within a third of the gap, and the objects without a thing there."""
-    settings = load_settings(None, ("output.recording=false", "bodies.use=false"))
+    settings = load_settings(None, ("output.recording=false", "bodies.use=false", f"mode={mode}"))
     points = np.array([one.position for one in pipeline.run(log, settings, Ledger()).map.resolved()]).reshape(-1, 3)
     near = np.linalg.norm(places[:, None] - points[None], axis=2) < GAP / 3 + 0.02
     return int(near.any(axis=1).sum()), int((~near.any(axis=0)).sum())
 
 
 @pytest.mark.parametrize("yaw", [0.0, np.radians(1.0)])
-def test_a_shelf_of_equal_things_is_mapped_with_default_settings(yaw):
+@pytest.mark.parametrize(("mode", "odometry"), [("fixed", False), ("joint", False), ("joint", True)])
+def test_a_shelf_of_equal_things_is_mapped_with_default_settings(yaw, mode, odometry):
     log, places = shelf(yaw)
-    found, false = counted(log, places)
+    found, false = counted(replace(log, odometry=log.localization) if odometry else log, places, mode)
     assert found >= 0.95 * len(places)
     assert false <= 0.05 * len(places)

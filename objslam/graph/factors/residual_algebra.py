@@ -8,8 +8,13 @@ from objslam.core.statistics import HUBER_K
 
 
 def whitening(covariance: Floats) -> Floats:
-    """Return upper triangular matrices (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM does."""
-    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
+    """Return upper triangular matrices (n, 6, 6) that whiten residuals with covariances (n, 6, 6), as GTSAM does.
+
+    They are inverse roots of the covariances. The inverse of a covariance itself loses twice the digits, and need not be
+    positive definite if its largest variance is 1e11 times its smallest.
+    """
+    root = np.linalg.cholesky(covariance[:, ::-1, ::-1])[:, ::-1, ::-1]  # Upper, because the axes are in reverse order.
+    return np.asarray(np.linalg.inv(root))
 
 
 def huber_roots(size: Floats) -> tuple[Floats, Floats]:

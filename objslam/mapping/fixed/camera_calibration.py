@@ -13,9 +13,9 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import angles_off
 from objslam.core.statistics import STRAY_RAY
 from objslam.core.trace import Parameters, Trace
-from objslam.core.types import Association
+from objslam.core.types import Association, Log
 from objslam.errors import SolveError
-from objslam.frontend.shared_errors import SharedErrors
+from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.mapping.fixed.fixed_poses import MOST_ROUNDS, SAME, FixedPoses, placed_objects, with_noise_of
 from objslam.mapping.progress import Progress
 
@@ -37,14 +37,20 @@ up to 1.4 (poses that err for seconds). With a smaller value, noisy poses split 
 
 
 def calibrate_fixed(
-    at: FixedPoses, errors: SharedErrors, ledger: Ledger, progress: Progress, trace: Trace | None
+    at: FixedPoses,
+    errors: SharedErrors,
+    ledger: Ledger,
+    progress: Progress,
+    trace: Trace | None,
+    first: tuple[Association, bool] | None = None,
 ) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
     """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
 
     The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit,
     and in rows of equal things only what moves rays off their objects. The covariance of the errors is added to the
     covariance of the objects. Returns the input without the errors, the association, the estimate, and the number of objects
-    in each round. If the errors cannot be estimated, they stay as they were, and the ledger gets a warning.
+    in each round. If the errors cannot be estimated, they stay as they were, and the ledger gets a warning. first: the first
+    association, if it is known, as of `_first_association`.
     """
     from objslam.graph.calibration.fixed_pose_calibration import (
         calibrate_at_poses,
@@ -54,7 +60,7 @@ def calibrate_fixed(
     )
     from objslam.graph.fixed_pose_triangulation import largest_noise
 
-    calibration = Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
+    calibration = _expected(errors)
     every = errors.take(at.frames, at.rays)
     told = noise_of_errors(every, calibration)
     rounds: tuple[dict[str, int], ...] = ()
@@ -66,7 +72,7 @@ def calibrate_fixed(
         if number:
             association = now.associate(told)
         else:
-            association, in_rows = _first_association(at, errors, calibration, told)
+            association, in_rows = first or _first_association(at, errors)
         rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
@@ -108,17 +114,38 @@ def calibrate_fixed(
     return now, association, with_noise_of(_with_covariance(estimate, found), now), rounds
 
 
-def _first_association(
-    at: FixedPoses, errors: SharedErrors, calibration: Calibration, told: Floats
-) -> tuple[Association, bool]:
+def associate_rows(at: FixedPoses, log: Log, progress: Progress) -> Association | None:
+    """Return the association at known poses and calibrated cameras if the log shows rows of equal things, else None.
+
+    at: as measured. Its mode does not matter. Wide gates confuse neighbours in such rows. A solve that moves the poses can
+    then fit the rays of neighbours to one object, and the gates of its next rounds keep them.
+    """
+    at = replace(at, settings=at.settings.model_copy(update={"mode": "fixed"}))
+    errors = shared_errors(log, at.seen, at.rays_seen, at.settings)
+    if errors is None:
+        return None
+    first = _first_association(at, errors)
+    in_rows = first[1]
+    return calibrate_fixed(at, errors, Ledger(), progress, None, first)[1] if in_rows else None
+
+
+def _expected(errors: SharedErrors) -> Calibration:
+    """Return the errors as their prior expects them."""
+    return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
+
+
+def _first_association(at: FixedPoses, errors: SharedErrors) -> tuple[Association, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
-    told: (R,) rad, the uncertainty of ray directions because of the errors. An association that allows for it is right if
-    things are far apart. In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a
-    wrong distance. Then a narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the
-    associations are compared by how likely the rays are after a calibration. A narrower one has to be clearly better. Also
-    return whether it is.
+    An association that allows for the uncertainty of ray directions because of the errors is right if things are far apart.
+    In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong distance. Then a
+    narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the associations are compared
+    by how likely the rays are after a calibration. A narrower one has to be clearly better. Also return whether it is.
     """
+    from objslam.graph.calibration.fixed_pose_calibration import noise_of_errors
+
+    calibration = _expected(errors)
+    told = noise_of_errors(errors.take(at.frames, at.rays), calibration)
     now = at.without(errors, calibration.values)
     wide = now.associate(told)
     best = wide
