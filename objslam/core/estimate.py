@@ -25,6 +25,7 @@ class Estimate:
     factor of their joint covariance. It is 0 for an object that was not solved, and None if all objects are independent.
     tags: the rotation and the size of each fiducial that has them, by the index of its object. log_evidence: the log
     evidence of the association, up to a constant. It compares associations of the same rays. -inf if it is not known.
+    uncalibrated: whether the estimation of the shared errors failed. Then the covariances lack these errors.
     """
 
     map_T_base: Floats
@@ -42,3 +43,4 @@ class Estimate:
     correlated: Floats | None = None
     tags: Mapping[int, TagPose] = field(default_factory=dict)
     log_evidence: float = float("-inf")
+    uncalibrated: bool = False

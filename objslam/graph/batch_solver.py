@@ -194,7 +194,7 @@ def solve_joint(
             found = replace(other, cost_before=found.cost_before)
             if trace is not None and attempt is not None:
                 trace.take(attempt)
-    calibrated, calibration = None, None
+    calibrated, calibration, failed = None, None, False
     if errors is not None and theta is not None and hold:
         calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
     elif errors is not None and theta is not None:
@@ -205,6 +205,7 @@ def solve_joint(
         except (SolveError, np.linalg.LinAlgError) as error:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
             calibration = Calibration(errors.names, theta, errors.prior, np.sqrt(np.diagonal(errors.prior)))
+            failed = True
         else:
             errors, calibration = calibrated.errors, calibrated.calibration
             measured, found = calibrated.measured, calibrated.found
@@ -258,6 +259,7 @@ def solve_joint(
         log_evidence=log_evidence(
             measured, association, used, np.linalg.norm(seen - origins, axis=1), solved, optimum.cost_after
         ),
+        uncalibrated=failed,
     )
     if tags is None:
         return estimate

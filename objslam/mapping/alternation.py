@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from objslam.config import Settings
@@ -46,6 +47,7 @@ def solve(
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     doubted: tuple[str, ...] = ()
+    unsettled = 0
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
         if errors is None:
@@ -64,7 +66,8 @@ def solve(
         state = solve_joint(begin, start)
         assert state.association is not None
         assert state.estimate is not None
-        association, estimate, rounds, doubted = state.association, state.estimate, state.rounds, state.doubted
+        association, estimate, rounds = state.association, state.estimate, state.rounds
+        doubted, unsettled = state.doubted, state.unsettled
         estimate, added = solve_to_centres(begin, association, estimate)
         if errors is not None:
             keyframes, rays_of_keyframes = without_errors(errors, estimate)
@@ -72,4 +75,5 @@ def solve(
             rays_of_keyframes = to_centres(rays_of_keyframes, added)
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
-    return Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded, doubted=doubted)
+    solved = Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)
+    return replace(solved, doubted=doubted, unsettled=unsettled)

@@ -203,6 +203,8 @@ def summarise(
         },
         "cut_off": _cut_off(rays),
         "doubted_labels": list(solution.doubted),
+        "unsettled_objects": solution.unsettled,
+        "uncalibrated": estimate.uncalibrated,
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),
         "noise": None if estimate.noise is None else estimate.noise.to_dict(),

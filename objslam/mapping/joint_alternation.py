@@ -20,7 +20,7 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.merge_and_split import merge_unseen_together, split_at_gaps
 from objslam.mapping.progress import Progress
 from objslam.mapping.relocalization import relocalize
-from objslam.mapping.solution import rays_moved, without_errors
+from objslam.mapping.solution import objects_changed, rays_moved, without_errors
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -48,8 +48,8 @@ class JointState:
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
     (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
-    until the last solve. settled: whether no ray changed its object in the last round. doubted: the labels of which it is
-    not clear whether they name one object or several.
+    until the last solve. unsettled: as in `Solution`. doubted: the labels of which it is not clear whether they name one
+    object or several.
     """
 
     frames: Keyframes
@@ -64,7 +64,7 @@ class JointState:
     errors: SharedErrors | None
     theta: Floats | None = None
     hold: bool = False
-    settled: bool = True
+    unsettled: int = 0
     doubted: tuple[str, ...] = ()
     rounds: tuple[dict[str, int], ...] = ()
     association: Association | None = None
@@ -129,7 +129,8 @@ class JointState:
         returned. A few changed rays hardly change the shared errors, but their estimation takes most of the time of a solve.
         So the shared errors stay as the first round found them. After the last round, they are estimated again.
         """
-        state, earlier, held = self, dict[bytes, Self](), False  # Whether the last solve held the shared errors.
+        state, before, earlier = self, self, dict[bytes, Self]()
+        held = False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"association, round {number + 1}", 0, 0)
             found = state._associate(map_T_base, guess, rough=not state.rounds)
@@ -140,18 +141,31 @@ class JointState:
                     returned = list(earlier).index(key)
                     state = state.continued_from(max(list(earlier.values())[returned:], key=lambda one: one.explained))
                 if not held:
-                    return replace(state, hold=self.hold, settled=True)
-                state, held = state.released(self.hold), False
+                    return replace(state, hold=self.hold, unsettled=0)
+                before = state = state.released(self.hold)
+                held = False
             else:
+                before, holds = state, state.hold
                 solved = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera)
                 solved = replace(solved, hold=state.errors is not None)
-                before, state = state.hold, solved.merged()
-                held = solved.hold != self.hold and (before or state is not solved)
+                state = solved.merged()
+                held = solved.hold != self.hold and (holds or state is not solved)
                 earlier[key] = state
             assert state.association is not None
             assert state.estimate is not None
             map_T_base, guess = state.estimate.map_T_base, (state.association, state.estimate.positions)
-        return replace(state.released(self.hold) if held else state, hold=self.hold, settled=False)
+        unsettled = state.changed_since(before)
+        return replace(state.released(self.hold) if held else state, hold=self.hold, unsettled=unsettled)
+
+    def changed_since(self, before: Self) -> int:
+        """Return the number of objects that differ from those of an earlier state (`objects_changed`)."""
+        if before is self:
+            return 0
+        assert self.association is not None
+        assert self.estimate is not None
+        if before.association is None or before.estimate is None:
+            return self.association.count
+        return objects_changed((before.association, before.estimate), (self.association, self.estimate))
 
     def released(self, hold: bool) -> Self:
         """Return the state after one more solve. hold: whether the shared errors stay. If not, the solve estimates them
@@ -166,7 +180,7 @@ class JointState:
             assert chosen.association is not None
             assert chosen.estimate is not None
             self.trace.end_round("association", chosen.association, chosen.estimate)
-        return replace(chosen, rounds=self.rounds, settled=True)
+        return replace(chosen, rounds=self.rounds, unsettled=0)
 
     def relocalized(self) -> Self:
         """Return the state after rounds along the most likely path through its map, if they make the rays better
@@ -207,7 +221,7 @@ class JointState:
         assert best.estimate is not None
         turns = best.alternated(best.estimate.map_T_base, (best.association, best.estimate.positions))
         if turns.explained < best.explained:
-            turns = replace(turns.continued_from(best), settled=turns.settled)
+            turns = replace(turns.continued_from(best), unsettled=turns.unsettled)
         return self.better(turns)
 
     def split(self) -> Self:

@@ -105,10 +105,10 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         if noisier is not None:
             state = state.better(_improved(_from_start(*_explored(noisier)), JointState.relocalized))
         state = _improved(state, JointState.split)
-    if not state.settled:
-        rounds = state.settings.joint.max_rounds
-        state.ledger.warn(f"the association still changes after {rounds} rounds (joint.max_rounds)")
     assert state.association is not None
+    if state.unsettled:
+        rounds, changed = state.settings.joint.max_rounds, f"{state.unsettled} of {state.association.count} objects"
+        state.ledger.warn(f"the association still changes {changed} after {rounds} rounds (joint.max_rounds)")
     if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
     return _with_few_rays(state)

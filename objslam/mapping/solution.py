@@ -27,7 +27,8 @@ class Solution:
     a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
     the box. to_centre: (R, 3) is added to the direction of each ray, in the camera frame, to point to the centre of its
     body. bodies, body_share and to_centre are None if no bodies were solved. doubted: the labels of which it is not clear
-    whether they name one object or several.
+    whether they name one object or several. unsettled: the objects that the last round changed, as of `objects_changed`,
+    although no further round was allowed.
     """
 
     keyframes: Keyframes
@@ -40,6 +41,7 @@ class Solution:
     body_share: float | None = None
     to_centre: Floats | None = None
     doubted: tuple[str, ...] = ()
+    unsettled: int = 0
 
 
 def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:
@@ -80,10 +82,34 @@ def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:
 
 def rays_moved(before: Ints, after: Ints) -> int:
     """Return how many rays (R,) changed their object. Renumbered objects count as the same. -1 means no object."""
+    stayed = _same_objects(before, after)[2].sum() + ((before < 0) & (after < 0)).sum()
+    return len(before) - int(stayed)
+
+
+def objects_changed(before: tuple[Association, Estimate], after: tuple[Association, Estimate]) -> int:
+    """Return how many objects are new, are gone, or moved by more than their sigma, between two solved associations.
+
+    A sigma takes the association for granted. So a place that changes by more, because rays change their objects, is less
+    certain than its sigma says. A few rays that go back and forth between neighbours hardly move anything.
+    """
+    (first, was), (second, now) = before, after
+    i, j, _ = _same_objects(first.object, second.object)
+    solved = was.solved[i] & now.solved[j]
+    moved, covariance = (now.positions[j] - was.positions[i])[solved], now.covariance[j][solved]
+    squared = np.einsum("ni,ni->n", moved, np.linalg.solve(covariance, moved[..., None])[..., 0])
+    return first.count + second.count - 2 * len(i) + int((squared > 1.0).sum())
+
+
+def _same_objects(before: Ints, after: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return the indices (n,) of objects before and after that are the same, and the rays (n,) that they share.
+
+    before, after: (R,) the object of each ray, -1 for none.
+    """
     from scipy.optimize import linear_sum_assignment
 
     shared = np.zeros((before.max(initial=-1) + 1, after.max(initial=-1) + 1), dtype=np.int64)
     both = (before >= 0) & (after >= 0)
     np.add.at(shared, (before[both], after[both]), 1)
-    stayed = shared[linear_sum_assignment(shared, maximize=True)].sum() + ((before < 0) & (after < 0)).sum()
-    return len(before) - int(stayed)
+    i, j = linear_sum_assignment(shared, maximize=True)
+    some = shared[i, j] > 0
+    return i[some], j[some], shared[i, j][some]

@@ -16,7 +16,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import joint_alternation
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.pipeline import run
-from objslam.mapping.solution import seen_something
+from objslam.mapping.solution import objects_changed, seen_something
 from objslam.simulation import DepthNoise, preset, simulate
 
 
@@ -57,7 +57,8 @@ def taking_turns(monkeypatch, turns, errors=None):
     def solve(state, why, association, start):
         held.append(state.hold)
         held_rays = int((association.object >= 0).sum())
-        estimate = SimpleNamespace(log_evidence=held_rays, map_T_base=np.eye(4)[None], positions=np.zeros((2, 3)))
+        placed = {"positions": np.zeros((2, 3)), "covariance": np.stack([np.eye(3)] * 2), "solved": np.ones(2, dtype=bool)}
+        estimate = SimpleNamespace(log_evidence=held_rays, map_T_base=np.eye(4)[None], **placed)
         return replace(state, association=association, estimate=estimate)
 
     monkeypatch.setattr(JointState, "_associate", lambda state, *_, rough: turns[len(state.rounds)])
@@ -78,9 +79,30 @@ def test_of_associations_that_take_turns_the_one_that_explains_more_rays_counts(
     """Which one returns first is chance."""
     begin, _ = taking_turns(monkeypatch, [two[first], two[1 - first], two[first]])
     chosen = begin.alternated(np.eye(4)[None], None)
-    assert chosen.settled
+    assert chosen.unsettled == 0
     assert chosen.association is two[1]
     assert [one["rays_changed"] for one in chosen.rounds[1:]] == [10, 10]
+
+
+@pytest.mark.parametrize(("turns", "expected"), [([0, 1], 1), ([0, 0], 0), ([1], 2)])
+def test_rounds_that_end_too_early_count_the_objects_that_the_last_one_changed(monkeypatch, two, turns, expected):
+    begin, _ = taking_turns(monkeypatch, [two[i] for i in turns])
+    few = begin.settings.model_copy(update={"joint": begin.settings.joint.model_copy(update={"max_rounds": len(turns)})})
+    assert replace(begin, settings=few).alternated(np.eye(4)[None], None).unsettled == expected
+
+
+@pytest.mark.parametrize(("shift", "expected"), [(0.5, 0), (1.5, 1)])
+def test_an_object_counts_as_changed_if_it_moves_by_more_than_its_sigma(shift, expected):
+    """A ray goes from one object to the other, and the objects change their numbers."""
+    sigma, places = 0.1, np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    covariance, solved = np.stack([sigma**2 * np.eye(3)] * 2), np.ones(2, dtype=bool)
+    label = np.zeros(2, dtype=np.int64)
+    moved = places[::-1] + np.array([[0.0, 0.0, 0.0], [0.0, shift * sigma, 0.0]])
+    first, second = Association(np.array([0, 0, 0, 1, 1, -1]), label), Association(np.array([1, 1, 0, 0, 0, -1]), label)
+    before, after = (
+        SimpleNamespace(positions=positions, covariance=covariance, solved=solved) for positions in (places, moved)
+    )
+    assert objects_changed((first, before), (second, after)) == expected
 
 
 @pytest.mark.parametrize(
@@ -97,7 +119,7 @@ def test_the_last_solve_estimates_the_shared_errors(monkeypatch, two, turns, exp
     begin, held = taking_turns(monkeypatch, [two[i] for i in turns], errors=SimpleNamespace())
     monkeypatch.setattr(JointState, "explained", property(lambda state: (state.association.object >= 0).sum()))
     chosen = begin.alternated(np.eye(4)[None], None)
-    assert chosen.settled
+    assert chosen.unsettled == 0
     assert not chosen.hold
     assert held == expected
 

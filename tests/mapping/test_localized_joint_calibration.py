@@ -8,7 +8,9 @@ from objslam.core.arrays import Floats
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
 from objslam.core.types import Log
+from objslam.graph.calibration import self_calibration
 from objslam.mapping import pipeline
+from objslam.mapping.checks.assessment import Evidence, assess, evidence_of
 from objslam.simulation import preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 
@@ -66,3 +68,21 @@ def test_a_lens_that_may_err_is_found_too() -> None:
     focal = found.names.index("front.focal")
     assert found.sigma[focal] < 0.01
     assert abs(found.values[focal] - 0.03) < 3 * found.sigma[focal]
+
+
+def test_a_calibration_that_fails_makes_the_verdict_check(monkeypatch) -> None:
+    log, settings = drive(0, {}), load_settings(None, ("mode=joint", "output.recording=false"))
+    assert not assessed(pipeline.run(log, settings, Ledger())).uncalibrated
+
+    def fails(*_: object) -> None:
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    monkeypatch.setattr(self_calibration, "calibrate", fails)
+    evidence = assessed(pipeline.run(log, settings, Ledger()))
+    assert evidence.uncalibrated
+    assert assess(evidence).level == "check"
+
+
+def assessed(result: RunResult) -> Evidence:
+    """The evidence of a result whose rays miss as far as expected."""
+    return evidence_of(result.summary, 1.0)

@@ -50,7 +50,9 @@ class Evidence:
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
     frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
     journal: the file with all messages of a live session, "" without one. doubted: the labels of which it is not clear
-    whether they name one object or several. odometry: the largest factor on a noise of the odometry that the log shows.
+    whether they name one object or several. unsettled: the objects that the last round of association still changed.
+    uncalibrated: whether the estimation of the shared errors failed. odometry: the largest factor on a noise of the odometry
+    that the log shows.
     scale: the standard deviation of the scale of the odometry, as a share. None if the log tells the scale. part: the limits
     of a log that is a part of a recording, as in `Log`. odometry_unused: whether the mode was left to the log, and a
     `fixed` run did not use its odometry.
@@ -72,6 +74,8 @@ class Evidence:
     late: int = 0
     journal: str = ""
     doubted: tuple[str, ...] = ()
+    unsettled: int = 0
+    uncalibrated: bool = False
     odometry: float = 1.0
     scale: float | None = None
     part: tuple[float | None, float | None] = (None, None)
@@ -116,6 +120,8 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         late=sum(summary["dropped"].get(reason, 0) for reason in (TOO_SLOW, RARE_POSES)),
         journal=summary["log_path"] or "",
         doubted=tuple(summary["doubted_labels"]),
+        unsettled=summary.get("unsettled_objects", 0),
+        uncalibrated=summary.get("uncalibrated", False),
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
         scale=_untold_scale(summary),
         part=(summary["part"]["begin"], summary["part"]["end"]) if "part" in summary else (None, None),
@@ -189,6 +195,13 @@ def _check(e: Evidence) -> list[str]:
             f"The boxes agree only if the odometry is {e.odometry:.0f} times as noisy as the settings say: it may slip, or "
             "the camera may turn on the robot (camera_poses)."
         )
+    if e.unsettled:
+        found.append(
+            "It is not settled which boxes show which object: the last round of association still changed "
+            f"{_objects(e.unsettled)}."
+        )
+    if e.uncalibrated:
+        found.append("The errors that all measurements share could not be estimated, so the sigmas lack them.")
     if e.doubted:
         found.append(
             f"It is not clear whether {', '.join(e.doubted)} name one object each, or several. Drive past them and others "

@@ -84,7 +84,7 @@ def calibrate_fixed(
             every_object = now.add_few(association, estimate, told)
             if every_object.count > association.count:
                 association, estimate = every_object, now.solve(every_object, trace, _parameters(calibration))
-            return now, association, replace(estimate, calibration=calibration), rounds
+            return now, association, replace(estimate, calibration=calibration, uncalibrated=True), rounds
         earlier.append((calibration.values, np.hypot(_own(now), told)))
         moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
         calibration = found.calibration
