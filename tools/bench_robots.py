@@ -6,7 +6,8 @@ Each robot drives to random points of a room, with stops. wheels: encoders with 
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
 wheels, but only one or two odometry poses in a second. The camera has a wrong clock, yaw, tilt and roll. Boxes are rounded
 to pixels, sit beside the object by a share of its size that depends on the side, and 1 % have a wrong name. Robots with an
-even number measure depths too. All settings are the defaults of joint mode. A line for each robot, then for each kind. Then,
+even number measure depths too, of surfaces that are before the centres by 0 to 1 times half the width. All settings are the
+defaults of joint mode. A line for each robot, then for each kind. Then,
 for each parameter of the calibration, the robots whose true value is within 1.96 and within 3 of its standard deviations.
 
 With --unnamed, all objects of a robot have one label, so the map must also find out which box is of which object.
@@ -36,6 +37,7 @@ from objslam.mapping import pipeline
 KINDS = ("wheels", "gyro", "vio", "slow")
 STEP = 0.005  # s, of the simulated motion
 SIDES = 0.04  # the offset of a box from its object, as a share of the size of the object, for each of five terms
+SURFACES = 0.2  # the spread over things of the distance from surface to centre, as a share of half the width
 SLIPS = 90.0  # s between sudden slips, on average
 RADIUS, UNNAMED_RADIUS = 3.0, 0.5
 """The radius of a match, m, with labels and without. Labels identify objects, so a large error is no missed object."""
@@ -253,11 +255,14 @@ def boxes_of(
         measured = depth * (1 + rng.normal(0, 0.01)) + np.hypot(0.02, 0.01 * depth) * rng.normal(size=len(frame))
         measured = measured + np.where(rng.random(len(frame)) < 0.05, rng.uniform(0.2, 2, len(frame)), 0.0)
     wrong = rng.random(len(frame)) < 0.01
+    label = np.where(wrong, rng.integers(0, number, len(frame)), thing)
+    behind = size / 2 * np.maximum(rng.uniform(0, 1) + SURFACES * rng.normal(size=number), 0.0)
+    measured = measured - (behind[:, None] * (local[..., 2] / distance).T)[thing, frame]
     return Detections(
         frame_stamps=stamps,
         frame=frame,
         boxes=np.concatenate([at - reach, at + reach], axis=1).round(),
-        label=np.where(wrong, rng.integers(0, number, len(frame)), thing),
+        label=label,
         scores=np.ones(len(frame)),
         depths=measured,
         track_ids=np.full(len(frame), -1),

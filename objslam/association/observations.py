@@ -3,7 +3,6 @@
 The sizes of boxes are evidence too: what a landmark usually measures, and what an unusual box costs.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Self
@@ -12,7 +11,7 @@ import numpy as np
 
 from objslam.core.appearance.features import FeatureTable
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, box_sizes
 from objslam.core.ground.flattening import LEVEL, flattened_lines
 from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 from objslam.core.types import Association, Keyframes, Rays
@@ -136,18 +135,6 @@ def observe(
 def size_per_metre(rays: Rays, keyframes: Keyframes, cameras: tuple[Camera, ...]) -> Floats:
     """Return width and height (R, 2) of the object in each box, in m per m of its distance."""
     return box_sizes(rays.box, rays.direction, cameras, keyframes.camera[rays.keyframe])
-
-
-def box_sizes(box: Floats, direction: Floats, cameras: Sequence[Camera], camera: Ints) -> Floats:
-    """Return width and height (R, 2) of the objects in boxes (R, 4), px, in m per m of their distances.
-
-    direction: (R, 3) unit vectors through the centres of the boxes, in the camera frame. camera: (R,) number of its camera.
-    """
-    focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[camera]
-    pinhole = np.array([not c.fisheye for c in cameras])[camera]
-    depth = np.where(pinhole, direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
-    # If a box is read in another order than it was written, a side may be negative.
-    return np.asarray(np.maximum(box[:, 2:] - box[:, :2], 0.0) / focal * depth[:, None])
 
 
 def extents(

@@ -38,6 +38,9 @@ class CalibrationSettings(Section):
     without odometry, else 0."""
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
+    surface: NotNegative = 0.5
+    """share of half their width by which the centres of all things of a log are farther behind their visible surfaces than
+    depth.centre says. It is estimated in joint mode only."""
     tag_scale: NotNegative = 0.01
     """share by which all fiducials of a given size are smaller or larger than the settings say. A printer, a ruler, the lens
     and the detector of the corners each add to it. It is estimated in joint mode only."""

@@ -50,8 +50,13 @@ class Depth(Section):
     sigma_per_m: NotNegative = 0.02
     """Part of the range noise that grows with the distance, in m per m."""
     bias: NotNegative = 0.05
-    """Standard deviation in m of the error that all ranges of one object share, because they end on its surface or have a
-    calibration error. Averaging does not reduce this error."""
+    """Standard deviation in m of the error that all ranges of one object share, because of its shape or a calibration error.
+    Averaging does not reduce this error."""
+    centre: NotNegative = 0.5
+    """How far the centre of a thing is behind its visible surface, as a share of half its width: 0 for a sign, 1 for a ball.
+    A depth ends on the surface. 0 is for depths of centres."""
+    centre_sigma: NotNegative = 0.3
+    """Standard deviation of the difference of this share between the things of a log."""
 
 
 class Odometry(Section):

@@ -20,7 +20,7 @@ value, fewer pairs trade off."""
 
 SCALES = ("scale", "turn_scale", "range_scale", "tag_scale", "focal")
 """The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
-OF_PLACES = ("tag_scale",)
+OF_PLACES = ("tag_scale", "surface")
 """The parameters of a place, not of a robot. The calibration of a robot has none of them."""
 MOST_SCALE = 0.5
 """The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of more than half

@@ -1,6 +1,7 @@
 """A calibrated camera with its projection, undistortion and field of view."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -292,6 +293,18 @@ def _growth(camera: Camera, angle: Floats) -> Floats:
         # Decentering and thin prisms reduce the radial growth by at most this much in any direction.
         across = (6 * np.hypot(k[2], k[3]) + 2 * np.hypot(k[8], k[10])) * t + 4 * np.hypot(k[9], k[11]) * t**3
         return np.asarray(np.where(below > 0, radial - across, 0.0))
+
+
+def box_sizes(box: Floats, direction: Floats, cameras: Sequence[Camera], camera: Ints) -> Floats:
+    """Return width and height (R, 2) of the objects in boxes (R, 4), px, in m per m of their distances.
+
+    direction: (R, 3) unit vectors through the centres of the boxes, in the camera frame. camera: (R,) number of its camera.
+    """
+    focal = np.array([[c.matrix[0, 0], c.matrix[1, 1]] for c in cameras])[camera]
+    pinhole = np.array([not c.fisheye for c in cameras])[camera]
+    depth = np.where(pinhole, direction[:, 2], 1.0)  # The size in a pinhole image falls with z, not with distance.
+    # If a box is read in another order than it was written, a side may be negative.
+    return np.asarray(np.maximum(box[:, 2:] - box[:, :2], 0.0) / focal * depth[:, None])
 
 
 def _edge(low: float, right: float, bottom: float, pieces: int) -> Floats:

@@ -105,12 +105,17 @@ NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""
 
 
-def range_noise(ranges: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings) -> tuple[Floats, Floats]:
+def range_noise(
+    ranges: Floats, half: Floats, camera: Ints, cameras: Sequence[Camera], settings: Settings
+) -> tuple[Floats, Floats]:
     """Return the standard deviations (n,), m, of ranges (n,), m, and of the bias that all ranges of an object share.
 
-    camera: (n,) the index of each range's camera. A camera without `depth_noise` has the noise in the settings.
+    half: (n,) half the width of each thing, in m per m of its distance (`surface_ranges.half_widths`). camera: (n,) the
+    index of each range's camera. A camera without `depth_noise` has the noise in the settings.
     """
     of = settings.depth
     told = [(of.sigma, of.sigma_per_m, of.bias) if c.depth_noise is None else astuple(c.depth_noise) for c in cameras]
     sigma, per_m, bias = np.array(told, dtype=np.float64).reshape(-1, 3)[camera].T
-    return sigma + per_m * ranges, bias
+    # How far the centre is behind the surface differs between logs, and between the things of a log.
+    share = np.hypot(of.centre_sigma, settings.calibration.surface)
+    return sigma + per_m * ranges, np.hypot(bias, share * half * ranges)

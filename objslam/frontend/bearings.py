@@ -10,6 +10,7 @@ from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
 from objslam.core.types import Detections, Keyframes, Log, Rays, label_table
+from objslam.frontend.surface_ranges import half_widths, to_centres
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
 """The reason to drop a box that ends at the image's edge, because its centre is then wrong."""
@@ -58,11 +59,11 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     order = np.argsort(keyframe, kind="stable")
     if not settings.depth.use:
         depth = np.full(len(depth), np.nan)
-    ranges = (depth / direction[:, 2])[order]
+    number, lenses = keyframes.camera[keyframe[order]], [one.camera for one in log.cameras]
+    half = half_widths(box[order], direction[order], lenses, number, np.isfinite(corner_sigma[order]))
+    ranges = (depth / direction[:, 2])[order] * to_centres(half, settings.depth.centre)
     feature, table = _table(features, [len(column[0]) for column in columns])
-    range_sigma, range_bias = range_noise(
-        ranges, keyframes.camera[keyframe[order]], [one.camera for one in log.cameras], settings
-    )
+    range_sigma, range_bias = range_noise(ranges, half, number, lenses, settings)
     return Rays(
         keyframe=keyframe[order],
         direction=direction[order],

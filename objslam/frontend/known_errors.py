@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from objslam.config import Settings
+from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
-from objslam.core.types import Log
+from objslam.core.types import Log, Rays
 from objslam.errors import ConfigError
 from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
 from objslam.io.calibration_yaml import load_calibration
@@ -30,7 +31,7 @@ def error_names(log: Log) -> tuple[str, ...]:
     """Return the names of all errors that the measurements of a log can share."""
     odometry = () if log.odometry is None else ODOMETRY
     cameras = tuple(f"{one.camera.name}.{name}" for one in log.cameras for name in _CAMERA)
-    return (*odometry, *cameras, "range_scale", "tag_scale")
+    return (*odometry, *cameras, "range_scale", "surface", "tag_scale")
 
 
 def against_given_poses(log: Log, settings: Settings) -> bool:
@@ -49,7 +50,7 @@ def prior_sigma(name: str, settings: Settings, given_poses: bool) -> float:
     wrong association fit. given_poses: what `against_given_poses` returns for the log.
     """
     what, fixed = kind(name), settings.mode == "fixed"
-    if fixed and (name in ODOMETRY or what in ("range_scale", "tag_scale")):
+    if fixed and (name in ODOMETRY or what in ("range_scale", "surface", "tag_scale")):
         return 0.0
     setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
     sigma = getattr(settings.calibration, setting)
@@ -88,6 +89,21 @@ def possible(log: Log, settings: Settings) -> list[str]:
     mounted = (*AXES, "x", "y", "z", *(LENS if settings.mode == "fixed" else ()))
     names = [n for n in error_names(log) if prior_sigma(n, settings, given_poses) > 0]
     return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
+
+
+def has_sized_tags(rays: Rays, settings: Settings) -> bool:
+    """Return whether any ray is to a fiducial whose size is given."""
+    if rays.corner_sigma is None:
+        return False
+    names = (rays.label_names[i] for i in np.unique(rays.label[np.isfinite(rays.corner_sigma)]).tolist())
+    return any(settings.tags.size_of(name) is not None for name in names)
+
+
+def measured_lengths(rays: Rays, half: Floats, settings: Settings) -> dict[str, bool]:
+    """Return by the name of each error of lengths whether any ray has it. half: (R,) as `surface_ranges.half_widths`."""
+    ranged = np.isfinite(rays.range)
+    surfaces = bool((ranged & (half > 0)).any())
+    return {"range_scale": bool(ranged.any()), "surface": surfaces, "tag_scale": has_sized_tags(rays, settings)}
 
 
 def known_errors(settings: Settings) -> Calibration | None:

@@ -23,9 +23,18 @@ from objslam.frontend.corrected_log import (
     refocused,
     take_out,
 )
-from objslam.frontend.known_errors import against_given_poses, estimates, known_errors, possible, prior_sigma
+from objslam.frontend.known_errors import (
+    against_given_poses,
+    estimates,
+    has_sized_tags,
+    known_errors,
+    measured_lengths,
+    possible,
+    prior_sigma,
+)
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
+from objslam.frontend.surface_ranges import half_widths_of_rays, range_factors, with_known_surfaces
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -115,6 +124,10 @@ class SharedErrors:
         noise = self.settings.noise.model_copy(update={"rays": True, "ranges": True, "odometry": True})
         return replace(self, settings=self.settings.model_copy(update={"noise": noise}))
 
+    @cached_property
+    def _half(self) -> Floats:
+        return half_widths_of_rays(self.rays, self.keyframes, [one.camera for one in self.log.cameras])
+
     @property
     def steps(self) -> Floats:
         """(P,) steps over which derivatives are taken.
@@ -126,9 +139,8 @@ class SharedErrors:
         path = self.log.robot_path
         if self.keyframes.odom_T_base is None and path is not None and len(path) > 1:
             apart = 2 * float(np.median(np.diff(path.stamps)))
-            steps["clock"] = float(
-                np.clip(apart, _STEPS["clock"], max(_STEPS["clock"], self.settings.calibration.max_clock))
-            )
+            longest = max(_STEPS["clock"], self.settings.calibration.max_clock)
+            steps["clock"] = float(np.clip(apart, _STEPS["clock"], longest))
         return np.array([steps.get(kind(name), _STEP) for name in self.names])
 
     @property
@@ -166,19 +178,14 @@ class SharedErrors:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
             gathered = self._drift(error).gathered(np.maximum.accumulate(poses.known), settings.odometry)
             step, wander = self._correctable().bridge.at(poses.known)
+        stamps, map_T_base, odom_T_base = poses.stamps, poses.map_T_base, poses.odom_T_base
         moved = replace(
-            keyframes,
-            stamps=poses.stamps,
-            base_T_camera=base_T_camera,
-            map_T_base=poses.map_T_base,
-            odom_T_base=poses.odom_T_base,
-            drift=gathered,
-            step=step,
-            wander=wander,
+            keyframes, stamps=stamps, map_T_base=map_T_base, odom_T_base=odom_T_base, base_T_camera=base_T_camera
         )
-        longer = (1 + error.get("range_scale", 0.0)) * (1 + self.noise.shrinkage)
-        ranges = {"range": rays.range * longer, "range_sigma": rays.range_sigma * longer}
-        ranged = replace(rays, direction=direction, sigma=sigma, **ranges)
+        moved = replace(moved, drift=gathered, step=step, wander=wander)
+        longer = range_factors(error, self._half) * (1 + self.noise.shrinkage)
+        reach, spread = rays.range * longer, rays.range_sigma * longer
+        ranged = replace(rays, direction=direction, sigma=sigma, range=reach, range_sigma=spread)
         tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))
         if self.settings.mode == "joint":
             noise = self.noise
@@ -323,28 +330,21 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
     keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
     """
     names: tuple[str, ...] = ()
+    half = half_widths_of_rays(rays, keyframes, [one.camera for one in log.cameras])
     if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):
         cameras = {one.camera.name: (keyframes.camera == index).any() for index, one in enumerate(log.cameras)}
         measured = {
             **cameras,
             "odometry": keyframes.odom_T_base is not None,
-            "range_scale": np.isfinite(rays.range).any(),
-            "tag_scale": _sized_tags(rays, settings),
+            **measured_lengths(rays, half, settings),
         }
         names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
+    rays = with_known_surfaces(rays, half, settings.calibration.surface if "surface" in names else 0.0)
     mean, given_poses = np.zeros(len(names)), against_given_poses(log, settings)
     prior = np.diag([prior_sigma(name, settings, given_poses) ** 2 for name in names]).reshape(len(names), len(names))
     known = known_errors(settings) if names else None
     if known is not None:
         here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
         mean[here], prior[np.ix_(here, here)] = known.values[there], known.covariance[np.ix_(there, there)]
-    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior, sized_tags=_sized_tags(rays, settings))
+    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior, sized_tags=has_sized_tags(rays, settings))
     return errors if names or errors.unknown_noise else None
-
-
-def _sized_tags(rays: Rays, settings: Settings) -> bool:
-    """Return whether any ray is to a fiducial whose size is given."""
-    if rays.corner_sigma is None:
-        return False
-    names = (rays.label_names[i] for i in np.unique(rays.label[np.isfinite(rays.corner_sigma)]).tolist())
-    return any(settings.tags.size_of(name) is not None for name in names)

@@ -60,14 +60,17 @@ def explore(
     settings: Settings,
     progress: Callable[[int, int], None],
     errors: CalibratedMeasurements | None = None,
+    surface: float = 0.0,
 ) -> InitialEstimate:
     """Return poses, landmarks and an association. A ray without a sure match has no landmark.
 
     errors: gives the keyframes and rays for any values of the shared errors. The filter estimates these errors, starting
-    from their mean. progress(done, total) is called with numbers of keyframes.
+    from their mean. surface: the value of the shared error of this name, which the filter does not estimate.
+    progress(done, total) is called with numbers of keyframes.
     """
     if errors is not None:
-        keyframes, rays, settings = errors.at(errors.mean)
+        of_surface = np.array([name == "surface" for name in errors.names], dtype=bool)
+        keyframes, rays, settings = errors.at(np.where(of_surface, surface, errors.mean))
     return _Exploration(keyframes, rays, settings, errors).run(progress)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.geometry import inverse
-from objslam.core.noise import NoiseFactors
+from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
 from objslam.frontend.turning_odometry import with_turns_of_tracks
@@ -39,6 +39,7 @@ from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
+    from objslam.frontend.shared_errors import SharedErrors
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _NOISIER = 1.5
@@ -259,7 +260,8 @@ def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
     exploring = partial(state.progress, "explore")
     start: InitialEstimate | None = None
     if np.isfinite(state.rays.range).any():
-        start = ekf_exploration.explore(state.keyframes, state.rays, state.settings, exploring, state.errors)
+        surface = 0.0 if state.errors is None else _surface(state.errors, state.theta)
+        start = ekf_exploration.explore(state.keyframes, state.rays, state.settings, exploring, state.errors, surface)
     if start is None or not ekf_exploration.is_sure(start):
         return state, initialize_unknown(state.keyframes, state.rays, state.cameras, state.settings, exploring)
     solved = state.solve("association", start.association)
@@ -278,11 +280,21 @@ def _with_loose_odometry(state: JointState, assumed: Floats | None) -> JointStat
     The noise is at least nominal. A solve estimates the shared errors and the noise together, so the rest may be small. An
     exploration has the shared errors fixed, and those of a wrong map are wrong by more than their sigma. With half the noise
     it expects known objects within gates that they miss, and maps them again.
+
+    If nearly all rays agree, wrong distances of centres behind surfaces may still have misled the exploration: an object
+    that is seen from another side then seems to be another object. If the distances differ by more than those of single
+    objects do, the log is explored with them.
     """
-    if state.errors is None or "odometry" not in state.errors.unknown_noise or state.agree.mean() >= _CLEAR:
+    if state.errors is None or "odometry" not in state.errors.unknown_noise:
         return None
     found, values = state.errors.noise, state.theta
-    if max(found.along, found.turning) <= _NOISIER:
+    if state.agree.mean() >= _CLEAR:
+        start = state.errors.mean if assumed is None else assumed
+        if abs(_surface(state.errors, values) - _surface(state.errors, start)) <= state.settings.depth.centre_sigma:
+            return None
+        of_surface = np.array([name == "surface" for name in state.errors.names])
+        found, values = NOMINAL, np.where(of_surface, _surface(state.errors, values), start)
+    elif max(found.along, found.turning) <= _NOISIER:
         if found.rays > _NOISIER:
             found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), assumed
         elif not _drives_otherwise(state, assumed):
@@ -297,6 +309,11 @@ def _at_least_nominal(noise: NoiseFactors) -> NoiseFactors:
     """Return the noise of an exploration: no noise of rays or odometry below that of the settings, and no shrinkage."""
     odometry = {name: max(getattr(noise, name), 1.0) for name in ("along", "across", "turning")}
     return replace(noise, rays=max(noise.rays, 1.0), shrinkage=0.0, **odometry)
+
+
+def _surface(errors: SharedErrors, values: Floats | None) -> float:
+    """Return the shared error `surface` among values (P,), 0 if it is not estimated."""
+    return 0.0 if values is None else float(values[[name == "surface" for name in errors.names]].sum())
 
 
 def _drives_otherwise(state: JointState, assumed: Floats | None) -> bool:

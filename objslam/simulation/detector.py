@@ -7,9 +7,10 @@ import numpy as np
 
 from objslam.core.appearance.features import unit_vectors
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.camera import Camera, depths, in_view
+from objslam.core.camera import Camera, depths, in_view, undistort
 from objslam.core.geometry import inverse
 from objslam.core.types import Detections
+from objslam.frontend.surface_ranges import half_widths, to_centres
 from objslam.simulation.settings import AppearanceNoise, DriveSettings
 
 FALSE_SIZES = (20.0, 120.0)  # The least and largest side of a false box, px.
@@ -92,7 +93,7 @@ def detect(
     box = np.column_stack([centre - seen.size / 2, centre + seen.size / 2])
     if settings.cut_off:
         box = np.clip(box, 0.0, np.tile(camera.size - 1, 2))
-    scores, z = score.uniform(0.5, 1.0, count), _depths(settings, seen.depth, depth)
+    scores, z = score.uniform(0.5, 1.0, count), _depths(settings, _of_surfaces(settings, camera, seen), depth)
     boxes = Boxes(seen.frame, seen.object + first_id, label[seen.object], box, scores, z)
     reach = _reach(settings, seen.size)
     inside = np.asarray(((centre - reach >= 0) & (centre + reach <= camera.size - 1)).all(axis=1))
@@ -109,6 +110,15 @@ def imagine(settings: DriveSettings, camera: Camera, classes: int, seed: np.rand
     box, scores = np.column_stack([corner, corner + size]), rng.uniform(0.3, 0.8, count)
     z = _depths(settings, depth.uniform(0.3, settings.max_range, count), depth)
     return Boxes(frame, np.full(count, -1), label, box, scores, z)
+
+
+def _of_surfaces(settings: DriveSettings, camera: Camera, seen: Views) -> Floats:
+    """Return the depths (M,) z, m, of the visible surfaces of objects, where depths end."""
+    direction, _ = undistort(camera, seen.centre)
+    box = np.concatenate([seen.centre - seen.size / 2, seen.centre + seen.size / 2], axis=1)
+    share = 0.0 if settings.depth is None else settings.depth.surface
+    half = half_widths(box, direction, [camera], np.zeros(len(box), dtype=np.int64))
+    return np.asarray(seen.depth / to_centres(half, share))
 
 
 def _depths(settings: DriveSettings, true: Floats, rng: np.random.Generator) -> Floats:

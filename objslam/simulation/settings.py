@@ -53,6 +53,7 @@ class DepthNoise(Section):
     sigma_per_m: NotNegative = 0.02  # The part of the standard deviation that grows with the depth, m per m.
     missing: Probability = 0.0  # The share of boxes whose depth is missing (NaN).
     wrong: Probability = 0.0  # The share of boxes with a wrong depth, which is random from 0.3 m to max_range.
+    surface: NotNegative = 0.5  # How far the surface is before the centre of an object, as a share of half its width.
 
 
 class AppearanceNoise(Section):

@@ -226,7 +226,7 @@ def test_depths_become_ranges_along_the_ray():
     camera = lens("plumb_bob")
     depths = [2.0, np.nan, 3.0]
     log = log_of(seen(camera, boxes_of(CENTRES), depths=depths))
-    rays, _ = rays_of(log, depth={"sigma": 0.1, "sigma_per_m": 0.05})
+    rays, _ = rays_of(log, depth={"sigma": 0.1, "sigma_per_m": 0.05, "centre": 0.0})
     points = rays.direction * rays.range[:, None]
     np.testing.assert_allclose(points[:, 2], depths)
     assert rays.range[2] > 3.1  # off the axis the way is longer than the depth

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from drives import circle_log, drive_of
 from numpy.testing import assert_allclose
+from scipy.stats import chi2
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
@@ -84,6 +85,21 @@ def test_the_reduced_system_is_that_of_solving_anew(localization):
         assert -system.descent[k] == pytest.approx(slope, abs=0.1 * np.sqrt(system.information[k, k]), rel=0.1)
 
 
+@pytest.mark.parametrize("surface", [0.0, 0.5, 1.0])
+def test_how_far_centres_are_behind_surfaces_is_found(surface):
+    """Without it, the scale of the odometry would take the difference, and all objects would be too near or too far."""
+    made, errors = drive({}, depth=DepthNoise(surface=surface))
+    found, plain = solve(made, errors), solve(drive({}, depth=DepthNoise(surface=surface))[0], None)
+    at = errors.names.index("surface")
+    off = found.calibration.values[at] - (surface - 0.5)
+    assert found.calibration.sigma[at] < 0.3
+    assert abs(off) < 3 * found.calibration.sigma[at]
+    miss = found.positions - made.points
+    distance2 = np.einsum("ni,ni->n", miss, np.linalg.solve(found.covariance, miss[:, :, None])[:, :, 0])
+    assert (distance2 < chi2.ppf(0.999, 3)).all()
+    assert plain.calibration is None
+
+
 @pytest.mark.parametrize("ranged", [True, False])
 def test_the_errors_of_a_log_are_found(ranged):
     made, errors = drive(ERRORS, depth=DepthNoise() if ranged else None)
@@ -119,7 +135,8 @@ def test_two_scales_that_trade_off_are_said():
 
 
 def test_without_errors_the_map_is_as_good():
-    made, errors = drive({}, depth=DepthNoise())
+    known = "calibration.surface=0", "depth.centre_sigma=0"  # All simulated surfaces are equally far before the centres.
+    made, errors = drive({}, depth=DepthNoise(), overrides=known)
     found, plain = solve(made, errors), solve(made, None)
     assert np.median(made.object_errors(found.positions)) < 1.2 * np.median(made.object_errors(plain.positions)) + 0.01
 
@@ -129,9 +146,10 @@ def test_a_calibration_of_before_is_where_the_next_solve_begins(tmp_path):
     first = solve(made, errors).calibration
     (tmp_path / "calibration.yaml").write_text(dump_calibration(first))
     again, known = drive(ERRORS, seed=2, depth=DepthNoise(), overrides=(f"calibration.file={tmp_path}/calibration.yaml",))
-    assert_allclose(known.mean, first.values)
+    of_robot = [name != "surface" for name in first.names]  # Another place has other things.
+    assert_allclose(known.mean, np.where(of_robot, first.values, 0.0))
     second = solve(again, known).calibration
-    assert (second.sigma < first.sigma).all()
+    assert (second.sigma < first.sigma)[of_robot].all()
     true = np.array([ERRORS.get(name, 0.0) for name in second.names])
     assert (np.abs(second.values - true) < 4 * second.sigma).all()
 

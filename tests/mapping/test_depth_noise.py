@@ -81,7 +81,7 @@ def test_noise_that_a_camera_tells_is_not_estimated():
 def test_ranges_of_each_camera_have_its_noise():
     cameras = [replace(logs()[0].cameras[0].camera, depth_noise=noise) for noise in (None, NOISE)]
     settings = load_settings(None, ())
-    sigma, bias = range_noise(np.array([1.0, 1.0, 3.0]), np.array([0, 1, 1]), cameras, settings)
+    sigma, bias = range_noise(np.array([1.0, 1.0, 3.0]), np.zeros(3), np.array([0, 1, 1]), cameras, settings)
     of, (least, per_m, shared) = settings.depth, astuple(NOISE)
     np.testing.assert_allclose(sigma, [of.sigma + of.sigma_per_m, least + per_m, least + 3 * per_m])
     np.testing.assert_allclose(bias, [of.bias, shared, shared])

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from objslam.config import Settings
 from objslam.core.calibration import Calibration
 from objslam.core.noise import NoiseFactors
 from objslam.mapping.joint_solve import _with_loose_odometry
 
-NAMES = ("odometry.scale", "odometry.turn_scale", "front.clock")
+NAMES = ("odometry.scale", "odometry.turn_scale", "front.clock", "surface")
 
 
 class Errors(SimpleNamespace):
@@ -22,14 +23,19 @@ class Errors(SimpleNamespace):
         return Errors(**{**vars(self), "noise": noise})
 
 
-def state(turn: float, *, agree: float = 0.88, clock: float = 0.0, noise: NoiseFactors | None = None):
-    values = np.array([0.0, turn, clock])
-    found = Calibration(NAMES, values, np.diag([0.03, 0.007, 0.004]) ** 2, np.array([0.03, 0.05, 0.1]))
-    errors = Errors(noise=noise or NoiseFactors(), unknown_noise=("odometry",), mean=np.zeros(3))
+def state(turn: float, *, agree: float = 0.88, clock: float = 0.0, surface: float = 0.0, noise: NoiseFactors | None = None):
+    values = np.array([0.0, turn, clock, surface])
+    found = Calibration(NAMES, values, np.diag([0.03, 0.007, 0.004, 0.1]) ** 2, np.array([0.03, 0.05, 0.1, 0.5]))
+    errors = Errors(noise=noise or NoiseFactors(), unknown_noise=("odometry",), mean=np.zeros(4), names=NAMES)
     weights = np.arange(100) < 100 * agree
     estimate = SimpleNamespace(calibration=found)
     return SimpleNamespace(
-        errors=errors, theta=values, estimate=estimate, agree=weights, attempt=lambda: Attempt(theta=None)
+        errors=errors,
+        theta=values,
+        estimate=estimate,
+        agree=weights,
+        attempt=lambda: Attempt(theta=None),
+        settings=Settings(),
     )
 
 
@@ -60,6 +66,8 @@ def replace_any(monkeypatch):
         ({"turn": -0.01}, False),
         ({"turn": -0.05, "agree": 0.97}, False),
         ({"turn": 0.0, "clock": 0.3}, False),
+        ({"turn": 0.0, "agree": 0.97, "surface": 0.2}, False),
+        ({"turn": 0.0, "agree": 0.97, "surface": -0.5}, True),
     ],
 )
 def test_a_robot_that_turns_less_than_its_odometry_says_is_explored_again(given, again):
@@ -69,9 +77,16 @@ def test_a_robot_that_turns_less_than_its_odometry_says_is_explored_again(given,
         assert attempt.theta[1] == given["turn"]
 
 
+def test_only_the_surfaces_are_taken_from_a_map_that_explains_nearly_all_rays():
+    attempt = _with_loose_odometry(state(turn=-0.05, agree=0.97, surface=-0.5, noise=NoiseFactors(turning=9.0)), None)
+    assert attempt is not None
+    np.testing.assert_array_equal(attempt.theta, [0.0, 0.0, 0.0, -0.5])
+    assert attempt.errors.noise.turning == 1.0
+
+
 def test_turns_that_the_exploration_began_with_are_no_reason_to_explore_again():
-    assert _with_loose_odometry(state(turn=-0.05), np.array([0.0, -0.045, 0.0])) is None
-    assert _with_loose_odometry(state(turn=-0.05), np.array([0.0, 0.02, 0.0])) is not None
+    assert _with_loose_odometry(state(turn=-0.05), np.array([0.0, -0.045, 0.0, 0.0])) is None
+    assert _with_loose_odometry(state(turn=-0.05), np.array([0.0, 0.02, 0.0, 0.0])) is not None
 
 
 def test_a_log_is_not_explored_with_less_noise_than_the_settings_say():

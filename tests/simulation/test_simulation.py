@@ -11,6 +11,7 @@ from objslam.errors import ConfigError
 from objslam.simulation import PRESETS, DepthNoise, DriveSettings, PoseNoise, make_camera, pair, preset, simulate
 
 EXACT = {"tracks": "perfect", "objects": 8, "frames": 120}
+OF_CENTRES = DepthNoise(sigma=0.0, sigma_per_m=0.0, surface=0.0)
 CAMERAS = {
     "pinhole": make_camera(pitch=0.1),
     "plumb_bob": make_camera(distortion=(-0.3, 0.1, 0.001, -0.002, 0.0), yaw=0.2),
@@ -126,9 +127,7 @@ def test_camera_points_where_it_is_told():
 
 
 def test_box_sizes_follow_extent_and_depth():
-    settings = DriveSettings(
-        objects=0, placed=(("cup", (3.5, 0.0, 0.3)),), path=(1, 2), frames=100, depth=DepthNoise(sigma=0.0, sigma_per_m=0.0)
-    )
+    settings = DriveSettings(objects=0, placed=(("cup", (3.5, 0.0, 0.3)),), path=(1, 2), frames=100, depth=OF_CENTRES)
     d = detections(settings)
     sizes = d.boxes[:, 2:] - d.boxes[:, :2]
     assert len(d) > 10
@@ -307,20 +306,35 @@ def test_several_cameras_take_turns():
     assert all(len(c.detections) > 10 for c in log.cameras)
 
 
+def test_depth_ends_on_the_surface():
+    """The surface is nearer than the centre by a share of half the width of the object, along the ray."""
+    frames = DriveSettings(**EXACT | {"frames": 400}, depth=OF_CENTRES)
+    balls = frames.model_copy(update={"depth": OF_CENTRES.model_copy(update={"surface": 1.0})})
+    log, nearer = simulate(frames, 0), detections(balls)
+    d = log.cameras[0].detections
+    map_T_camera = log.truth.trajectory.poses[d.frame] @ log.cameras[0].camera.base_T_camera
+    points = np.array([o.position for o in log.truth.objects])[d.track_ids]
+    distance = np.linalg.norm(points - map_T_camera[:, :3, 3], axis=1)
+    width = (d.boxes[:, 2] - d.boxes[:, 0]) * d.depths / log.cameras[0].camera.matrix[0, 0]
+    np.testing.assert_allclose(distance * (1 - nearer.depths / d.depths), width / 2, rtol=1e-6)
+
+
 def test_depth_is_z_with_its_errors():
-    log = simulate(DriveSettings(**EXACT | {"frames": 400}, depth=DepthNoise(sigma=0.0, sigma_per_m=0.0)), 0)
+    log = simulate(DriveSettings(**EXACT | {"frames": 400}, depth=OF_CENTRES), 0)
     d = log.cameras[0].detections
     map_T_camera = log.truth.trajectory.poses[d.frame] @ log.cameras[0].camera.base_T_camera
     points = np.array([o.position for o in log.truth.objects])[d.track_ids]
     z = np.einsum("ri,ri->r", points - map_T_camera[:, :3, 3], map_T_camera[:, :3, 2])
     np.testing.assert_allclose(d.depths, z, atol=1e-9)
 
-    noisy = detections(DriveSettings(**EXACT | {"frames": 400}, depth=DepthNoise(sigma=0.03, sigma_per_m=0.02, missing=0.2)))
+    noisy = DepthNoise(sigma=0.03, sigma_per_m=0.02, missing=0.2, surface=0.0)
+    noisy = detections(DriveSettings(**EXACT | {"frames": 400}, depth=noisy))
     missing = np.isnan(noisy.depths)
     assert in_band(missing.sum(), len(noisy), 0.2)
     assert sigma_fits(((noisy.depths - z) / np.hypot(0.03, 0.02 * z))[~missing], 1.0)
 
-    wrong = detections(DriveSettings(**EXACT | {"frames": 400}, depth=DepthNoise(sigma=0.0, sigma_per_m=0.0, wrong=0.1)))
+    wrong = DepthNoise(sigma=0.0, sigma_per_m=0.0, wrong=0.1, surface=0.0)
+    wrong = detections(DriveSettings(**EXACT | {"frames": 400}, depth=wrong))
     assert in_band((np.abs(wrong.depths - z) > 1e-6).sum(), len(wrong), 0.1)
 
 
@@ -342,7 +356,7 @@ def test_broken_tracks_start_anew_after_a_second():
 
 
 def test_moving_objects_are_seen_but_no_part_of_the_truth():
-    log = simulate(DriveSettings(**EXACT | {"frames": 400}, moving=3, depth=DepthNoise(sigma=0.0, sigma_per_m=0.0)), 0)
+    log = simulate(DriveSettings(**EXACT | {"frames": 400}, moving=3, depth=OF_CENTRES), 0)
     d, camera = log.cameras[0].detections, log.cameras[0].camera
     assert len(log.truth.objects) == 8
     for k in (8, 9, 10):

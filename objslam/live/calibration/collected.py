@@ -10,6 +10,7 @@ from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Tra
 from objslam.errors import ObjslamError
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.surface_ranges import range_factors
 from objslam.live.mapper.state import MapState
 from objslam.mapping.solution import seen_something
 
@@ -99,7 +100,7 @@ def as_measured(m: MapState, rows: Ints) -> Keyframes:
 
 def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     """Return the rays in these rows (R,) without corrections. keyframe: (R,) index of each ray's keyframe."""
-    longer = 1 + m.errors.get("range_scale", 0.0)
+    longer = range_factors(m.errors, m.half_widths(rows))
     rays = offline_rays(m, rows, keyframe)
     direction = rays.direction
     for number, camera in enumerate(m.cameras):
@@ -112,7 +113,7 @@ def offline_rays(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     """Return the rays in these rows (R,), corrected, as `Rays`. keyframe: (R,) index of each ray's keyframe."""
     names = ("direction", "sigma", "range", "range_sigma", "label", "score", "box")
     columns = {name: getattr(m.rays, name)[rows] for name in names}
-    _, bias = range_noise(columns["range"], m.camera_of_rays(rows), m.sent_cameras, m.given)
+    _, bias = range_noise(columns["range"], m.half_widths(rows), m.camera_of_rays(rows), m.sent_cameras, m.given)
     return Rays(keyframe=keyframe, **columns, range_bias=bias, track_id=m.rays.track[rows], label_names=tuple(m.labels))
 
 

@@ -9,6 +9,7 @@ from objslam.core.types import Keyframes, Log
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.frontend.shared_errors import SharedErrors
+from objslam.frontend.surface_ranges import range_factors
 from objslam.graph.factors.localization import localizations
 from objslam.graph.factors.priors import anchor
 from objslam.live.calibration.collected import as_measured, offline_rays, recorded_log
@@ -77,8 +78,9 @@ def _errors(m: MapState, log: Log, keyframes: Keyframes, rows: Ints) -> tuple[Sh
 def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
     """Correct the rays by the new errors instead of the errors `before`. Return whether any ray may have changed."""
     rays, camera = m.rays, m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe)]
-    longer = (1 + m.errors.get("range_scale", 0.0)) / (1 + before.get("range_scale", 0.0))
-    changed = longer != 1
+    half = m.half_widths(np.arange(len(rays.number)))
+    longer = range_factors(m.errors, half) / range_factors(before, half)
+    changed = bool((longer != 1).any())
     rays.range[:] *= longer
     rays.range_sigma[:] *= longer
     for number, one in enumerate(m.cameras):

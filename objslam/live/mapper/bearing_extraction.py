@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.observations import box_sizes
 from objslam.core.arrays import Floats
-from objslam.core.camera import Camera
+from objslam.core.camera import Camera, box_sizes
 from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, surest
 from objslam.frontend.corrected_log import corrected_camera, corrected_mount, lens_errors, refocused
+from objslam.frontend.surface_ranges import half_widths, range_factors, to_centres
 from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
@@ -72,14 +72,16 @@ class BearingExtractor:
         label = np.array([self._label_number[name] for name in frame.labels], dtype=np.int64)
         few = surest(np.zeros(len(kept), dtype=np.int64), label[kept], frame.scores[kept], camera, self._ledger)
         kept, direction, sigma = kept[few], direction[few], sigma[few]
-        reach = frame.depths[kept] / direction[:, 2] if settings.depth.use else np.full(len(kept), np.nan)
-        lens, longer = lens_errors(errors, frame.camera), 1 + errors.get("range_scale", 0.0)
         same = np.zeros(len(kept), dtype=np.int64)
+        half = half_widths(frame.boxes[kept], direction, [camera], same)
+        reach = frame.depths[kept] / direction[:, 2] if settings.depth.use else np.full(len(kept), np.nan)
+        reach = reach * to_centres(half, settings.depth.centre)
+        lens, longer = lens_errors(errors, frame.camera), range_factors(errors, half)
         rays = FrameRays(
             direction=refocused(direction, np.ones(len(direction), dtype=bool), lens),
             sigma=sigma,
             range=reach * longer,
-            range_sigma=range_noise(reach, same, [camera], settings)[0] * longer,
+            range_sigma=range_noise(reach, half, same, [camera], settings)[0] * longer,
             label=label[kept],
             score=frame.scores[kept],
             box=frame.boxes[kept],

@@ -167,6 +167,10 @@ class MapState:
         k = self.keyframes
         return np.asarray(k.camera[np.searchsorted(k.id, self.rays.keyframe[at])])
 
+    def half_widths(self, at: Ints) -> Floats:
+        """Return half the width of the thing in the box of each ray in rows (n,), as `surface_ranges.half_widths`."""
+        return self.rays.size[at, 0] / 2
+
     def bearings(self, at: Ints) -> Bearings:
         """Return the rays in rows (n,) for the graph.
 
@@ -176,7 +180,8 @@ class MapState:
         rays = self.rays
         sigma = rays.range_sigma[at]
         if np.isfinite(sigma).any():
-            _, bias = range_noise(rays.range[at], self.camera_of_rays(at), self.sent_cameras, self.settings)
+            camera = self.camera_of_rays(at)
+            _, bias = range_noise(rays.range[at], self.half_widths(at), camera, self.sent_cameras, self.settings)
             sigma = np.sqrt(sigma**2 + (self.landmarks.seen[self.rows_of(rays.owner[at])] + 1) * bias**2)
         direction, noise = self.to_landmarks(at)
         columns = {name: getattr(rays, name)[at] for name in ("number", "keyframe", "range")}

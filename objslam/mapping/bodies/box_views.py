@@ -20,8 +20,9 @@ from objslam.triangulation.bodies.edges import BoxEdges, contacts, tangent_plane
 class BoxViews:
     """B boxes of n bodies.
 
-    rays: the rays of the boxes. map_T_camera: (K, 4, 4) of the keyframes. body: (B,) the body of each box. points: (n, 3) m,
-    of the objects. half: (n, 2) m, their apparent half axes across and upwards. bound: (B, 4) as in `BoxEdges`.
+    rays: the rays of the boxes, whose ranges end on surfaces. map_T_camera: (K, 4, 4) of the keyframes. body: (B,) the body
+    of each box. points: (n, 3) m, of the objects. half: (n, 2) m, their apparent half axes across and upwards. bound: (B, 4)
+    as in `BoxEdges`.
     """
 
     keyframes: Keyframes

@@ -12,6 +12,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES, UNKNOWN_YAW, Body, PlacedBody
 from objslam.core.camera import Camera
 from objslam.core.statistics import grouped_median
+from objslam.frontend.surface_ranges import centre_factors, half_widths_of_rays
 from objslam.frontend.up import up_axis
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
@@ -108,6 +109,9 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     border = max(settings.rays.border, 0.0)
     size = np.array([c.size for c in cameras])[keyframes.camera[used.keyframe]]
     bound = np.concatenate([used.box[:, :2] <= border, used.box[:, 2:] >= size - 1 - border], axis=1)
+    calibration = estimate.calibration
+    errors = {} if calibration is None else dict(zip(calibration.names, calibration.values.tolist(), strict=True))
+    used = replace(used, range=used.range / centre_factors(errors, half_widths_of_rays(used, keyframes, cameras), settings))
     boxes = BoxViews(keyframes, used, cameras, settings, map_T_camera, body, points, half, bound)
     return _Views(objects, ray, boxes)
 

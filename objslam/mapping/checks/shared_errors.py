@@ -22,6 +22,7 @@ _CAUSES = {
     "tilt": "is base_T_camera right?",
     "roll": "is base_T_camera right?",
     "range_scale": "is the depth in metres (depth_scale)?",
+    "surface": "do the depths end on the surfaces of the things (depth.centre)?",
     "tag_scale": "is tags.size the side between the corners that the detector reports?",
     "focal": "are the camera matrix and the boxes of the same image size?",
     "cx": "are the camera matrix and the boxes of the same image size?",

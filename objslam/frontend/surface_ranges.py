@@ -1,0 +1,61 @@
+"""Ranges that end on the visible surface of a thing, and the distance of its centre behind the surface."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Floats, Ints
+from objslam.core.camera import Camera, box_sizes
+from objslam.core.types import Keyframes, Rays
+
+_LEAST = 0.2
+"""The least ratio of a range to the distance of the centre. A smaller number lets boxes that fill the image move centres
+farther away."""
+
+
+def half_widths(
+    box: Floats, direction: Floats, cameras: Sequence[Camera], camera: Ints, flat: np.ndarray | bool = False
+) -> Floats:
+    """Return half the width (R,) of the thing in each box, in m per m of its distance.
+
+    It is 0 for cameras whose boxes do not show sizes, and for things that are known to be flat. box: (R, 4) px. direction:
+    (R, 3) unit, in the camera frame. camera: (R,) number of its camera. flat: (R,) whether a thing is a fiducial.
+    """
+    sized = np.array([c.sees_size for c in cameras], dtype=bool)[camera]
+    return np.where(sized & ~np.asarray(flat), box_sizes(box, direction, cameras, camera)[:, 0] / 2, 0.0)
+
+
+def half_widths_of_rays(rays: Rays, keyframes: Keyframes, cameras: Sequence[Camera]) -> Floats:
+    """Return half the width (R,) of the thing in the box of each ray, as `half_widths`."""
+    flat = False if rays.corner_sigma is None else np.isfinite(rays.corner_sigma)
+    return half_widths(rays.box, rays.direction, cameras, keyframes.camera[rays.keyframe], flat)
+
+
+def to_centres(half: Floats, share: float) -> Floats:
+    """Return the ratio (R,) of the distance of the centre of a thing to the range of its surface.
+
+    half: (R,) as `half_widths`. share: how far the centre is behind the surface, as a share of half the width.
+    """
+    return np.asarray(1 / np.maximum(1 - share * half, _LEAST))
+
+
+def range_factors(errors: Mapping[str, float], half: Floats) -> Floats:
+    """Return the factors (R,) that correct ranges for the shared errors `range_scale` and `surface`. half: as
+    `half_widths`."""
+    return (1 + errors.get("range_scale", 0.0)) * to_centres(half, errors.get("surface", 0.0))
+
+
+def centre_factors(errors: Mapping[str, float], half: Floats, settings: Settings) -> Floats:
+    """Return the ratios (R,) of corrected ranges of centres to those of surfaces. half: as `half_widths`."""
+    return to_centres(half, settings.depth.centre) * to_centres(half, errors.get("surface", 0.0))
+
+
+def with_known_surfaces(rays: Rays, half: Floats, sigma: float) -> Rays:
+    """Return the rays without the uncertainty that all things of a log share, because it is estimated.
+
+    half: (R,) as `half_widths`. sigma: the standard deviation of `surface` that is part of `Rays.range_bias`.
+    """
+    shared = sigma * half * rays.range
+    return replace(rays, range_bias=np.sqrt(np.maximum(rays.range_bias**2 - np.nan_to_num(shared) ** 2, 0.0)))
