@@ -34,8 +34,8 @@ class CalibrationSettings(Section):
     roll: NotNegative = 0.02
     """rad; the rotation of each camera on the base about the forward axis."""
     translation: Literal["auto"] | NotNegative = "auto"
-    """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode, and in joint mode
-    without odometry, else 0."""
+    """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode and with a localisation,
+    else 0."""
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
     surface: NotNegative = 0.5

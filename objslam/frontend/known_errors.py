@@ -17,7 +17,7 @@ from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
 from objslam.io.calibration_yaml import load_calibration
 
 _PRIORS = {"translation": 0.05, "focal": 0.02, "centre": 0.02}
-"""The prior standard deviations that `auto` means: the first in fixed mode and in joint mode without odometry, the others in
+"""The prior standard deviations that `auto` means: the first for a log with a localisation and in fixed mode, the others in
 fixed mode. The first (m) is for a place that was measured with a ruler. The second (a share) is for a field of view from a
 data sheet. The third (a share of the focal length) is for an image centre that is assumed in the middle of the image. A
 calibrated camera errs less. With larger values, a log must show more before an error counts as known."""
@@ -35,11 +35,11 @@ def error_names(log: Log) -> tuple[str, ...]:
 
 
 def against_given_poses(log: Log, settings: Settings) -> bool:
-    """Return whether the errors of cameras are found against the poses of a localisation alone.
+    """Return whether the errors of cameras are found against given poses: those of a localisation, or of fixed mode.
 
-    So it is in fixed mode, and in joint mode without odometry. Then a wrong place of a camera moves all objects.
+    Then a wrong place of a camera moves all objects. A map from odometry alone moves along.
     """
-    return settings.mode == "fixed" or (log.odometry is None and log.localization is not None)
+    return settings.mode == "fixed" or log.localization is not None
 
 
 def prior_sigma(name: str, settings: Settings, given_poses: bool) -> float:

@@ -157,7 +157,9 @@ def most_likely(data: ComparedPoses) -> PoseErrors:
     """
     most = _MOST_FACTOR if data.free else 0.0
     usual, cost_usual = _searched(data, _begun(data, PoseErrors(), 0.0), 0.0, ())
-    best, least = _searched(data, _begun(data, usual, most), most, ())
+    # Too large an error of the prediction is a local optimum, so the search also begins at that of the odometry's noise.
+    begun = {_begun(data, replace(usual, predicted=predicted), most) for predicted in (0.0, usual.predicted)}
+    best, least = min((_searched(data, start, most, ()) for start in begun), key=lambda found: found[1])
     lasting, cost = _searched(data, _begun_lasting(data, best), most, (_BOTH,))
     if cost < least - _SIGNIFICANT:
         best, least = lasting, cost
@@ -215,17 +217,9 @@ def _with_lasting(model: PoseErrors, names: tuple[str, ...], share: int, time: i
 
 
 def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
-    """Return the best of a few models with sizes of the errors up to `most`.
-
-    From a large error of the prediction, the steps of a search would not find small ones.
-    """
+    """Return the best of a few models with sizes of the errors up to `most`, with the prediction's error of a model."""
     sizes = [size for size in _SIZES if size <= most]
-    tried = [
-        replace(model, heading=ErrorKind(heading), place=ErrorKind(place), predicted=predicted)
-        for heading in sizes
-        for place in sizes
-        for predicted in (0.0, model.predicted)
-    ]
+    tried = [replace(model, heading=ErrorKind(heading), place=ErrorKind(place)) for heading in sizes for place in sizes]
     return min(tried, key=data.cost)
 
 
