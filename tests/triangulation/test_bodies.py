@@ -23,7 +23,7 @@ from objslam.triangulation.bodies.edges import BoxEdges, contacts
 from objslam.triangulation.bodies.ellipsoid import from_axes
 from objslam.triangulation.bodies.fit import Prior, Weights, fit
 from objslam.triangulation.bodies.prior import weak_prior
-from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals
+from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals, touched_points
 from objslam.triangulation.bodies.shapes import CUBOID, CYLINDER, ELLIPSOID
 from objslam.triangulation.bodies.shared import covariance_of, sides_of
 from objslam.triangulation.bodies.solve import solve_bodies
@@ -46,7 +46,7 @@ def test_true_ellipsoids_are_found_from_their_boxes(lens):
     for _ in range(1 if lens == "pinhole" else 6):  # The contacts converge by a factor of about 50.
         edges = edges_of(camera, boxes, poses, body, contact=contact)
         values = fit(edges, values, prior, plain(len(body)), ELLIPSOID).values
-        contact = contacts(camera, boxes, poses, edge_gaps(edges, values, ELLIPSOID)[2])
+        contact = contacts(camera, boxes, poses, edge_gaps(edges, values, ELLIPSOID)[2][:, :, None])
     assert np.abs(values - true).max() < 1e-6
 
 
@@ -64,6 +64,33 @@ def test_a_true_cuboid_is_found_from_its_boxes():
     assert np.abs(found[0, :3] - centre).max() < 1e-6
     assert np.abs(CUBOID.half_axes(found)[0] - half).max() < 1e-6
     assert abs(CUBOID.heading(found)[0] - yaw) < 1e-6
+
+
+@pytest.mark.parametrize("shape", ["cuboid", "cylinder"])
+def test_straight_sides_are_curved_in_a_wide_lens(shape):
+    """A box touches the curved image of an upright side in its middle, and not at a corner."""
+    rng, camera, kind = np.random.default_rng(2), CAMERAS["equidistant"], {"cuboid": CUBOID, "cylinder": CYLINDER}[shape]
+    centre, half, yaw = np.array([0.2, -0.1, 0.3]), np.array([0.35, 0.25, 0.9]), 0.5
+    height = np.linspace(-1, 1, 201)[:, None, None]
+    rim = corners_of(half, yaw)[::2] if shape == "cuboid" else ring_of(half)[:40]
+    if shape == "cuboid":  # The straight sides at the top and at the bottom are curved too.
+        rim = np.concatenate([a + np.linspace(0, 1, 101)[:, None] * (b - a) for a in rim for b in rim])
+    surface = centre + (rim * [1, 1, 0] + height * [0, 0, half[2]]).reshape(-1, 3)
+    poses = np.array(
+        [
+            looking_at(centre + d * np.array([np.cos(a), np.sin(a), 0.1]), centre + rng.normal(0, 0.6, 3))
+            for a, d in zip(rng.uniform(0, 6, 20), rng.uniform(1.6, 3, 20), strict=True)
+        ]
+    )
+    boxes = np.array([box_around(camera, surface, pose) for pose in poses])
+    start = np.array([[0.25, -0.05, 0.2, -1.0, 0.1, 0.3, -0.3]])
+    values, prior, contact = start, Prior(start, 1e-12 * np.eye(7)[None]), None
+    for _ in range(8):
+        edges = edges_of(camera, boxes, poses, np.zeros(20, dtype=int), contact=contact)
+        values = fit(edges, values, prior, plain(20), kind).values
+        contact = contacts(camera, boxes, poses, touched_points(edges, values, np.array([SHAPES.index(shape)])))
+    assert np.abs(values[0, :3] - centre).max() < 3e-3
+    np.testing.assert_allclose(kind.half_axes(values)[0], half, rtol=0.02)
 
 
 @pytest.mark.parametrize("kind", [ELLIPSOID, CUBOID, CYLINDER])

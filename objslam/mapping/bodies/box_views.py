@@ -61,7 +61,7 @@ class BoxViews:
         return replace(self, rays=self.rays.take(boxes), body=self.body[boxes], bound=self.bound[boxes])
 
     def contacts(self, touched: Floats) -> Floats:
-        """Return where (B, 4), px, the edges touch the images of bodies. touched: (B, 4, 3) m, the points where the bodies
+        """Return where (B, 4), px, the edges touch the images of bodies. touched: (B, 4, P, 3) m, the points where they may
         touch."""
         found, poses = np.zeros((len(self.body), 4)), self.poses
         for i in np.unique(self.camera):
@@ -70,7 +70,7 @@ class BoxViews:
         return found
 
     def edges(self, touched: Floats | None = None) -> BoxEdges:
-        """Return the planes of the boxes. touched: (B, 4, 3) m, the points at which the bodies touch these planes, if
+        """Return the planes of the boxes. touched: (B, 4, P, 3) m, the points at which the bodies may touch them, if
         known."""
         rays, settings, poses, camera = self.rays, self.settings, self.poses, self.camera
         count = len(self.body)

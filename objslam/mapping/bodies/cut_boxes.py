@@ -163,9 +163,9 @@ def _edges(cut: CutBoxes, keyframe: Ints, box: Ints, body: Ints, bodies: Bodies,
 
 
 def _touches_outside(views: BoxViews, touched: Floats) -> Bools:
-    """Return which edges (B, 4) a body may touch outside the image, given the points (B, 4, 3), m, that it touches."""
+    """Return which edges (B, 4) a body may touch outside the image, given the points (B, 4, P, 3), m, that it may touch."""
     pose, box, at = views.poses, views.rays.box, views.contacts(touched)
-    depth = ((touched - pose[:, None, :3, 3]) * pose[:, None, :3, 2]).sum(axis=2)
+    depth = ((touched[:, :, 0] - pose[:, None, :3, 3]) * pose[:, None, :3, 2]).sum(axis=2)
     low, high = box[:, [1, 0, 1, 0]], box[:, [3, 2, 3, 2]]  # The ends of each edge.
     margin = _WITHIN * (high - low)
     before = views.bound[:, [1, 0, 1, 0]] & (at <= low + margin)

@@ -36,6 +36,14 @@ def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
     return a + b + c, np.stack([a + b, a - b, turned, c], axis=-1), corner
 
 
+def sides(values: Floats, touched: Floats) -> Floats:
+    """Return the vectors (B, 4, 3, 3) along the sides that end at corners (B, 4, 3) relative to the centres (see
+    `shapes.Kind`)."""
+    back = values * [1, 1, 1, 1, 1, -1, 1]
+    along = -2 * _local(values, touched)[..., None] * np.eye(3)
+    return _local(back[..., None, :], along)
+
+
 def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats, Bools]:
     """Return the ranges of cuboids (see `shapes.Kind`): the last of the three slabs that a ray enters (Kay, Kajiya 1986)."""
     start, along, half = _local(values, origins - values[:, :3]), _local(values, directions), _half(values)

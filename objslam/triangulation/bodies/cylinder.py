@@ -33,6 +33,12 @@ def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
     return across + half * np.abs(z), by, rim
 
 
+def sides(values: Floats, touched: Floats) -> Floats:
+    """Return the vectors (B, 4, 1, 3) along the tube from points (B, 4, 3) of its rims relative to the centres (see
+    `shapes.Kind`)."""
+    return touched[..., None, :] * [0.0, 0.0, -2.0]
+
+
 def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats, Bools]:
     """Return the ranges of cylinders (see `shapes.Kind`): where a ray has entered both the tube and the slab."""
     start, half = origins - values[:, :3], np.exp(values[:, 6])

@@ -86,14 +86,19 @@ def tangent_planes(
 
 
 def contacts(camera: Camera, boxes: Floats, map_T_camera: Floats, touched: Floats) -> Floats:
-    """Return where (B, 4), px, the edges of boxes (B, 4) touch the image of a body, given the points (B, 4, 3) in map.
+    """Return where (B, 4), px, the edges of boxes (B, 4) touch the image of a body.
 
-    A point that is not in front of the camera gives the middle of its edge. A point beyond the edge gives its nearest end.
+    touched: (B, 4, P, 3) in map, points at which each edge may touch the body. The one farthest out in the image counts. If
+    none is in front of the camera, the result is the middle of the edge. A point beyond the edge gives its nearest end.
     """
-    local = np.einsum("bij,bki->bkj", map_T_camera[:, :3, :3], touched - map_T_camera[:, None, :3, 3])
+    local = np.einsum("bij,bkpi->bkpj", map_T_camera[:, :3, :3], touched - map_T_camera[:, None, None, :3, 3])
     ahead = local[..., 2] > 0
     safe = np.where(ahead[..., None], local, [0.0, 0.0, 1.0])
-    pixel = project(camera, safe.reshape(-1, 3)).reshape(-1, 4, 2)
-    along = np.stack([pixel[:, 0, 1], pixel[:, 1, 0], pixel[:, 2, 1], pixel[:, 3, 0]], axis=1)
+    pixel = project(camera, safe.reshape(-1, 3)).reshape((*ahead.shape, 2))
+    pixel[:, 1::2] = pixel[:, 1::2, :, ::-1]  # (x, y) for vertical edges, but (y, x) for horizontal edges.
+    outward = np.where(ahead & np.isfinite(pixel).all(axis=3), pixel[..., 0] * _OUTWARD[:, None], -np.inf)
+    best = outward.argmax(axis=2)[..., None]
+    along = np.take_along_axis(pixel[..., 1], best, axis=2)[..., 0]
+    ahead = np.take_along_axis(ahead, best, axis=2)[..., 0]
     low, high = boxes[:, [1, 0, 1, 0]], boxes[:, [3, 2, 3, 2]]
     return np.asarray(np.where(ahead & np.isfinite(along), np.clip(along, low, high), (low + high) / 2))

@@ -46,6 +46,11 @@ def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
     return distance, by / (2 * distance[..., None]), normals @ matrices(values[:, 0]) / distance[..., None]
 
 
+def sides(values: Floats, touched: Floats) -> Floats:
+    """Return no vectors (B, 4, 0, 3), because an ellipsoid has no straight sides (see `shapes.Kind`)."""
+    return np.zeros((*touched.shape[:2], 0, 3))
+
+
 def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats, Bools]:
     """Return the ranges of ellipsoids (see `shapes.Kind`): the nearer root of a quadratic equation."""
     inverse, start = np.linalg.inv(matrices(values)), origins - values[:, :3]

@@ -27,6 +27,8 @@ class Kind:
     support: takes parameters (B, 1, 7) and unit normals (B, 4, 3). Returns the distances (B, 4), m, of tangent planes from
     the centre, their derivatives (B, 4, 4) by the last four parameters, and the points (B, 4, 3), m, that they touch,
     relative to the centre.
+    sides: takes parameters (B, 1, 7) and those points. Returns vectors (B, 4, S, 3), m, along the straight sides of the body
+    that end there, to their other ends. In a distorted image, a box may touch a side in its middle.
     ranges: takes parameters (B, 7), origins (B, 3), m, and directions (B, 3) of rays. Returns the distances (B,), m, to the
     surface, their derivatives (B, 7), and which rays (B,) hit it. The other functions take parameters (N, 7). half_axes:
     returns the half axes (N, 3), m, the long horizontal one first. heading: the yaw (N,), rad, of the long axis.
@@ -34,6 +36,7 @@ class Kind:
     """
 
     support: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
+    sides: Callable[[Floats, Floats], Floats]
     ranges: Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Bools]]
     half_axes: Callable[[Floats], Floats]
     heading: Callable[[Floats], Floats]
@@ -41,7 +44,7 @@ class Kind:
 
 
 def _kind(module: Any) -> Kind:
-    return Kind(module.support, module.ranges, module.half_axes, module.heading, module.axes_jacobian)
+    return Kind(module.support, module.sides, module.ranges, module.half_axes, module.heading, module.axes_jacobian)
 
 
 ELLIPSOID, CUBOID, CYLINDER = _kind(ellipsoid), _kind(cuboid), _kind(cylinder)

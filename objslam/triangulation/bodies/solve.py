@@ -27,7 +27,7 @@ from objslam.triangulation.bodies.shared import (
 )
 
 Measure = Callable[[Floats | None], BoxEdges]
-"""The edges of the boxes, given the points (B, 4, 3) in map at which the bodies touch them. None means unknown points."""
+"""The edges of the boxes, given points (B, 4, P, 3) in map at which bodies may touch them. None means unknown points."""
 More = Callable[["Bodies"], "BoxEdges | None"]
 """More edges that can only be found with the bodies, such as those of cut off boxes. None if there are none."""
 
