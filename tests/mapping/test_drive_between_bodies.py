@@ -1,6 +1,7 @@
 """Bodies in the whole pipeline: a robot that drives between large objects, and what becomes of its map and its path."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,6 +31,20 @@ def test_large_objects_bend_neither_map_nor_path(seed):
     for o in result.map:
         assert o.body is not None
         assert (o.body.size_sigma > 0).all()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_large_objects_do_not_move_the_camera_in_fixed_mode(seed):
+    """The drives have no shared errors. The centres of boxes lie beside those of bodies, in the same direction each time."""
+    log = drive(seed, laps=2, frames=300)
+    log = replace(log, odometry=None, localization=log.truth.trajectory)
+    worst = {}
+    for bodies in ("true", "false"):
+        settings = load_settings(None, ("mode=fixed", "output.recording=false", f"bodies.use={bodies}"))
+        found = pipeline.run(log, settings, Ledger()).calibration
+        worst[bodies] = (np.abs(found.values) / found.sigma).max()
+    assert worst["true"] < 0.7
+    assert worst["true"] < 0.6 * worst["false"]
 
 
 def test_a_known_size_is_kept():

@@ -18,6 +18,7 @@ from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.mapping.fixed.fixed_poses import MOST_ROUNDS, SAME, FixedPoses, placed_objects, with_noise_of
 from objslam.mapping.progress import Progress
+from objslam.mapping.solution import Solution
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -102,6 +103,11 @@ def calibrate_fixed(
         ledger.warn(f"the shared errors still change after {MOST_ROUNDS} rounds of association")
     now = at.without(errors, calibration.values)
     estimate = now.solve(association, trace, _parameters(calibration))
+    centred = _calibrated_by_centres(now, errors, association, estimate, calibration.values)
+    if centred is not None:
+        found, calibration = centred, centred.calibration
+        now = at.without(errors, calibration.values)
+        estimate = now.solve(association, trace, _parameters(calibration))
     every_object = now.add_few(association, estimate, told)
     if every_object.count > association.count:
         association = every_object
@@ -112,6 +118,32 @@ def calibrate_fixed(
         ).sensitivity
         found = replace(found, sensitivity=sensitivity)
     return now, association, with_noise_of(_with_covariance(estimate, found), now), rounds
+
+
+def _calibrated_by_centres(
+    now: FixedPoses, errors: SharedErrors, association: Association, estimate: Estimate, theta: Floats
+) -> FixedCalibration | None:
+    """Return the calibration by bearings to the centres of bodies, None if no body shifts its bearings enough.
+
+    The centre of the box of a large thing nearby lies beside the image of the thing's centre, in the same direction from all
+    sides. So the centres of boxes would tilt the camera, or move the centre of its image. now: the input at the errors theta
+    (P,), with its estimate.
+    """
+    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
+    from objslam.graph.fixed_pose_triangulation import largest_noise
+    from objslam.mapping.bodies.centre_bearings import to_centres, worth_turning
+    from objslam.mapping.bodies.fitting import with_bodies
+
+    solution = Solution(now.seen, now.rays_seen, association, estimate, ())
+    shift = with_bodies(solution, now.cameras, now.settings).to_centre
+    if shift is None or not worth_turning(shift, now.rays_seen.sigma, association).any():
+        return None
+    turned = replace(errors, rays=to_centres(errors.rays, np.where((estimate.weight > 0)[:, None], shift, 0.0)))
+    noise = largest_noise(now.seen, now.settings)
+    try:
+        return calibrate_at_poses(turned, association, placed_objects(estimate), theta, noise)
+    except SolveError:  # The calibration by the centres of boxes holds.
+        return None
 
 
 def associate_rows(at: FixedPoses, log: Log, progress: Progress) -> Association | None:
