@@ -35,10 +35,10 @@ class CalibrationSettings(Section):
     """rad; the rotation of each camera on the base about the forward axis."""
     translation: Literal["auto"] | NotNegative = "auto"
     """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode and with a localisation,
-    else 0."""
+    0.02 in joint mode with odometry beside it, and 0 in joint mode with odometry alone."""
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
-    surface: NotNegative = 0.5
+    surface: NotNegative = 0.3
     """share of half their width by which the centres of all things of a log are farther behind their visible surfaces than
     depth.centre says. It is estimated in joint mode only."""
     tag_scale: NotNegative = 0.01

@@ -24,13 +24,13 @@ from objslam.frontend.corrected_log import (
     take_out,
 )
 from objslam.frontend.known_errors import (
-    against_given_poses,
     estimates,
     has_sized_tags,
     known_errors,
     measured_lengths,
     possible,
     prior_sigma,
+    usual_place,
 )
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
@@ -340,8 +340,8 @@ def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings
         }
         names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
     rays = with_known_surfaces(rays, half, settings.calibration.surface if "surface" in names else 0.0)
-    mean, given_poses = np.zeros(len(names)), against_given_poses(log, settings)
-    prior = np.diag([prior_sigma(name, settings, given_poses) ** 2 for name in names]).reshape(len(names), len(names))
+    mean, place = np.zeros(len(names)), usual_place(log, settings)
+    prior = np.diag([prior_sigma(name, settings, place) ** 2 for name in names]).reshape(len(names), len(names))
     known = known_errors(settings) if names else None
     if known is not None:
         here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T

@@ -52,4 +52,4 @@ def test_wide_things_share_more_of_the_error_of_their_ranges(mode):
     settings = load_settings(None, (f"mode={mode}",))
     ranges, half = np.array([2.0, 2.0]), np.array([0.0, 0.2])
     _, bias = range_noise(ranges, half, np.zeros(2, dtype=int), [CAMERA], settings)
-    assert_allclose(bias, [0.05, np.sqrt(0.05**2 + (0.3**2 + 0.5**2) * 0.4**2)])
+    assert_allclose(bias, [0.05, np.sqrt(0.05**2 + (0.3**2 + 0.3**2) * 0.4**2)])
