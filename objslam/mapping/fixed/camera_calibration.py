@@ -105,7 +105,7 @@ def calibrate_fixed(
     estimate = now.solve(association, trace, _parameters(calibration))
     centred = _calibrated_by_centres(now, errors, association, estimate, calibration.values)
     if centred is not None:
-        found, calibration = centred, centred.calibration
+        found, calibration, rounds = centred, centred.calibration, (*rounds, {"objects": association.count})
         now = at.without(errors, calibration.values)
         estimate = now.solve(association, trace, _parameters(calibration))
     every_object = now.add_few(association, estimate, told)
