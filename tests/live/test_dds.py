@@ -147,6 +147,17 @@ def test_reliable_and_best_effort_publishers_of_one_topic_are_each_heard_once(do
     assert surely <= Counter(stamps(sink.odometry)) <= surely + perhaps
 
 
+def test_a_reliable_publisher_beside_a_best_effort_one_is_heard_from_its_first_message(domain, monkeypatch):
+    """It sends as soon as the best-effort reader hears it, before a reliable reader is there."""
+    monkeypatch.setattr("objslam.live.adapters.dds.LOOK_EVERY", 1.5)  # The reliable reader is there in the middle of it.
+    other = Drive(domain, seconds=3600.0, reliable=False, heard=("odom",))
+    with listening(domain, odometry="/odom", detections="none") as (sink, _), robot_process(other):
+        wait_for(lambda: len(sink.odometry) > 20)
+        said = Counter(round(stamp, 6) for stamp in sent(start(Drive(domain, seconds=3.0, heard=("odom",))))["odometry"])
+        wait_for(lambda: Counter(stamps(sink.odometry)) >= said)
+    assert all(count <= 1 + said[stamp] for stamp, count in Counter(stamps(sink.odometry)).items())
+
+
 def test_a_payload_that_is_malformed_on_the_wire_is_counted(domain):
     from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 

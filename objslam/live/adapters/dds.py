@@ -1,5 +1,6 @@
 """Receives the messages of a ROS 2 robot over DDS, without an installed ROS."""
 
+import math
 import threading
 import time
 from dataclasses import dataclass, field
@@ -39,6 +40,18 @@ class _Reader:
 
 
 @dataclass
+class _Heard:
+    """What two readers received of one publisher.
+
+    own: the stamp of the first message that the reader of the publisher's kind received, ns.
+    other: the stamp of the last message that the other reader pushed before that, ns.
+    """
+
+    own: float = math.inf
+    other: float = -math.inf
+
+
+@dataclass
 class DdsAdapter:
     """Reads the topics of the wanted types, while their publishers come and go.
 
@@ -53,6 +66,7 @@ class DdsAdapter:
     _readers: dict[tuple[str, Kind], _Reader] = field(default_factory=dict)
     _topics: dict[str, Any] = field(default_factory=dict)
     _unread: dict[str, int] = field(default_factory=dict)
+    _heard: dict[int, _Heard] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.ledger = self.messages.ledger
@@ -161,7 +175,7 @@ class DdsAdapter:
         """Push messages that wait in a reader, at most _TAKE, so that other readers and a stop do not wait long."""
         for sample in reader.entity.take(_TAKE):
             info = sample.sample_info
-            if not info.valid_data or not self._is_mine(reader, info.publication_handle, found):
+            if not info.valid_data or not self._is_mine(reader, info.publication_handle, info.source_timestamp, found):
                 continue
             try:
                 check_size(reader.of.type, sample.data, "cdr")
@@ -171,19 +185,32 @@ class DdsAdapter:
                 continue
             self.messages.receive(reader.of.type, reader.of.topic, message, info.source_timestamp / 1e9)
 
-    def _is_mine(self, reader: _Reader, handle: int, found: Any) -> bool:
-        """Return whether this reader pushes a message of the publisher with this handle.
+    def _is_mine(self, reader: _Reader, handle: int, stamp: int, found: Any) -> bool:
+        """Return whether this reader pushes a message of the publisher with this handle. stamp: of its sending, ns.
 
-        Two readers may receive one message, because a best-effort reader receives from reliable publishers too. If the
-        publisher is unknown, the reader with the strictest QoS pushes the message.
+        Two readers may receive one message, because a best-effort reader receives from reliable publishers too. The reader
+        of the publisher's own kind pushes it. Until that reader receives the publisher, the other one pushes its messages:
+        a robot may send as soon as anybody listens. If the publisher is unknown, the reader with the strictest QoS pushes.
         """
-        if self._publications.get(handle) is None:
+        if self._publications.kind(handle) is None:
             self._look_around(found)
-        publication = self._publications.get(handle)
-        if publication is not None:
-            return publication.kind == reader.of.kind
-        alone = sum(topic == reader.of.topic for topic, _ in self._readers) == 1
-        return alone or reader.of.kind == max(kind for topic, kind in self._readers if topic == reader.of.topic)
+        kind = self._publications.kind(handle)
+        if kind is None:
+            kinds = [kind for topic, kind in self._readers if topic == reader.of.topic]
+            return reader.of.kind == max(kinds)
+        _, latched = kind
+        if latched:
+            return kind == reader.of.kind  # It receives the old messages too, so nothing is lost before it is there.
+        heard = self._heard.setdefault(handle, _Heard())
+        if len(self._heard) > MOST:
+            del self._heard[next(iter(self._heard))]
+        if kind == reader.of.kind:
+            heard.own = min(heard.own, stamp)
+            return stamp > heard.other
+        if not heard.other < stamp < heard.own:
+            return False
+        heard.other = stamp
+        return True
 
     def _count_losses(self) -> None:
         for reader in self._readers.values():

@@ -37,6 +37,7 @@ class Publications:
     def __init__(self, kept: Callable[[], Collection[str]]) -> None:
         """kept: returns the topics that never give way, such as those that the user chose."""
         self._kept, self._found = kept, dict[int, Publication]()
+        self._gone: dict[int, Kind] = {}  # The kinds of the last publishers that went: their messages may still wait.
         self._count: Counter[str] = Counter()
         self._longest: dict[str, int] = {}  # The handle that gives way first, by group. It is searched when it is needed.
 
@@ -46,14 +47,17 @@ class Publications:
     def __iter__(self) -> Iterator[Publication]:
         return iter(list(self._found.values()))
 
-    def get(self, handle: int) -> Publication | None:
-        """Return the publisher with a handle, None if it is not kept."""
-        return self._found.get(handle)
+    def kind(self, handle: int) -> Kind | None:
+        """Return the kind of the publisher with a handle, also if it went lately, or None if it is not kept."""
+        return self._found[handle].kind if handle in self._found else self._gone.get(handle)
 
     def remove(self, handle: int) -> Publication | None:
         """Forget a publisher, and return it. None if it is not kept."""
         gone = self._found.pop(handle, None)
         if gone is not None:
+            self._gone[handle] = gone.kind
+            if len(self._gone) > MOST:
+                del self._gone[next(iter(self._gone))]
             self._count[_group(gone)] -= 1
             if not self._count[_group(gone)]:
                 del self._count[_group(gone)]
