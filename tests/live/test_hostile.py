@@ -192,7 +192,8 @@ def test_publishers_that_are_kept_never_give_way():
     gone = kept.remove(0)
     assert gone is not None
     assert kept.add(MOST, new) is None
-    assert kept.get(MOST) is new
+    assert list(kept)[-1] is new
+    assert [kept.kind(handle) for handle in (0, MOST, MOST + 1)] == [new.kind, new.kind, None]  # Also of one that went.
     assert kept.add(MOST, new) is None  # DDS tells of a publisher again when its QoS changes.
     assert len(kept) == MOST
 

@@ -44,11 +44,11 @@ class _Heard:
     """What two readers received of one publisher.
 
     own: the stamp of the first message that the reader of the publisher's kind received, ns.
-    other: the stamp of the last message that the other reader pushed before that, ns.
+    others: the stamps of the messages that the other reader pushed before that, ns, the last QUEUE of them.
     """
 
     own: float = math.inf
-    other: float = -math.inf
+    others: dict[int, None] = field(default_factory=dict)
 
 
 @dataclass
@@ -206,10 +206,12 @@ class DdsAdapter:
             del self._heard[next(iter(self._heard))]
         if kind == reader.of.kind:
             heard.own = min(heard.own, stamp)
-            return stamp > heard.other
-        if not heard.other < stamp < heard.own:
+            return stamp not in heard.others
+        if stamp >= heard.own or stamp in heard.others:
             return False
-        heard.other = stamp
+        heard.others[stamp] = None
+        if len(heard.others) > QUEUE:
+            del heard.others[next(iter(heard.others))]
         return True
 
     def _count_losses(self) -> None:
