@@ -15,14 +15,17 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import ObjslamError, SolveError
 from objslam.frontend.bearings import build_rays
+from objslam.frontend.corrected_log import take_out
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping.alternation import solve
+from objslam.mapping.checks.agreement import agreement, bounded_part
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.trials import clear
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
 from objslam.mapping.checks.parts.mixture import find_mixture
+from objslam.mapping.checks.ranges import check_ranges
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, seen_something
 
@@ -45,6 +48,9 @@ _IN_BOTH = 0.4
 halves. The share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean
 simulated logs have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve explains the rays of both."""
 
+_OF_RANGES = ("odometry.scale", "range_scale", "surface")
+"""The shared errors that would explain ranges in a wrong scale. A test of this scale must not take them out."""
+
 
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
     """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
@@ -56,7 +62,8 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
     needs far more noise, of any kind. If neither of the two explains the boxes, the solves show nothing, and a finding
     stands if the quick check is clear. "halves": the finding is wrong if the solution explains the boxes of both halves, or
     if both halves agree on the objects. "frames": the finding is wrong if the solution explains similar shares of the rays
-    in all frames.
+    in all frames. "ranges": the finding is wrong if the ranges fit the odometry without the errors of clocks, turns and
+    mounts that the solution has.
     """
     kept = tuple(
         one
@@ -72,6 +79,8 @@ def _refuted(
     quiet = _noise(solution, rays_only=True) <= _NOISE
     if finding.basis == "frames":
         return quiet and find_mixture(solution.rays.keyframe, _explained(solution)) is None
+    if finding.basis == "ranges":
+        return quiet and not _ranges_differ(log, solution, settings)
     explained = quiet and _least_explained(solution) >= _EXPLAINED
     if finding.basis == "halves":
         # With rounds of association, an object may be in the map twice, once for each half.
@@ -133,6 +142,18 @@ def _noise(solution: Solution, *, rays_only: bool = False) -> float:
     if found is None:
         return 1.0
     return found.rays if rays_only else max(found.rays, found.along, found.turning)
+
+
+def _ranges_differ(log: Log, solution: Solution, settings: Settings) -> bool:
+    """Return whether the scales of ranges and odometry differ, without the other shared errors that the solution has."""
+    found = solution.estimate.calibration
+    if found is None:
+        return True
+    values = dict(zip(found.names, found.values.tolist(), strict=True))
+    other = {name: value for name, value in values.items() if name not in _OF_RANGES}
+    part = bounded_part(take_out(log, other), settings)
+    measured = agreement(part, part.log, settings)
+    return measured is not None and check_ranges(measured, part) is not None
 
 
 def _halves_agree(solution: Solution) -> bool:

@@ -12,6 +12,7 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.rotation import rotation_from_vector
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
+from objslam.frontend.shared_errors import shared_errors
 from objslam.mapping import pipeline, refuted
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
@@ -21,6 +22,7 @@ from objslam.mapping.checks.hypotheses.trials import Trial, clear
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
 from objslam.mapping.refuted import without_refuted
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
+from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.wrong_inputs import MISTAKES, join
 
 SETTINGS = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false"))
@@ -201,6 +203,26 @@ def test_frames_of_another_recording_still_spoil_a_joint_map():
     wrong, ok = names(join(*rooms, interleaved=True))
     assert "mixed recordings" in wrong
     assert ok == 0
+
+
+@pytest.mark.parametrize(("factor", "kept"), [(1.0, False), (1.25, True), (0.6, True)])
+def test_ranges_in_another_scale_than_the_odometry_stay_wrong(factor, kept):
+    """The quick look was wrong on a real robot whose camera is late: there, ranges end at one place if they are shorter."""
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
+    log = add_shared_errors(room(0, depth=DepthNoise(), frames=150), {"front.clock": -0.24, "odometry.turn_scale": -0.06})
+    log = replace(
+        log,
+        cameras=tuple(replace(c, detections=replace(c.detections, depths=c.detections.depths * factor)) for c in log.cameras),
+    )
+    frames = build_keyframes(log, settings, Ledger())
+    rays = build_rays(log, frames, settings, Ledger())
+    errors = shared_errors(log, frames, rays, settings)
+    solution = solve(frames, rays, (log.cameras[0].camera,), settings, Ledger(), nothing, errors=errors)
+    said = Finding("depth scale", "the depths are too long", basis="ranges")
+    assert bool(without_refuted(Diagnosis((said,)), solution, log, settings, nothing).findings) == kept
+    if kept:
+        found = diagnose(log, settings, Ledger()).findings
+        assert [(one.name, one.basis) for one in found] == [("depth scale", "ranges")]
 
 
 def test_halves_are_compared_by_their_fitting_rays():

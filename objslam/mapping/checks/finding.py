@@ -14,13 +14,14 @@ class Finding:
     name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the fault makes
     the positions of a map unreliable, because the run does not correct it. basis: the evidence. "log" is the input itself.
     The other values say which boxes do not agree at the given poses: all "boxes", those of the two "halves" of the log, or
-    those of single "frames". A joint solve may refute a finding with such evidence.
+    those of single "frames". "ranges": the ranges do not agree with the way of the odometry. A joint solve may refute a
+    finding with such evidence.
     """
 
     name: str
     message: str
     spoils: bool = True
-    basis: Literal["log", "boxes", "halves", "frames"] = "log"
+    basis: Literal["log", "boxes", "halves", "frames", "ranges"] = "log"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of summary.json."""

@@ -1,5 +1,7 @@
 """Compare measured ranges with the distances that bearings alone give, or with the motion by odometry."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
@@ -30,6 +32,8 @@ _SIGMAS = 5.0
 """The least error of the ranges that is reported, in standard deviations. A larger number warns less often."""
 _UNITS = {1000.0: "mm", 100.0: "cm", 3.28084: "feet", 39.37: "inches", 1e-3: "km"}
 """The name of each unit of length, by the number of units in a metre."""
+_SCALE = "depth scale"
+"""The name of a finding about ranges that are too long or too short, but not in another unit."""
 _CLOSE = 0.25
 """A factor counts as a unit of `_UNITS` if the logarithm of their ratio is below this. A larger value names more units."""
 _UNIT = 0.7
@@ -57,7 +61,7 @@ def check_ranges(found: Agreement, part: Part) -> Finding | None:
     if part.crowd <= _ALONE:
         return _by_spread(found, part)
     in_crowd = _by_bearings(found)
-    return in_crowd if in_crowd is not None and in_crowd.name != "depth scale" else None
+    return in_crowd if in_crowd is not None and in_crowd.name != _SCALE else None
 
 
 def _by_spread(found: Agreement, part: Part) -> Finding | None:
@@ -81,7 +85,10 @@ def _by_spread(found: Agreement, part: Part) -> Finding | None:
     most = _SPREAD_OF_UNITS if abs(np.log(ratio)) > _UNIT else _SPREAD
     if np.median(np.abs(known + np.log(ratio))) > most or abs(ratio - 1) < _LEAST_BY_ODOMETRY:
         return None
-    return _in_words(ratio, "the way of the odometry")
+    found = _in_words(ratio, "the way of the odometry")
+    # The odometry may turn too far or too little, and clocks may differ. Both move the ends of ranges as a scale does. A
+    # joint solve knows these errors.
+    return replace(found, basis="ranges") if found.name == _SCALE else found
 
 
 def _frames(found: Agreement) -> tuple[list[int], list[int]]:
@@ -155,7 +162,7 @@ def _in_words(ratio: float, than: str, *, spoils: bool = True) -> Finding:
                 "(depth_scale is the units of a depth image per metre)",
             )
     return Finding(
-        "depth scale",
+        _SCALE,
         f"the depths are {100 * abs(ratio - 1):.0f} % too {'long' if ratio > 1 else 'short'} for {than}: "
         "the scale of the depth (depth_scale), of the poses, or the focal length is wrong",
         spoils=spoils,
