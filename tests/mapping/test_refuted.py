@@ -210,10 +210,9 @@ def test_ranges_in_another_scale_than_the_odometry_stay_wrong(factor, kept):
     """The quick look was wrong on a real robot whose camera is late: there, ranges end at one place if they are shorter."""
     settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
     log = add_shared_errors(room(0, depth=DepthNoise(), frames=150), {"front.clock": -0.24, "odometry.turn_scale": -0.06})
-    log = replace(
-        log,
-        cameras=tuple(replace(c, detections=replace(c.detections, depths=c.detections.depths * factor)) for c in log.cameras),
-    )
+    camera = log.cameras[0]
+    boxes = replace(camera.detections, depths=camera.detections.depths * factor)
+    log = replace(log, cameras=(replace(camera, detections=boxes),))
     frames = build_keyframes(log, settings, Ledger())
     rays = build_rays(log, frames, settings, Ledger())
     errors = shared_errors(log, frames, rays, settings)
