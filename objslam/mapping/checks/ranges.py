@@ -85,10 +85,10 @@ def _by_spread(found: Agreement, part: Part) -> Finding | None:
     most = _SPREAD_OF_UNITS if abs(np.log(ratio)) > _UNIT else _SPREAD
     if np.median(np.abs(known + np.log(ratio))) > most or abs(ratio - 1) < _LEAST_BY_ODOMETRY:
         return None
-    found = _in_words(ratio, "the way of the odometry")
+    said = _in_words(ratio, "the way of the odometry")
     # The odometry may turn too far or too little, and clocks may differ. Both move the ends of ranges as a scale does. A
     # joint solve knows these errors.
-    return replace(found, basis="ranges") if found.name == _SCALE else found
+    return replace(said, basis="ranges") if said.name == _SCALE else said
 
 
 def _frames(found: Agreement) -> tuple[list[int], list[int]]:
