@@ -40,3 +40,14 @@ def test_a_demo_without_images_has_nothing_to_reconstruct(tool, tmp_path):
     assert code == 1
     assert len(said.splitlines()) == 1
     assert "`objslam demo` without --boxes makes one" in said
+
+
+def test_without_a_gpu_its_benchmark_says_so_in_one_line(monkeypatch, capsys):
+    pytest.importorskip("torch")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr(sys, "argv", ["bench_gpu.py"])
+    monkeypatch.syspath_prepend(str(TOOLS))
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(TOOLS / "bench_gpu.py"), run_name="__main__")
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == "no GPU was measured: torch sees no CUDA device\n"

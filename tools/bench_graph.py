@@ -1,4 +1,4 @@
-"""Measure how the time to build and solve the factor graph grows with the log, and compare with GTSAM's CustomFactor.
+"""Measure how the CPU time to build and solve a graph grows with the log, and compare with GTSAM's CustomFactor.
 
 python tools/bench_graph.py               # everything, a few minutes, most of them for the CustomFactor
 python tools/bench_graph.py --skip-custom
@@ -100,7 +100,7 @@ def drive(rays_total: int, seed: int = 0) -> tuple[Keyframes, Rays, Association,
 
 
 def against_custom(rays_total: int, iterations: int = 3) -> float:
-    """Return the seconds of the CustomFactor divided by those of the compiled factor. Graph, start and iterations are the
+    """Return the CPU time of the CustomFactor divided by that of the compiled factor. Graph, start and iterations are the
     same."""
     keyframes, rays, association, points = drive(rays_total)
     noise = [gtsam.noiseModel.Isotropic.Sigma(2, 0.05)] * len(rays)
@@ -108,7 +108,7 @@ def against_custom(rays_total: int, iterations: int = 3) -> float:
     between = betweens(every[:-1], every[1:], *motions(keyframes, Settings()))
     seconds = []
     for custom in (False, True):
-        begin = time.perf_counter()
+        begin = time.process_time()
         if custom:
             sigma = gtsam.noiseModel.Isotropic.Sigma(3, 0.05)
             made = [
@@ -127,13 +127,13 @@ def against_custom(rays_total: int, iterations: int = 3) -> float:
         parameters.setRelativeErrorTol(0)
         parameters.setAbsoluteErrorTol(0)
         gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        seconds.append(time.perf_counter() - begin)
+        seconds.append(time.process_time() - begin)
     print(f"{rays_total:7d} rays, {iterations} LM iterations: compiled {seconds[0]:.3f} s, CustomFactor {seconds[1]:.2f} s")
     return seconds[1] / seconds[0]
 
 
 def growth() -> None:
-    """Build and solve of growing logs, and the exponent of the growth."""
+    """Print the CPU time to build and solve growing logs, and the exponent of the growth."""
     sizes = [5_000, 10_000, 20_000, 50_000]
     table: dict[str, list[float]] = {"joint graph": [], "fixed": [], "joint from odometry": []}
     settings = Settings(mode="joint")
@@ -141,11 +141,11 @@ def growth() -> None:
     solve_joint(*drive_[:3], settings, Ledger())  # first use loads and warms what is measured
     for size in sizes:
         keyframes, rays, association, points = drive(size)
-        begin = time.perf_counter()
+        begin = time.process_time()
         estimate = solve_joint(keyframes, rays, association, settings, Ledger())
-        table["joint from odometry"].append(time.perf_counter() - begin)
+        table["joint from odometry"].append(time.process_time() - begin)
         error = np.linalg.norm(estimate.positions - points, axis=1)[estimate.solved]
-        begin = time.perf_counter()
+        begin = time.process_time()
         # one solve alone, from the poses that the first one found
         noise = robust("huber", rays.sigma, 2)
         graph = build_graph(
@@ -164,11 +164,11 @@ def growth() -> None:
             moved, np.where(np.isfinite(estimate.positions), estimate.positions, points), np.unique(association.object)
         )
         gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-        table["joint graph"].append(time.perf_counter() - begin)
-        begin = time.perf_counter()
+        table["joint graph"].append(time.process_time() - begin)
+        begin = time.process_time()
         placed = triangulate_at(keyframes.map_T_camera, keyframes, rays, association, settings)
         solve_fixed(keyframes, rays, association, placed, settings)
-        table["fixed"].append(time.perf_counter() - begin)
+        table["fixed"].append(time.process_time() - begin)
         print(
             f"{size:7d} rays, {len(keyframes)} keyframes, {association.count} objects: "
             + ", ".join(f"{name} {times[-1]:.2f} s" for name, times in table.items())

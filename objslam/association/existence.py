@@ -9,7 +9,7 @@ from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
-from objslam.core.statistics import grouped_quantiles, logistic, poisson_tail
+from objslam.core.statistics import grouped_quantiles, log_beta, logistic, poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
@@ -69,10 +69,8 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rate
 
 def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: float | Floats) -> Floats:
     """Return ln of the probability (N,) of a sequence of detections and misses, if the rate has a beta distribution."""
-    from scipy.special import betaln
-
     a, b = concentration * rate, concentration * (1 - rate)
-    return np.asarray(betaln(a + seen, b + expected - seen) - betaln(a, b))
+    return log_beta(a + seen, b + expected - seen) - log_beta(a, b)
 
 
 def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) -> Floats:

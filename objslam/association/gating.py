@@ -143,9 +143,6 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     solved alone. In most parts, each ray (or each landmark) simply takes its best edge. The Hungarian method solves the
     rest. cost: (E,) of each edge. frame: (R,) of each ray. unmatched: the cost of a ray without a landmark.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     chosen = np.full(len(frame), -1, dtype=np.int64)
     useful = np.flatnonzero(cost < unmatched)
     if len(useful) == 0:
@@ -153,6 +150,12 @@ def best_assignment(edges: Edges, cost: Floats, frame: Ints, unmatched: float) -
     ray, landmark, gain = edges.ray[useful], edges.landmark[useful], unmatched - cost[useful]
     # A place is one landmark in one frame.
     places, place = np.unique(frame[ray] * (int(landmark.max()) + 1) + landmark, return_inverse=True)
+    if len(places) == len(ray) == len(np.unique(ray)):  # Nothing competes, as in many small logs.
+        chosen[ray] = landmark
+        return chosen
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     size = len(frame) + len(places)
     graph = coo_array((np.ones(len(ray)), (ray, len(frame) + place)), shape=(size, size))
     part = np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)[ray]

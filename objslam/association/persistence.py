@@ -8,6 +8,7 @@ measurement: it finds the object or misses it. A miss counts only as far as the 
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.statistics import log_beta
 
 LIFETIME = 60.0
 """The mean time (days) that an object stays where it is. A larger value needs more misses before an object is gone. At 60
@@ -48,8 +49,6 @@ def persistence(before: Floats, days: Floats, found: Bools, looks: Ints, past_lo
 
 def missed_by_all(looks: Ints, past_looks: Ints, past_detections: Ints) -> Floats:
     """Return the probability (N,) that all `looks` miss an object that is there (beta-binomial)."""
-    from scipy.special import betaln
-
     rate = np.clip((past_detections + _RATE * _LOOKS) / (past_looks + _LOOKS), 0.01, 0.99)
     a, b = _CONCENTRATION * rate, _CONCENTRATION * (1 - rate)
-    return np.asarray(np.exp(betaln(a, b + looks) - betaln(a, b)))
+    return np.asarray(np.exp(log_beta(a, b + looks) - log_beta(a, b)))

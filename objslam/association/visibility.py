@@ -16,7 +16,7 @@ from objslam.core.object_map import SeenFrom
 from objslam.core.statistics import distinct, grouped_median, grouped_quantile, grouped_quantiles
 from objslam.core.types import Keyframes
 
-_PAIRS_AT_ONCE = 1 << 20  # The most pairs of an object and a frame processed together. A larger value needs more memory.
+_PAIRS_AT_ONCE = 1 << 18  # The most pairs of an object and a frame processed together, which fit into the processor's cache.
 _USUAL_DISTANCES = (0.02, 0.98)
 """The quantiles of a class's detection distances. Outside them, a miss tells nothing. A wider range counts more misses."""
 _CORE_SHARE = 0.8

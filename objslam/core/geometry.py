@@ -195,8 +195,11 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     valid = inside & ((span <= max_gap) | exact)
     fraction = np.divide(query - stamps[before], span, out=np.zeros(len(query)), where=span > 0)
     first = poses[before[valid]]
-    step = inverse(first) @ poses[after[valid]]
-    result[valid] = first @ exp_se3(log_se3(step) * fraction[valid, None])
+    if len(first) >= len(stamps) > 1:  # Many queries share a twist, so each twist is computed once.
+        twist = log_se3(inverse(poses[:-1]) @ poses[1:])[before[valid]]
+    else:
+        twist = log_se3(inverse(first) @ poses[after[valid]])
+    result[valid] = first @ exp_se3(twist * fraction[valid, None])
     return result, valid
 
 

@@ -159,6 +159,14 @@ def quantile(values: Floats, share: float) -> float:
     return float(low + (at - below) * (high - low))
 
 
+_FEW = 20_000
+"""Up to this many numbers, special functions are computed without scipy.special, whose import takes 0.06 s, about as long as
+the association of a small log. So many numbers take a third of that."""
+_DEVIATIONS = 9.0
+"""A Poisson tail is summed up to this many standard deviations above the mean, plus as many squared for small means. What
+lies beyond is below 1e-16 of the tail. With a larger number, the sum is longer."""
+
+
 def logistic(odds: Floats) -> Floats:
     """Return the probabilities (N,) of log odds (N,): 1 / (1 + exp(-odds)), without overflow.
 
@@ -168,10 +176,35 @@ def logistic(odds: Floats) -> Floats:
 
 
 def poisson_tail(least: Ints, mean: Floats) -> Floats:
-    """Return the probability (N,) that a Poisson variable of this mean (N,) is at least `least` (N,).
+    """Return the probability (...) that a Poisson variable of this mean (...) is at least `least` (...).
 
-    It is the regularised incomplete gamma function (NIST DLMF 8.4.10). scipy.stats has it too, but its import takes 0.3 s.
+    It is the regularised incomplete gamma function (NIST DLMF 8.4.10). For few numbers, the probabilities of all counts are
+    summed instead. scipy.stats has the tail too, but its import takes 0.3 s.
     """
-    from scipy.special import gammainc
+    count, mean = np.maximum(least, 1).ravel().astype(np.float64), mean.ravel()
+    beyond = np.maximum(mean - count, 0.0) + _DEVIATIONS * np.sqrt(np.maximum(mean, count)) + _DEVIATIONS**2
+    terms = math.ceil(float(beyond.max(initial=0.0)))
+    if terms * len(count) <= _FEW:
+        with np.errstate(divide="ignore", under="ignore"):
+            first = np.exp(count * np.log(mean) - mean - _log_gamma(count + 1))
+            ratios = np.cumprod(mean[:, None] / (count[:, None] + np.arange(1, terms)), axis=1)
+        tail = np.minimum(first * (1 + ratios.sum(axis=1)), 1.0)
+    else:
+        from scipy.special import gammainc
 
-    return np.where(least > 0, gammainc(np.maximum(least, 1), mean), 1.0)
+        tail = gammainc(count, mean)
+    return np.where(least > 0, tail.reshape(least.shape), 1.0)
+
+
+def log_beta(a: Floats, b: Floats) -> Floats:
+    """Return the logarithms (N,) of the beta function of positive numbers (N,)."""
+    if len(a) <= _FEW:
+        return _log_gamma(a) + _log_gamma(b) - _log_gamma(a + b)
+    from scipy.special import betaln
+
+    return np.asarray(betaln(a, b))
+
+
+def _log_gamma(values: Floats) -> Floats:
+    """Return the logarithms (N,) of the gamma function of few positive numbers (N,)."""
+    return np.array([math.lgamma(value) for value in values.tolist()])

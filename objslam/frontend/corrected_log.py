@@ -12,6 +12,8 @@ from objslam.core.geometry import make_pose, motion_between
 from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.frontend.odometry_bridge import OdometryBridge
+from objslam.frontend.odometry_drift import DriftPath, PlanarSteps
+from objslam.frontend.recent_values import RecentValues
 
 ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
 """The errors of odometry."""
@@ -24,6 +26,12 @@ _SQUEEZED = 1e-3
 """A clock offset may move frames beyond an end of the path. They are placed within this time (s) of that end. A larger value
 moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2
 us."""
+_LEVEL = 1e-6
+"""The largest tilt (rad) and change of height (m) of a path whose drift is computed in the plane. A path with more takes
+longer, and is exact. A larger value neglects more of a tilt."""
+_KEPT = 3
+"""For how many turn scales and biases the corrected path is kept. The derivatives by the other errors need no new path. A
+larger number takes more memory."""
 
 
 def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:
@@ -58,6 +66,9 @@ class CorrectablePath:
         self._turned = np.append(0.0, np.cumsum(turn))
         self._seconds = odometry.stamps - odometry.stamps[0]
         self._ways = np.ascontiguousarray(np.diff(places, axis=0).T)
+        level = max(np.abs(rotation[:, :2, 2]).max(), np.abs(places[:, 2] - places[0, 2]).max()) <= _LEVEL
+        self._heading = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]) if level else None
+        self._moved = RecentValues[tuple[Floats, Floats]](_KEPT)
 
     @cached_property
     def bridge(self) -> OdometryBridge:
@@ -80,23 +91,44 @@ class CorrectablePath:
         poses = self.odometry.poses if which is None else self.odometry.poses[which]
         if scale == turn_scale == turn_bias == 0:
             return poses
-        more = turn_scale * self._turned + turn_bias * self._seconds
-        middle = (more[1:] + more[:-1]) / 2  # The chord of an arc points along the mean of the two headings at its ends.
-        cos, sin = np.cos(middle), np.sin(middle)
-        x, y, z = self._ways
-        places = np.empty((3, len(more)))
-        places[:, 0] = self.odometry.poses[0, :3, 3] / (1 + scale)
-        places[0, 1:], places[1, 1:], places[2, 1:] = cos * x - sin * y, sin * x + cos * y, z
-        np.cumsum(places, axis=1, out=places)
-        places *= 1 + scale
-        if which is not None:
-            more, places = more[which], places[:, which]
+        more, places = self._headings_and_places(turn_scale, turn_bias)
+        places = places if which is None else places[:, which]
+        places = self.odometry.poses[0, :3, 3, None] + (1 + scale) * places
+        more = more if which is None else more[which]
         cos, sin = np.cos(more)[:, None], np.sin(more)[:, None]
         corrected = poses.copy()
         corrected[:, 0, :3] = cos * poses[:, 0, :3] - sin * poses[:, 1, :3]
         corrected[:, 1, :3] = sin * poses[:, 0, :3] + cos * poses[:, 1, :3]
         corrected[:, :3, 3] = places.T
         return corrected
+
+    def drift(self, error: Mapping[str, float]) -> DriftPath:
+        """Return the steps of the corrected path, from which its drift is computed."""
+        scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+        if self._heading is None or self.odometry.travel is not None:
+            return DriftPath.of(self.path(error))
+        more, (x, y, _) = self._headings_and_places(turn_scale, turn_bias)
+        heading, (begin, *_) = self._heading + more - self._heading[0], self._heading
+        c, s = (1 + scale) * np.cos(begin), (1 + scale) * np.sin(begin)
+        steps = PlanarSteps.between(np.cos(heading), np.sin(heading), c * x + s * y, c * y - s * x)
+        return DriftPath(None, self.odometry.stamps, steps.sums())
+
+    def _headings_and_places(self, turn_scale: float, turn_bias: float) -> tuple[Floats, Floats]:
+        """Return by how much (N,), rad, the errors turn each pose, and the places (3, N), m, seen from the first pose.
+
+        The scale is not in the places, because it only multiplies them.
+        """
+
+        def compute() -> tuple[Floats, Floats]:
+            more = turn_scale * self._turned + turn_bias * self._seconds
+            middle = (more[1:] + more[:-1]) / 2  # The chord of an arc points along the mean of the two headings at its ends.
+            cos, sin = np.cos(middle), np.sin(middle)
+            x, y, z = self._ways
+            places = np.zeros((3, len(more)))
+            places[0, 1:], places[1, 1:], places[2, 1:] = cos * x - sin * y, sin * x + cos * y, z
+            return more, np.cumsum(places, axis=1, out=places)
+
+        return self._moved.get((turn_scale, turn_bias), compute)
 
 
 class OdometryCorrection:

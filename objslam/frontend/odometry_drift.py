@@ -1,7 +1,8 @@
 """The drift of odometry, which is the covariance that it accumulates along its path."""
 
 from collections.abc import Mapping
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Self, TypeVar
 
 import numpy as np
 
@@ -35,65 +36,110 @@ def gathered_drift(odometry: Trajectory, stamps: Floats, settings: Odometry) -> 
     steps are summed. For two stamps i < j, drift[j] - drift[i] is the covariance of the motion from i to j. The adjoint can
     move it into base at j.
     """
-    return DriftPath(odometry).gathered(stamps, settings)
+    return DriftPath.of(odometry).gathered(stamps, settings)
 
 
+@dataclass(frozen=True)
 class DriftPath:
-    """The steps of an odometry, from which its drift is computed quickly, for any noise and stamps.
+    """The steps of an odometry with N poses, from which its drift is computed quickly, for any noise and stamps.
 
-    On a planar path, ten times fewer numbers are computed.
+    odometry: None if `sums` replace it. stamps: (N,) s. sums: (14, N) what a planar path has gathered up to each pose, from
+    `PlanarSteps.sums`. None if the path is not planar.
     """
 
-    def __init__(self, odometry: Trajectory) -> None:
+    odometry: Trajectory | None
+    stamps: Floats
+    sums: Floats | None
+
+    @classmethod
+    def of(cls, odometry: Trajectory) -> Self:
         """Measure the steps of the odometry. Where poses were left out, a step is as long as what was travelled in it."""
-        self._odometry = odometry
         poses = odometry.poses
         start, places = poses[0, :3, :3], (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3]
         up = start[:, 2] @ poses[:, :3, :3]
-        self._planar = bool(max(np.abs(up - up[0]).max(), np.abs(places[:, 2]).max()) <= _PLANAR_TOLERANCE)
-        if not self._planar:
-            return
+        if max(np.abs(up - up[0]).max(), np.abs(places[:, 2]).max()) > _PLANAR_TOLERANCE:
+            return cls(odometry, odometry.stamps, None)
         heading = poses[:, :3, 0] @ start[:, :2]
-        c, s = (heading[1:] / np.maximum(np.linalg.norm(heading[1:], axis=1, keepdims=True), 1e-12)).T
-        yaw = np.arctan2(heading[:, 1], heading[:, 0])
+        heading /= np.maximum(np.linalg.norm(heading, axis=1, keepdims=True), 1e-12)
+        cos, sin = heading.T
         if odometry.travel is None:
-            self._turn = np.abs((np.diff(yaw) + np.pi) % (2 * np.pi) - np.pi)
-            self._way = np.hypot(*np.diff(places[:, :2], axis=0).T) / np.sinc(self._turn / (2 * np.pi))
+            steps = PlanarSteps.between(cos, sin, places[:, 0], places[:, 1])
         else:
-            self._way, self._turn = odometry.travel[1:, 0], odometry.travel[1:, 1]
-        px, py = places[1:, 0], places[1:, 1]
-        one, none = np.ones_like(px), np.zeros_like(px)
-        # How each variance of a step (of yaw, x, y) adds to the six distinct elements of the covariance, see `_PLANAR`.
-        self._parts = (
-            np.stack([one, py, -px, py * py, -px * py, px * px], axis=1),
-            np.stack([none, none, none, c * c, c * s, s * s], axis=1),
-            np.stack([none, none, none, s * s, -c * s, c * c], axis=1),
-        )
+            steps = PlanarSteps(cos, sin, places[:, 0], places[:, 1], odometry.travel[1:, 0], odometry.travel[1:, 1])
+        return cls(None, odometry.stamps, steps.sums())
 
     def gathered(self, stamps: Floats, settings: Odometry) -> Floats:
         """Return the drift (Q, 6, 6) at stamps (Q,), as `gathered_drift` does."""
-        odometry = self._odometry
-        if len(odometry) == 1:
+        last = len(self.stamps) - 1
+        if last == 0:
             return np.zeros((len(stamps), 6, 6))
-        if self._planar:
-            variances = _step_variances(self._turn, self._way, settings)
-            angle, x, y = (variance[:, None] * part for variance, part in zip(variances, self._parts, strict=True))
-            steps = angle + x + y
-        else:
-            start_T_base, travel = inverse(odometry.poses[0]) @ odometry.poses, odometry.travel
-            lengths = None if travel is None else (travel[1:, 1], travel[1:, 0])
-            steps = step_drift(start_T_base, settings, False, lengths).reshape(-1, 36)
-        total = np.zeros((len(odometry), steps.shape[1]))
+        after = np.clip(np.searchsorted(self.stamps, stamps), 1, last)
+        span = self.stamps[after] - self.stamps[after - 1]
+        share = np.clip((stamps - self.stamps[after - 1]) / span, 0.0, 1.0)
+        if self.sums is not None:
+            drift = np.zeros((len(stamps), 6, 6))
+            sums = (1 - share) * self.sums[:, after - 1] + share * self.sums[:, after]
+            drift[:, 2:5, 2:5] = (_weights(settings) @ sums).T[:, _PLANAR]
+            return drift
+        assert self.odometry is not None
+        start_T_base, travel = inverse(self.odometry.poses[0]) @ self.odometry.poses, self.odometry.travel
+        lengths = None if travel is None else (travel[1:, 1], travel[1:, 0])
+        steps = step_drift(start_T_base, settings, False, lengths).reshape(-1, 36)
+        total = np.zeros((last + 1, 36))
         np.cumsum(steps, axis=0, out=total[1:])
-        after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, len(odometry) - 1)
-        span = odometry.stamps[after] - odometry.stamps[after - 1]
-        share = np.clip((stamps - odometry.stamps[after - 1]) / span, 0.0, 1.0)[:, None]
-        gathered = (1 - share) * total[after - 1] + share * total[after]
-        if not self._planar:
-            return np.asarray(gathered.reshape(-1, 6, 6))
-        drift = np.zeros((len(stamps), 6, 6))
-        drift[:, 2:5, 2:5] = gathered[:, _PLANAR]
-        return drift
+        gathered = (1 - share)[:, None] * total[after - 1] + share[:, None] * total[after]
+        return np.asarray(gathered.reshape(-1, 6, 6))
+
+
+@dataclass(frozen=True)
+class PlanarSteps:
+    """The steps of a planar path with N poses, in the frame of its first pose.
+
+    cos, sin: (N,) of the headings. x, y: (N,) m. way: (N-1,) m and turn: (N-1,) rad, the lengths of the steps.
+    """
+
+    cos: Floats
+    sin: Floats
+    x: Floats
+    y: Floats
+    way: Floats
+    turn: Floats
+
+    @classmethod
+    def between(cls, cos: Floats, sin: Floats, x: Floats, y: Floats) -> Self:
+        """Measure the steps between poses. A step is an arc."""
+        turn = np.abs(np.arctan2(sin[1:] * cos[:-1] - cos[1:] * sin[:-1], cos[1:] * cos[:-1] + sin[1:] * sin[:-1]))
+        way = np.hypot(np.diff(x), np.diff(y)) / np.sinc(turn / (2 * np.pi))
+        return cls(cos, sin, x, y, way, turn)
+
+    def sums(self) -> Floats:
+        """Return the sums (14, N) up to each pose from which `_weights` makes the six elements of the drift.
+
+        The variances of a step are linear in its way and its turn, so one set of sums serves any noise.
+        """
+        cos, sin, x, y = self.cos[1:], self.sin[1:], self.x[1:], self.y[1:]
+        sums = np.zeros((14, len(self.x)))
+        for first, length in ((0, self.way), (6, self.turn)):
+            by_x, by_y = length * x, length * y
+            for row, part in enumerate((length, by_y, by_x, by_y * y, by_y * x, by_x * x)):
+                np.cumsum(part, out=sums[first + row, 1:])
+        along = self.way * cos
+        np.cumsum(along * cos, out=sums[12, 1:])
+        np.cumsum(along * sin, out=sums[13, 1:])
+        return sums
+
+
+def _weights(settings: Odometry) -> Floats:
+    """Return how (6, 14) the sums of `PlanarSteps` add to the six distinct elements of the drift, see `_PLANAR`."""
+    by_way, by_turn = (_step_variances(turn, way, settings) for turn, way in ((0.0, 1.0), (1.0, 0.0)))
+    weights = np.zeros((6, 14))
+    for first, (angle, _, _) in ((0, by_way), (6, by_turn)):
+        weights[np.arange(6), first + np.arange(6)] = angle * np.array([1.0, 1.0, -1.0, 1.0, -1.0, 1.0])
+    (_, x, y), (_, turned, _) = by_way, by_turn  # A turn adds the same variance to x and y.
+    weights[3, [0, 6, 12]] += y, turned, x - y
+    weights[5, [0, 6, 12]] += x, turned, y - x
+    weights[4, 13] = x - y
+    return weights
 
 
 _PLANAR = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])

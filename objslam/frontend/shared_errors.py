@@ -297,11 +297,7 @@ class SharedErrors:
 
     def _drift(self, error: Mapping[str, float]) -> DriftPath:
         """The steps of the corrected odometry, which give its drift."""
-
-        def measured() -> DriftPath:
-            return DriftPath(self._correctable().path(self._of_odometry(error)))
-
-        return self._kept_drift.get(self._odometry_key(error), measured)
+        return self._kept_drift.get(self._odometry_key(error), lambda: self._correctable().drift(self._of_odometry(error)))
 
     def _odometry_key(self, error: Mapping[str, float]) -> tuple[float, ...]:
         """The errors of the odometry. Its scale includes the compensation of the map's shrinkage."""

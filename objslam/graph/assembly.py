@@ -52,9 +52,8 @@ class Measurements:
     """The measurements of a log, as P multiframes.
 
     images: all K keyframes. keyframes: the first keyframe of each multiframe. Only these have a pose in the graph. rays: in
-    the camera frames of `keyframes`. motion, covariance: (P-1, 4, 4), (P-1, 6, 6) the camera motions by odometry, None
-    without odometry. motions: those in the graph, None without odometry. tags: the fiducials whose corners are landmarks,
-    None if there are none.
+    the camera frames of `keyframes`. motions: the camera motions in the graph, None without odometry. tags: the fiducials
+    whose corners are landmarks, None if there are none.
     """
 
     multiframes: Multiframes
@@ -62,8 +61,6 @@ class Measurements:
     keyframes: Keyframes
     rays: Rays
     settings: Settings
-    motion: Floats | None
-    covariance: Floats | None
     motions: OdometryMotions | None = None
     tags: TagCorners | None = None
 
@@ -83,12 +80,11 @@ class Measurements:
         """
         joined = Multiframes.single(len(images)) if multiframes is None else multiframes
         keyframes, rays = joined.keyframes(images), joined.rays(images, rays)
-        motion, covariance, used = None, None, None
+        used = None
         if keyframes.odom_T_base is not None:
-            motion, covariance = motions(keyframes, settings)
             used = OdometryMotions.of(keyframes, settings, find_ties(keyframes, settings) if ties is None else ties)
         sized = None if tags is None else tags.sized(rays.label_names, settings)
-        return cls(joined, images, keyframes, rays, settings, motion, covariance, used, sized)
+        return cls(joined, images, keyframes, rays, settings, used, sized)
 
     def map_T_base(self, map_T_camera: Floats) -> Floats:
         """Return the base poses (K, 4, 4) at all images, from the poses (P, 4, 4) of the graph."""
@@ -155,11 +151,16 @@ class Measurements:
             return (squares,)
         return squares, LocalizedRows(by_localization, 3 * len(landmarks))
 
+    @cached_property
+    def _steps(self) -> tuple[Floats, Floats]:
+        return motions(self.keyframes, self.settings)
+
     def odometry(self) -> tuple[Floats, Floats]:
-        """Return the motions (P-1, 4, 4) and their covariances (P-1, 6, 6). ValueError without odometry."""
-        if self.motion is None or self.covariance is None:
-            raise ValueError("the log has no odometry, which motions need")
-        return self.motion, self.covariance
+        """Return the camera motions (P-1, 4, 4) by odometry, and their covariances (P-1, 6, 6).
+
+        ValueError without odometry.
+        """
+        return self._steps
 
     def factors(
         self,

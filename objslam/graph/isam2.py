@@ -143,6 +143,16 @@ class IncrementalGraph(GrowingGraph):
         self._at.read(levenberg_marquardt(self._store.graph(), self._at.values(), iterations, tolerance).values)
         self.rebuild()
 
+    def iterate(self) -> float:
+        """Optimise all variables by one iteration of Levenberg-Marquardt, and return by which share the cost fell.
+
+        iSAM2 stays as it was until a `rebuild`, which must follow before the next update. SolveError as in `solve`.
+        """
+        self.refresh()
+        found = levenberg_marquardt(self._store.graph(), self._at.values(), 1)
+        self._at.read(found.values)
+        return 1 - found.cost_after / max(found.cost_before, 1e-300)
+
     def rebuild(self) -> None:
         """Rebuild iSAM2 from the stored factors, linearised at the current estimate."""
         try:

@@ -82,8 +82,9 @@ def reject_outliers(
     if measured.tags is not None:
         positions = measured.tags.placed(measured.rays, map_T_camera, positions)
     solver = _Solver(measured, association, trace, near, close)
+    enough = np.full(association.count, np.iinfo(np.int64).max)
     for _ in range(rounds):
-        moved, agreeing = second_opinion(measured, map_T_camera, association, positions, used)
+        moved, agreeing, enough = second_opinion(measured, map_T_camera, association, positions, used, enough)
         if optimum is None:
             agreeing = agreeing | back
         elif (agreeing == used).all():
@@ -195,23 +196,24 @@ def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, asso
 
 
 def second_opinion(
-    measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools
-) -> tuple[Floats, Bools]:
+    measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools, enough: Ints
+) -> tuple[Floats, Bools, Ints]:
     """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
-    Corners of fiducials stay, because four corners of one square are better known than four separate points. Return the
-    positions (N, 3) m, and whether each ray (R,) agrees with its object.
+    Corners of fiducials stay, because four corners of one square are better known than four separate points. An object with
+    `enough` (N,) agreeing rays stays too: with so many, an earlier new position was not better. Return the positions (N, 3)
+    m, whether each ray (R,) agrees with its object, and `enough` for the next time.
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)
     agreeing = supported(rays, association, map_T_camera, positions, used)
     support = np.bincount(association.object[agreeing], minlength=association.count)
-    doubtful = support < _SURE * number
+    doubtful = (support < _SURE * number) & (support < enough)
     if measured.tags is not None:
         doubtful &= ~measured.tags.is_corner()
     which = np.isin(association.object, np.flatnonzero(doubtful))
     if not which.any():
-        return positions, agreeing
+        return positions, agreeing, enough
     objects, index = np.unique(association.object[which], return_inverse=True)
     some = Association(index, association.label[objects])
     if used.any():  # Solved poses no longer have the noise of the localisation.
@@ -220,9 +222,10 @@ def second_opinion(
     other = positions.copy()
     other[objects[placed.ok]] = placed.positions[placed.ok]
     agreeing = supported(rays, association, map_T_camera, other, used)
-    gained = np.bincount(association.object[agreeing], minlength=len(support))
-    positions = np.where((gained > support)[:, None], other, positions)
-    return positions, supported(rays, association, map_T_camera, positions, used)
+    better = np.bincount(association.object[agreeing], minlength=len(support)) > support
+    positions = np.where(better[:, None], other, positions)
+    enough = np.where(doubtful & ~better & (support > 0), support, enough)
+    return positions, supported(rays, association, map_T_camera, positions, used), enough
 
 
 def supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:

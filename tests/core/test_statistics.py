@@ -19,6 +19,7 @@ from objslam.core.statistics import (
     distinct,
     grouped_median,
     grouped_quantile,
+    log_beta,
     logistic,
     noise_factors,
     order_by_group,
@@ -105,6 +106,17 @@ def test_the_poisson_tail_is_one_less_the_sum_of_the_smaller_counts():
     least, mean = np.array([-2, 0, 1, 2, 5, 3]), np.array([1.0, 0.0, 0.5, 3.0, 2.0, 0.0])
     expected = [1 - sum(math.exp(-m) * m**k / math.factorial(k) for k in range(n)) for n, m in zip(least, mean, strict=True)]
     np.testing.assert_allclose(poisson_tail(least, mean), expected, atol=1e-15)
+
+
+def test_sums_and_scipy_give_the_same_special_functions(monkeypatch):
+    rng = np.random.default_rng(0)
+    mean = np.exp(rng.uniform(-8, 6, 200))
+    least = np.maximum(np.round(mean + rng.normal(size=200) * 3 * np.sqrt(mean) + rng.integers(-2, 8, 200)), 0).astype(int)
+    a, b = np.exp(rng.uniform(-3, 8, (2, 200)))
+    summed = poisson_tail(least, mean), log_beta(a, b)
+    monkeypatch.setattr(statistics, "_FEW", 0)
+    np.testing.assert_allclose(summed[0], poisson_tail(least, mean), rtol=1e-11)
+    np.testing.assert_allclose(summed[1], log_beta(a, b), atol=1e-10)
 
 
 def test_log_odds_become_probabilities_however_large_they_are():

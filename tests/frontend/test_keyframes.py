@@ -16,6 +16,7 @@ from objslam.core.rotation import rotation_from_vector
 from objslam.core.trajectory import correct_path
 from objslam.core.types import CameraLog, Detections, Log, Trajectory
 from objslam.errors import LogError
+from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, corrected_odometry
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.odometry_drift import add_step, gathered_drift, step_drift
 from objslam.graph.fixed_pose_triangulation import noise_of_poses
@@ -332,6 +333,19 @@ def test_drift_is_the_covariance_propagated_step_by_step(seed):
     ten = between(gathered_drift(Trajectory(np.arange(11.0), way), np.arange(11.0), only_yaw), way, 0, 10)
     assert ten[4, 4] == pytest.approx(0.01**2 * (np.arange(10) ** 2).sum())
     assert ten[2, 2] == pytest.approx(10 * 0.01**2)
+
+
+@pytest.mark.parametrize("errors", [(0.0, 0.0, 0.0), (0.04, 0.0, 0.0), (-0.03, -0.07, 0.002)])
+def test_the_drift_of_a_corrected_path_is_that_of_its_steps(errors):
+    """The path is planar, so its drift comes from sums in the plane. The reference propagates the noise of each step."""
+    rng = np.random.default_rng(2)
+    steps = rng.normal(scale=[0.1, 0.02, 0.2], size=(40, 3)).cumsum(axis=0)
+    odometry = Trajectory(np.arange(40.0), lift_se2(steps))
+    error = dict(zip(ODOMETRY, errors, strict=True))
+    corrected, path = corrected_odometry(odometry, error), CorrectablePath(odometry)
+    start_T_base = inverse(corrected.poses[0]) @ corrected.poses
+    expected = np.cumsum(step_drift(start_T_base, NOISY, planar=True), axis=0)
+    np.testing.assert_allclose(path.drift(error).gathered(odometry.stamps[1:], NOISY), expected, atol=1e-12)
 
 
 def test_drift_does_not_depend_on_the_rate_nor_on_where_the_odometry_starts():

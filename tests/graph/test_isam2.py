@@ -86,6 +86,20 @@ def test_it_ends_where_the_batch_solve_does(drive):
     np.testing.assert_allclose(graph.poses(np.arange(len(drive.keyframes))), read_poses(values), atol=2e-3)
 
 
+def test_single_iterations_end_where_a_solve_does(drive):
+    graph, landmarks = grown(drive)
+    saved = graph.save()
+    graph.solve(50)
+    expected = graph.points(landmarks)
+    graph.restore(saved)
+    fell = [graph.iterate() for _ in range(8)]
+    assert fell[0] > fell[-1] >= 0
+    np.testing.assert_allclose(graph.points(landmarks), expected, atol=2e-3)
+    graph.rebuild()
+    graph.refresh()
+    np.testing.assert_allclose(graph.points(landmarks), expected, atol=2e-3)
+
+
 def test_covariances_are_those_of_the_batch_solve(drive):
     graph, landmarks = grown(drive)
     graph.solve(50)

@@ -5,6 +5,8 @@ part of the residuals that poses, landmarks and shared errors do not absorb. Ran
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 from scipy import sparse
@@ -78,6 +80,16 @@ class _Rows:
     motion_window: Ints
     ray_window: Ints
 
+    @cached_property
+    def by_motion_window(self) -> sparse.csr_matrix:
+        """(W, s) sums what belongs to the motions of each window."""
+        return _sums_in(self.motion_window)
+
+    @cached_property
+    def by_ray_window(self) -> sparse.csr_matrix:
+        """(W, n) sums what belongs to the rays of each window."""
+        return _sums_in(self.ray_window)
+
     @property
     def probes(self) -> int:
         """The number of random probes: enough for the kind of noise with the fewest independent residuals."""
@@ -99,17 +111,20 @@ def estimate_noise(
     root = np.linalg.cholesky(np.linalg.inv(errors.prior)).T
     jacobian, residual = system.jacobian, np.append(system.residual, root @ (theta - errors.mean))
     probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(residual), rows.probes))
-    begin = errors.noise
-    noise, history = begin, list[tuple[Floats, Floats]]()
+    begin = noise = errors.noise
+    history = list[tuple[Floats, Floats]]()
+    whitens = whitening(_motion_covariance(rows, noise))
+    rescaling = _Rescaling.of(system, rows, begin, whitens)
     left = _left(jacobian, system.normal, system.sides, root, np.column_stack([probes, residual]))
     for _ in range(_ITERATIONS):
-        other = _updated(system, rows, noise, kinds, probes, left, prior_residuals)
+        other = _updated(system, rows, noise, whitens, kinds, probes, left, prior_residuals)
         if other.like(noise, _CONVERGED):
             noise = other
             break
         history = [*history[-MEMORY:], (_logarithms(noise), _logarithms(other) - _logarithms(noise))]
         noise = _from_logarithms(accelerated(history, 1.0), other)
-        rescale = _rescaling(system, rows, begin, noise, len(system.residual))
+        whitens = whitening(_motion_covariance(rows, noise))
+        rescale = rescaling.to(noise, whitens)
         told = np.column_stack([probes, np.append(rescale @ system.residual, residual[len(system.residual) :])])
         scaled = rescale @ jacobian
         left = _left(scaled, NormalEquations.of(scaled, system.normal.order), rescale @ system.sides, root, told)
@@ -181,27 +196,48 @@ def _left(jacobian: sparse.csr_matrix, normal: NormalEquations, sides: Floats, p
     return np.asarray(rest - reduced @ np.linalg.solve(reduced.T @ reduced, reduced.T @ rest))
 
 
-def _rescaling(system: LinearSystem, rows: _Rows, before: NoiseFactors, after: NoiseFactors, size: int) -> sparse.csr_matrix:
-    """Return the matrix that changes rows (size, ...) whitened by the noise `before` into rows whitened by `after`."""
-    scale = np.ones(size)
-    scale[: system.first_range] = before.rays / after.rays
-    ranges = slice(system.first_range, system.first_range + len(rows.owner))
-    scale[ranges] = _range_sigma(rows, before) / _range_sigma(rows, after)
-    steps = len(rows.rest)
-    first, last = system.first_motion, system.first_motion + 6 * steps
-    blocks = whitening(_motion_covariance(rows, after)) @ np.linalg.inv(whitening(_motion_covariance(rows, before)))
-    row, column = (
-        first + 6 * np.arange(steps)[:, None, None] + np.arange(6)[axes] for axes in ((slice(None), None), (None,))
-    )
-    here = np.r_[:first, last:size]
-    at = [np.concatenate([here, np.broadcast_to(i, blocks.shape).ravel()]) for i in (row, column)]
-    return sparse.csr_matrix((np.concatenate([scale[here], blocks.ravel()]), (at[0], at[1])), shape=(size, size))
+@dataclass(frozen=True)
+class _Rescaling:
+    """The change of M rows that are whitened by the noise `begin` into rows whitened by another noise.
+
+    system, rows: the rows. begin: the noise. colours: (s, 6, 6) undo the whitening of the motions. pattern: the columns of
+    all entries of the matrix (M, M), row by row, and the first entry of each row.
+    """
+
+    system: LinearSystem
+    rows: _Rows
+    begin: NoiseFactors
+    colours: Floats
+    pattern: tuple[Ints, Ints]
+
+    @classmethod
+    def of(cls, system: LinearSystem, rows: _Rows, begin: NoiseFactors, whitens: Floats) -> Self:
+        """Prepare the change. whitens: (s, 6, 6) of the motions, for the noise `begin`."""
+        size, first = len(system.residual), system.first_motion
+        last = first + whitens.size // 6
+        blocks = np.repeat(np.arange(first, last).reshape(-1, 6), 6, axis=0)
+        columns = np.concatenate([np.arange(first), blocks.ravel(), np.arange(last, size)])
+        lengths = np.ones(size, dtype=np.int64)
+        lengths[first:last] = 6
+        return cls(system, rows, begin, np.asarray(np.linalg.inv(whitens)), (columns, np.append(0, np.cumsum(lengths))))
+
+    def to(self, noise: NoiseFactors, whitens: Floats) -> sparse.csr_matrix:
+        """Return the matrix (M, M) for another noise. whitens: (s, 6, 6) of the motions, for this noise."""
+        system, rows, size = self.system, self.rows, len(self.system.residual)
+        scale = np.ones(size)
+        scale[: system.first_range] = self.begin.rays / noise.rays
+        ranges = slice(system.first_range, system.first_range + len(rows.owner))
+        scale[ranges] = _range_sigma(rows, self.begin) / _range_sigma(rows, noise)
+        last = system.first_motion + whitens.size // 6
+        data = np.concatenate([scale[: system.first_motion], (whitens @ self.colours).ravel(), scale[last:]])
+        return sparse.csr_matrix((data, *self.pattern), shape=(size, size))
 
 
 def _updated(
     system: LinearSystem,
     rows: _Rows,
     noise: NoiseFactors,
+    whitens: Floats,
     kinds: frozenset[str],
     probes: Floats,
     left: Floats,
@@ -209,8 +245,8 @@ def _updated(
 ) -> NoiseFactors:
     """Return the noise after one step of the iteration.
 
-    kinds: the kinds of noise to estimate. left: (M, probes + 1) the probes and residuals after the solution. prior: the
-    weight of the nominal noise, as a number of residuals.
+    whitens: (s, 6, 6) of the motions, for the present noise. kinds: the kinds of noise to estimate. left: (M, probes + 1)
+    the probes and residuals after the solution. prior: the weight of the nominal noise, as a number of residuals.
     """
     found = noise.to_dict(None)
     residual, kept, count = left[:, -1], left[:, :-1], probes.shape[1]
@@ -221,17 +257,14 @@ def _updated(
     steps = len(rows.rest)
     motion = slice(system.first_motion, system.first_motion + 6 * steps)
     if "odometry" in kinds and steps:
-        root = whitening(_motion_covariance(rows, noise))
-        pushed = np.einsum("kji,kj->ki", root, residual[motion].reshape(-1, 6))
-        one, two = (np.einsum("kji,kjp->kip", root, m[motion].reshape(-1, 6, count)) for m in (probes, kept))
+        told = np.column_stack([residual[motion], probes[motion], kept[motion]])
+        pushed = np.swapaxes(whitens, 1, 2) @ told.reshape(-1, 6, 1 + 2 * count)
         for k, name in enumerate(("along", "across", "turning")):
             variance = found[name] ** 2
             axis = rows.motion_axes[k]
             root_of_part = np.sqrt(np.maximum(np.einsum("kii->k", rows.parts[k]), 0.0) / (axis**2).sum(axis=1))
-            own, first, second = (
-                _summed(root_of_part[:, None] * np.einsum("ki,kip->kp", axis, part), rows.motion_window)
-                for part in (pushed[..., None], one, two)
-            )
+            sums = rows.by_motion_window @ (root_of_part[:, None] * np.einsum("ki,kip->kp", axis, pushed))
+            own, first, second = sums[:, 0], sums[:, 1 : 1 + count], sums[:, 1 + count :]
             share = len(own) / steps
             squares = share * variance**2 * (own**2).sum()
             redundancy = share * variance * (first * second).sum() / count
@@ -248,21 +281,20 @@ def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kep
     off = np.einsum("njk,nk->nj", axes, residual[: 2 * count].reshape(-1, 2)) / np.sqrt(rows.bearing_weight)[:, None]
     one, two = (np.einsum("njk,nkp->njp", axes, m[: 2 * count].reshape(count, 2, -1)) for m in (probes, kept))
     largest = 0.0
-    for window in (np.arange(count), rows.ray_window):
-        root = np.sqrt(np.bincount(window))[:, None]
-        groups = len(root)
-        sums = _summed(off, window) / root
-        first, second = (_summed(m.reshape(count, -1), window).reshape(groups, 2, -1) / root[:, None] for m in (one, two))
+    told = np.concatenate([off[:, :, None], one, two], axis=2).reshape(count, -1)
+    for summed, size in ((told, 1), (rows.by_ray_window @ told, np.bincount(rows.ray_window))):
+        groups = len(summed)
+        found = summed.reshape(groups, 2, -1) / np.sqrt(size).reshape(-1, 1, 1)
+        sums, first, second = found[:, :, 0], found[:, :, 1 : 1 + probes.shape[1]], found[:, :, 1 + probes.shape[1] :]
         redundancy = (first * second).sum(axis=(0, 2)) / probes.shape[1]
-        size = groups * (np.abs(sums).mean(axis=0) * _MEAN_NORMAL * factor) ** 2
-        largest = max(largest, float(((prior + size) / (prior + np.maximum(redundancy, 0.0))).max()))
+        squares = groups * (np.abs(sums).mean(axis=0) * _MEAN_NORMAL * factor) ** 2
+        largest = max(largest, float(((prior + squares) / (prior + np.maximum(redundancy, 0.0))).max()))
     return float(np.sqrt(largest))
 
 
-def _summed(values: Floats, window: Ints) -> Floats:
-    """Return the sums (W, D) of the rows of (n, D) in each window (n,)."""
-    members = sparse.csr_matrix((np.ones(len(window)), (window, np.arange(len(window)))))
-    return np.asarray(members @ values)
+def _sums_in(window: Ints) -> sparse.csr_matrix:
+    """Return the matrix (W, n) whose product with rows (n, D) sums them in each window (n,)."""
+    return sparse.csr_matrix((np.ones(len(window)), (window, np.arange(len(window)))))
 
 
 def _range_noise(

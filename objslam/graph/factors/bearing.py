@@ -8,6 +8,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import make_pose
+from objslam.core.rotation import cross
 from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
 
@@ -111,9 +112,9 @@ def tangent_basis(directions: Floats) -> Floats:
     The first vector is the cross product of the direction and an axis: the axis along which the direction has its smallest
     component in absolute value.
     """
-    first = np.cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
+    first = cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(directions, first)], axis=2)
+    return np.stack([first, cross(directions, first)], axis=2)
 
 
 def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None, metric: bool) -> Floats:

@@ -13,6 +13,7 @@ from scipy import sparse
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse, log_se3
+from objslam.core.rotation import cross
 from objslam.core.statistics import CAUCHY_K
 from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements, RowsOfKind
@@ -186,7 +187,7 @@ class JointGraph:
         by_seen = np.concatenate([by_seen.reshape(-1, 3), by_distance])
         ray = np.concatenate([np.repeat(np.arange(len(rays)), 2), ranged])
         on_landmark = (map_T_camera[rays.keyframe, :3, :3][ray] @ by_seen[..., None])[..., 0]
-        seen_rows = np.hstack([on_landmark, np.cross(by_seen, seen[ray]), -by_seen])
+        seen_rows = np.hstack([on_landmark, cross(by_seen, seen[ray]), -by_seen])
         way, move_rows, move_cost = self._motion_rows(map_T_camera)
         further = [kind.rows(map_T_camera, landmarks) for kind in self.further]
         apart, absolute_roots, absolute_cost = self.absolute_roots(map_T_camera)
@@ -213,7 +214,11 @@ class JointGraph:
         if not len(self.motion_roots):
             return np.zeros(0), np.zeros(0)
         off = log_se3(self.motion_errors(map_T_camera)[1])
-        square = ((self.motion_roots @ off[..., None])[..., 0] ** 2).sum(axis=1)
+        return self._motion_weights((self.motion_roots @ off[..., None])[..., 0])
+
+    def _motion_weights(self, whitened: Floats) -> tuple[Floats, Floats]:
+        """Return the same as `motion_weights`, from the whitened residuals (s, 6)."""
+        square = (whitened**2).sum(axis=1)
         robust, ratio = self.measured.seen_twice, square / JUMP**2
         return np.where(robust, 1 / np.sqrt(1 + ratio), 1.0), np.where(robust, JUMP**2 * np.log1p(ratio), square) / 2
 
@@ -232,11 +237,12 @@ class JointGraph:
             return np.zeros(0), np.zeros((0, 6, 12)), np.zeros(0)
         moved, error = self.motion_errors(map_T_camera)
         off = log_se3(error)
-        weight, cost = self.motion_weights(map_T_camera)
-        roots = weight[:, None, None] * self.motion_roots
-        after = roots @ by_end(off)
-        before = -after @ adjoint(inverse(moved))
-        return (roots @ off[..., None]).ravel(), np.concatenate([before, after], axis=2), cost
+        whitened = (self.motion_roots @ off[..., None])[..., 0]
+        weight, cost = self._motion_weights(whitened)
+        rows = np.empty((len(off), 6, 12))
+        np.matmul(weight[:, None, None] * self.motion_roots, by_end(off), out=rows[:, :, 6:])
+        np.matmul(-rows[:, :, 6:], adjoint(inverse(moved)), out=rows[:, :, :6])
+        return (weight[:, None] * whitened).ravel(), rows, cost
 
 
 def _ranged(rays: Rays) -> Ints:

@@ -43,8 +43,9 @@ def log_evidence(
     total = -cost - float(np.log(2 * np.pi * sigma**2).sum()) - np.log(_VIEW) * int((~used).sum())
     if np.isfinite(rays.range).any():
         total += _of_ranges(measured, association, used, distance)
-    if measured.covariance is not None:
-        total -= float(np.linalg.slogdet(measured.covariance[measured.keyframes.measured])[1].sum()) / 2
+    if measured.motions is not None:
+        _, covariance = measured.odometry()
+        total -= float(np.linalg.slogdet(covariance[measured.keyframes.measured])[1].sum()) / 2
     unknowns = len(inverse.scale) - 6 * len(measured.keyframes)  # Those of landmarks. Each has a weak prior.
     return float(total - unknowns * np.log(settings.joint.prior_sigma) - inverse.log_determinant / 2)
 

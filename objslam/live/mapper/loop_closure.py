@@ -1,6 +1,5 @@
 """Loop closure: landmarks seen now are recognised as landmarks seen long ago, several at once, and merged."""
 
-from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -24,8 +23,8 @@ _AROUND = 6.0
 """Other landmarks within this radius (m) of recognised landmarks match again. Cameras see about as far in a hall. In a
 larger radius, more landmarks match again."""
 _ERA = 15.0  # Landmarks _AROUND match again if seen within this time (s) of the recognised ones. A longer time matches more.
-_ITERATIONS = 5  # The iterations of the solve after a loop closure. More iterations delay the next frame.
-_TOLERANCE = 1e-3  # The relative decrease of the cost at which the solve stops. A smaller value takes longer.
+_ITERATIONS = 5  # The most iterations of the solve after a loop closure. More iterations delay the next frame.
+_TOLERANCE = 1e-3  # The share of the cost below whose decrease the solve gives up. A smaller value takes longer.
 _HOLDS = 0.7  # The share of a loop's rays that must be inliers. A larger share undoes more loops, right and wrong ones.
 _BENT = 0.02  # The assumed error (m) of the corrected path, added to the noise of rays. A larger error accepts more rays.
 
@@ -154,7 +153,7 @@ def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
     landmarks.yaw[:] += np.arctan2(carried[:, 1, 0], carried[:, 0, 0])
     mine = np.flatnonzero(np.isin(rays.owner, landmarks.id[np.concatenate([now, old])]) & rays.used)
     _merge(m, now, old, rebuild=False)
-    if any(_holds(m, mine) for _ in _settled(m)):
+    if _settles(m, mine):
         m.schedule.relinearise_soon()
         m.counters.accept("loops closed")
         m.counters.accept("merged objects", len(old))
@@ -167,12 +166,25 @@ def _bend(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
     m.read_positions()
 
 
-def _settled(m: MapState) -> Iterator[None]:
-    """Solve the corrected graph by one step, then by several steps. Yield after each solve that does not fail."""
-    for solve in (m.graph.rebuild, lambda: m.graph.solve(_ITERATIONS, _TOLERANCE)):
-        with suppress(SolveError):
-            solve()
-            yield
+def _settles(m: MapState, mine: Ints) -> bool:
+    """Solve the corrected graph until the rays in rows `mine` (n,) hold, and return whether they do.
+
+    After one step on the Bayes tree, iterations of Levenberg-Marquardt follow. The next frame waits for all of them, so they
+    end as soon as the rays hold. Later relinearisations do the rest.
+    """
+    with suppress(SolveError):
+        m.graph.rebuild()
+        if _holds(m, mine):
+            return True
+    with suppress(SolveError):
+        for _ in range(_ITERATIONS):
+            decrease = m.graph.iterate()
+            if _holds(m, mine):
+                m.graph.rebuild()
+                return True
+            if decrease < _TOLERANCE:
+                break
+    return False
 
 
 def _holds(m: MapState, mine: Ints) -> bool:

@@ -40,11 +40,11 @@ def moving_things(evidence: Evidence, left: Ints) -> Iterator[Ints]:
     The least number of boxes follows from how often boxes follow one another by chance in this log. left: (M,) the rays
     without an object, in the order of frames.
     """
+    if len(left) < _FEWEST:
+        return
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    if len(left) < _FEWEST:
-        return
     frame = _frame_of_camera(evidence)[left]
     one, two = _links(evidence, left, frame, _LAGS, evidence.state.obs.direction)
     rotation = evidence.state.view.map_T_camera[evidence.state.obs.frame, :3, :3]

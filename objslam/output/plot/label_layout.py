@@ -1,5 +1,6 @@
 """Placement of labels in a picture, so that no label covers another label or a dot."""
 
+import cv2
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
@@ -80,9 +81,13 @@ def _counts(points: Floats, frame: Floats) -> Floats:
 
     A test of each of 100,000 points for each candidate would take minutes. With the table, `_covered` is fast.
     """
-    edges = [np.arange(np.floor(low), np.ceil(high) + 2) for low, high in frame.T]
-    table = np.histogram2d(points[:, 0], points[:, 1], edges)[0]
-    return np.pad(table.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    low = np.floor(frame[0]).astype(np.int64)
+    width, height = (np.ceil(frame[1]).astype(np.int64) + 1 - low).tolist()
+    x, y = (np.floor(points[np.isfinite(points).all(axis=1)]) - low).T
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    pixel = (x[inside] * height + y[inside]).astype(np.int64)
+    table = np.bincount(pixel, minlength=width * height).reshape(width, height)
+    return np.asarray(cv2.integral(table.astype(np.float64)), dtype=np.float64)
 
 
 def _covered(boxes: Floats, counts: Floats, origin: Floats) -> Floats:
