@@ -15,6 +15,7 @@ from objslam.core.types import Trajectory
 from objslam.frontend.shared_errors import SharedErrors, shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
+from objslam.graph.calibration import correlated_errors
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.noise_in_instruments import noise_shares
@@ -175,7 +176,7 @@ def test_noise_of_odometry_does_not_pull_at_the_scale_of_turns():
     assert pulls.std() < 1.5
 
 
-def test_errors_that_hang_together_make_the_gradient_less_certain():
+def test_errors_that_hang_together_make_the_gradient_less_certain(monkeypatch):
     """White residuals, and residuals that push a parameter the same way for three seconds each."""
     made, errors = drive({}, frames=200, false=0.0)
     theta, every = np.zeros(len(errors.names)), np.ones(len(made.rays), dtype=bool)
@@ -193,6 +194,14 @@ def test_errors_that_hang_together_make_the_gradient_less_certain():
     together = white.copy()
     together[: len(rows)] = rng.standard_normal(window.max() + 1)[window] * np.sign(pushes[: len(rows)])
     assert correlation_factors(state, replace(system, residual=together))[k] > 1.5
+    # The boxes of one object err together for the whole log, and each window has boxes of several objects.
+    landmark, side = np.repeat(made.association.object, 2), np.sign(pushes[: len(rows)])
+    alone = white.copy()
+    alone[: len(rows)] = rng.standard_normal(landmark.max() + 1)[landmark] * side
+    assert correlation_factors(state, replace(system, residual=alone))[k] > 1.5
+    both = correlation_factors(state, replace(system, residual=alone))[k]
+    monkeypatch.setattr(correlated_errors, "_by_object", lambda of, system, window: window)
+    assert both > 1.1 * correlation_factors(state, replace(system, residual=alone))[k]
 
 
 @pytest.mark.parametrize("clock", [0.0, 0.07])

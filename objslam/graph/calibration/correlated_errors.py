@@ -1,12 +1,14 @@
-"""Measure by how much the shared errors are less certain because noise is correlated in time.
+"""Measure by how much the shared errors are less certain because noise is correlated.
 
-The gradient by a parameter is a sum over measurements. It is split into sums over windows of time, and its variance is the
-variance of these sums. Noise need not be white inside a window (cluster-robust covariance; Liang and Zeger 1986).
+The gradient by a parameter is a sum over measurements. It is split into sums over clusters, and its variance is the variance
+of these sums. Noise need not be white inside a cluster (cluster-robust covariance; Liang and Zeger 1986). Errors of poses
+are correlated for some seconds, and those of boxes as long as the robot sees the same thing: a detector draws the box of a
+thing too far to one side, from all places nearby.
 """
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.calibration.variance_components import correlation_time
@@ -15,8 +17,9 @@ from objslam.graph.calibration.variance_components import correlation_time
 def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     """Return the factors (P,) >= 1 on the standard deviations of the gradients by the shared errors.
 
-    A factor is the standard deviation from sums over windows of `correlation_time` seconds, divided by the standard
-    deviation for white noise. system: the linear system of the graph `of`.
+    A factor is the standard deviation from sums over clusters, divided by the standard deviation for white noise. Clusters
+    are windows of `correlation_time` seconds, or all boxes of an object and such windows for all other measurements. The
+    larger factor counts. system: the linear system of the graph `of`.
     """
     jacobian = system.jacobian
     told = np.column_stack([system.residual, system.instruments, system.sides])
@@ -24,10 +27,25 @@ def correlation_factors(of: Linearised, system: LinearSystem) -> Floats:
     count = system.sides.shape[1]
     parts, reduced = left[:, 1 : 1 + count] * left[:, :1], left[:, 1 + count :]
     window = np.floor(_seconds(of, system) / correlation_time(of.measured.keyframes.stamps)).astype(np.int64)
-    sums = np.zeros((int(window.max(initial=0)) + 1, count))
-    np.add.at(sums, window, parts)
     white = np.maximum((reduced**2).sum(axis=0), 1e-300)
-    return np.asarray(np.sqrt(np.maximum((sums**2).sum(axis=0) / white, 1.0)))
+    largest = np.ones(count)
+    for cluster in (window, _by_object(of, system, window)):
+        sums = np.zeros((int(cluster.max(initial=0)) + 1, count))
+        np.add.at(sums, cluster, parts)
+        largest = np.maximum(largest, (sums**2).sum(axis=0) / white)
+    return np.asarray(np.sqrt(largest))
+
+
+def _by_object(of: Linearised, system: LinearSystem, window: Ints) -> Ints:
+    """Return the clusters (M,) of rows: one for the bearings and ranges of each object, and after them the windows (M,)."""
+    rays, owner = of.measured.rays.take(of.which), of.association.object[of.which]
+    if of.measured.tags is not None:  # The corners of a fiducial err together.
+        owner = of.measured.tags.object_of_landmark()[owner]
+    cluster = window + int(owner.max(initial=-1)) + 1
+    cluster[: 2 * len(owner)] = np.repeat(owner, 2)
+    ranged = owner[np.isfinite(rays.range)]
+    cluster[system.first_range : system.first_range + len(ranged)] = ranged
+    return cluster
 
 
 def _seconds(of: Linearised, system: LinearSystem) -> Floats:

@@ -114,6 +114,10 @@ def calibrate(
             state, theta, steps, nearly = at.state, at.theta, steps + at.steps, False
         if same:
             break
+    if len(theta):
+        fit = replace(fit, wider=correlation_factors(at.state, at.system))
+        at = fit.shared_errors(state, theta, _CONVERGED, at.noise)
+        state, theta, steps = at.state, at.theta, steps + at.steps
     nothing = np.zeros(len(state.used), dtype=bool)
     near = state.landmarks, state.factored
     final = reject_outliers(
@@ -186,11 +190,16 @@ class _Outer:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The input of a search for shared errors: the measurements as a function of the errors."""
+    """The input of a search for shared errors: the measurements as a function of the errors.
+
+    wider: (P,) factors on the standard deviations of the gradient, for noise that is not white, None until they are known.
+    They can be known only where the parameters fit, because wrong parameters cause correlated residuals too.
+    """
 
     errors: CalibratedMeasurements
     measure: Measure
     trace: Trace | None
+    wider: Floats | None = None
 
     @property
     def prior_residuals(self) -> float:
@@ -219,7 +228,7 @@ class _Fit:
         def outer(state: InnerSolve, theta: Floats, linear: LinearSystem) -> _Outer:
             linear = linear.with_noise(shares)
             system = _without_shrinking(state, linear.reduce(), errors, theta)
-            weights, information = _likelihood(system)
+            weights, information = _likelihood(system.with_wider(self.wider))
             gradient = weights @ system.gradient
             step = np.linalg.solve(information + prior, gradient - prior @ (theta - errors.mean))
             return _Outer(state, theta, linear, system, gradient, information, information + prior, np.asarray(step))
@@ -277,11 +286,12 @@ def _covariance(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats:
     """Return the covariance (P, P) of the parameters, at most the covariance of their prior in every direction.
 
     prior: (P, P) information. wider: (P,) factors on the standard deviations of the gradient, for noise that is not white.
-    With them, the covariance is a sandwich (Huber 1967).
+    With them, the covariance is a sandwich (Huber 1967). Its weights are those of white noise, because the factors are known
+    only roughly, and with too large a factor, other weights would promise too much.
     """
     weights, information = _likelihood(system)
     inverse = np.linalg.inv(information + prior)
-    varies = weights @ (system.variance * np.outer(wider, wider)) @ weights.T + prior
+    varies = weights @ system.with_wider(wider).variance @ weights.T + prior
     root = np.linalg.cholesky(prior)
     size, axes = np.linalg.eigh(root.T @ inverse @ varies @ inverse @ root)
     axes = np.linalg.solve(root.T, axes)

@@ -120,6 +120,10 @@ class ReducedSystem:
     sensitivity: Floats
     newton: Floats
 
+    def with_wider(self, factors: Floats | None) -> Self:
+        """Return the system with larger standard deviations of its gradient. factors: (P,), None leaves them as they are."""
+        return self if factors is None else replace(self, variance=self.variance * np.outer(factors, factors))
+
 
 def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats, noise: Floats | None = None) -> LinearSystem:
     """Return the linear system of a graph at its values and at the shared errors theta (P,).
