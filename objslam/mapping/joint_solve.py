@@ -100,9 +100,10 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         state = _without_confused_rows(state, found) if start is None else found
     else:
         begin = _with_turns(state)
-        explored = _from_start(*_explored(begin))
+        solved, first = _explored(begin)
+        explored = _from_start(solved, first)
         state = _improved(explored, JointState.relocalized)
-        noisier = _with_loose_odometry(explored, begin.theta)
+        noisier = _with_loose_odometry(explored, begin.theta, first)
         if noisier is not None:
             state = state.better(_improved(_from_start(*_explored(noisier)), JointState.relocalized))
         state = _improved(state, JointState.split)
@@ -270,12 +271,17 @@ def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
     return replace(solved, hold=True, association=None), start
 
 
-def _with_loose_odometry(state: JointState, assumed: Floats | None) -> JointState | None:
+def _with_loose_odometry(
+    state: JointState, assumed: Floats | None, first: InitialEstimate | None = None
+) -> JointState | None:
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
     None if the noise is about nominal and the shared errors are about those `assumed` (P,) by the first exploration, if the
     settings fix the noise, or if nearly all rays agree. The solve finds them, but the exploration needs them before. A wrong
     map can hide the noise of the odometry in the noise of the rays.
+
+    The filter finds both while it explores (`first`). So noise of the odometry is no reason to explore again if the filter's
+    corrections were about as large as it expected, and its shared errors count as assumed.
 
     The noise is at least nominal. A solve estimates the shared errors and the noise together, so the rest may be small. An
     exploration has the shared errors fixed, and those of a wrong map are wrong by more than their sigma. With half the noise
@@ -294,15 +300,27 @@ def _with_loose_odometry(state: JointState, assumed: Floats | None) -> JointStat
             return None
         of_surface = np.array([name == "surface" for name in state.errors.names])
         found, values = NOMINAL, np.where(of_surface, _surface(state.errors, values), start)
-    elif max(found.along, found.turning) <= _NOISIER:
+    elif not _trusted_too_much(found, first):
+        shared = assumed if first is None or first.shared is None else first.shared
         if found.rays > _NOISIER:
             found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), assumed
-        elif not _drives_otherwise(state, assumed):
+        elif not _drives_otherwise(state, shared):
             return None
     errors = state.errors.with_noise(_at_least_nominal(found))
     keyframes, rays, _ = errors.at(errors.mean if values is None else values)
     unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
     return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
+
+
+def _trusted_too_much(found: NoiseFactors, first: InitialEstimate | None) -> bool:
+    """Return whether an exploration `first` trusted the odometry clearly more than the noise `found` by the solve allows.
+
+    The filter adapts the noise of the odometry to its own corrections. Their mean square, relative to its expectation, is 1
+    at the right noise.
+    """
+    if first is not None and np.isfinite(first.surprise):
+        return first.surprise > _NOISIER**2
+    return max(found.along, found.turning) > _NOISIER
 
 
 def _at_least_nominal(noise: NoiseFactors) -> NoiseFactors:
