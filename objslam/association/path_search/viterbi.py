@@ -139,12 +139,12 @@ def _least(total: Cells, cost: Cells, states: slice, count: int) -> tuple[Cells,
     """
     total = np.ascontiguousarray(total)
     cheap = np.flatnonzero(cost.min(axis=1) < _SLIP)
-    if not len(cheap):
+    steps = (cheap - (count - 1)).tolist() or [0]
+    after = slice(max(states.start + steps[0], 0), min(states.stop + steps[-1], count))
+    if not len(cheap) or after.start >= after.stop:  # No state is reached but by a slip.
         return np.full_like(total, _SLIP), states
-    steps = cheap - (count - 1)
-    after = slice(max(states.start + int(steps[0]), 0), min(states.stop + int(steps[-1]), count))
-    least = np.full((len(total), max(after.stop - after.start, 0), total.shape[2]), _SLIP, dtype=total.dtype)
-    for step, of_step in zip(steps.tolist(), cost[cheap], strict=True):
+    least = np.full((len(total), after.stop - after.start, total.shape[2]), _SLIP, dtype=total.dtype)
+    for step, of_step in zip(steps, cost[cheap], strict=True):
         begin, end = max(states.start + step, 0), min(states.stop + step, count)
         if begin < end:
             here = least[:, begin - after.start : end - after.start]
