@@ -23,7 +23,7 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.init_unknown_correspondences import HORIZON, InitialEstimate
 from objslam.graph.loop_closure import seen_together
 from objslam.graph.multiframes import Multiframes
-from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise, with_shared_errors
+from objslam.graph.planar_motion import motions_by_shared_errors, planar_noise
 
 _STRETCH = 150
 """A landmark with too few rays is dropped after this number of frames without a ray. It is dropped sooner if the heading
@@ -64,7 +64,7 @@ def explore(
 ) -> InitialEstimate:
     """Return poses, landmarks and an association. A ray without a sure match has no landmark.
 
-    The exploration ends early, and leaves the rest of the rays without a landmark, as soon as it cannot be sure (`is_sure`).
+    The exploration ends as soon as it cannot be sure any more (`is_sure`). The rays that are left have no landmark then.
 
     errors: gives the keyframes and rays for any values of the shared errors. The filter estimates these errors, starting
     from their mean. surface: the value of the shared error of this name, which the filter does not estimate.
@@ -87,8 +87,7 @@ def is_sure(start: InitialEstimate) -> bool:
 class _Exploration:
     """The filter at the present frame. label, first, last, hits: (N,) the label, the first and last frame, and the number of
     rays of each landmark. owner: (R,) the landmark of each ray. doubtful: (R,) whether a ray may belong to a known landmark,
-    so that it makes no new landmark. path: (P, 4, 4) map_T_base at each frame. ratio: (3,) the sum over `corrections`
-    corrections of their squares in the motion's yaw, x and y, relative to their expectations."""
+    so that it makes no new landmark. path: (P, 4, 4) map_T_base at each frame."""
 
     def __init__(
         self,
@@ -99,7 +98,7 @@ class _Exploration:
     ) -> None:
         assert keyframes.odom_T_base is not None
         assert keyframes.drift is not None
-        self.keyframes, self.rays, self.settings, self.errors = keyframes, rays, settings, errors
+        self.keyframes, self.rays, self.settings = keyframes, rays, settings
         self.frames = Multiframes.of(keyframes)
         self.frame = self.frames.number[rays.keyframe]
         first, base = self.frames.first, keyframes.odom_T_base
@@ -111,7 +110,6 @@ class _Exploration:
         self.heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[first][:, :3, :3])[:, -1])  # rad^2
         self.filter = ekf.Filter.start(keyframes.map_T_base[0], prior)
         self.roughness = np.ones(ekf.POSE)  # The factors on the variances of the motion's yaw, x and y.
-        self.ratio, self.corrections = np.zeros(ekf.POSE), 0
         self.path = np.tile(np.eye(4), (len(first), 1, 1))
         self.owner, self.doubtful = np.full(len(rays), -1, dtype=np.int64), np.zeros(len(rays), dtype=bool)
         self.label, self.first, self.last, self.hits = np.zeros((4, 0), dtype=np.int64)
@@ -132,15 +130,11 @@ class _Exploration:
                 self._forget(k)
                 self._close(k)
                 progress(int(self.frames.first[k]) + 1, len(self.keyframes))
-                # A ray that has no landmark now will never have one.
+                # A ray that has no landmark after its frame never gets one.
                 if (self.owner[: begin[k + 1]] < 0).sum() > (1 - _EXPLAINED) * len(self.rays):
-                    self.owner[begin[k + 1] :] = -1
                     break
         map_T_camera = self.path[self.frames.number] @ self.base_T_camera
-        shared = None if self.errors is None else with_shared_errors(self.errors, self.filter.shared)
-        surprise = float((self.ratio / self.corrections).max()) if self.corrections else np.nan
-        association = Association(self.owner, self.label)
-        return InitialEstimate(map_T_camera, association, self.filter.position, shared, surprise)
+        return InitialEstimate(map_T_camera, Association(self.owner, self.label), self.filter.position)
 
     def _see(self, rays: Ints, now: int) -> None:
         """Assign the rays of a frame, and correct the filter. A ray with a range and no match makes a landmark."""
@@ -184,9 +178,7 @@ class _Exploration:
         turn = np.eye(ekf.POSE)
         turn[1:, 1:] = self.filter.map_T_base[:2, :2]
         ratio = (turn.T @ step) ** 2 / np.maximum(np.diagonal(turn.T @ expected @ turn), 1e-12)
-        ratio = np.minimum(ratio, _LARGEST)
-        self.ratio, self.corrections = self.ratio + ratio, self.corrections + 1
-        self.roughness = np.clip(self.roughness * (1 + _GAIN * (ratio - 1)), 1.0, _MOST)
+        self.roughness = np.clip(self.roughness * (1 + _GAIN * (np.minimum(ratio, _LARGEST) - 1)), 1.0, _MOST)
 
     def _stretch(self, now: int) -> int:
         """Return the first frame after which the heading has drifted by less than `HORIZON`, at most `_STRETCH` frames

@@ -64,17 +64,11 @@ class InitialEstimate:
     """A start for the global association: camera poses (K, 4, 4), the landmark of each ray, and landmark positions (N, 3).
 
     The map frame is the odometry's frame, in which the first keyframe is fixed.
-
-    shared: (P,) the shared errors if the exploration estimated those of the odometry, else None. surprise: the mean squared
-    correction of a pose along and across the motion and in yaw, the largest of the three, relative to its expectation. It is
-    1 if the odometry is as noisy as the exploration took it for, and NaN if the exploration did not compare them.
     """
 
     map_T_camera: Floats
     association: Association
     positions: Floats
-    shared: Floats | None = None
-    surprise: float = np.nan
 
 
 def initialize_unknown(

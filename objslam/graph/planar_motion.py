@@ -25,11 +25,14 @@ def motions_by_shared_errors(errors: CalibratedMeasurements | None, first: Ints,
     The shared errors are the errors of the odometry, and one clock for all cameras. motion: (P-1, 4, 4) of the base, from
     keyframe to keyframe of `first` (P,).
     """
-    groups = _groups(errors)
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(errors.names if errors is not None else ()):
+        if kind(name) == "clock" or name.startswith("odometry."):
+            groups.setdefault("clock" if kind(name) == "clock" else name, []).append(i)
     if errors is None or not groups:
         return np.zeros((len(motion), 3, 0)), np.zeros(0)
     change, prior = [], []
-    for which in groups:
+    for which in groups.values():
         step = np.zeros(len(errors.mean))
         step[which] = errors.steps[which]
         base = errors.at(errors.mean + step, drift=False)[0].odom_T_base
@@ -39,20 +42,3 @@ def motions_by_shared_errors(errors: CalibratedMeasurements | None, first: Ints,
         change.append(np.stack(planar, axis=1) / errors.steps[which[0]])
         prior.append(np.sqrt(errors.prior[which[0], which[0]]))
     return np.stack(change, axis=2), np.array(prior)
-
-
-def with_shared_errors(errors: CalibratedMeasurements, found: Floats) -> Floats:
-    """Return the values (P,) of all shared errors, if the motions show those of `motions_by_shared_errors`, found (S,)."""
-    values = errors.mean.copy()
-    for which, value in zip(_groups(errors), found.tolist(), strict=True):
-        values[which] += value
-    return values
-
-
-def _groups(errors: CalibratedMeasurements | None) -> list[list[int]]:
-    """Return the S groups of shared errors that change the motions: each error of the odometry, and the clocks together."""
-    groups: dict[str, list[int]] = {}
-    for i, name in enumerate(errors.names if errors is not None else ()):
-        if kind(name) == "clock" or name.startswith("odometry."):
-            groups.setdefault("clock" if kind(name) == "clock" else name, []).append(i)
-    return list(groups.values())

@@ -110,7 +110,8 @@ def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
         total: (Y, X, X) of the states before.
         x, y, yaw: as of `Motions.costs`.
     """
-    turns, east, north = (_extent((total < _SLIP).any(axis=others)) for others in ((1, 2), (0, 2), (0, 1)))
+    below = total < _SLIP
+    turns, east, north = (_extent(np.any(below, axis=others, keepdims=True).ravel()) for others in ((1, 2), (0, 2), (0, 1)))
     part = total[turns, east, north]
     part, east = _least(part, x[:, turns], east, total.shape[1])
     part, north = _least(np.swapaxes(part, 1, 2), y[:, turns], north, total.shape[2])

@@ -1,0 +1,1 @@
+"""Explore a log without a localisation, where nobody knows which box shows which object."""
