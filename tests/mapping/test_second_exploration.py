@@ -8,7 +8,8 @@ import pytest
 from objslam.config import Settings
 from objslam.core.calibration import Calibration
 from objslam.core.noise import NoiseFactors
-from objslam.mapping.exploration.second_exploration import with_loose_odometry
+from objslam.core.types import Association
+from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
 
 NAMES = ("odometry.scale", "odometry.turn_scale", "front.clock", "surface")
 
@@ -94,3 +95,25 @@ def test_a_log_is_not_explored_with_less_noise_than_the_settings_say():
     quiet = NoiseFactors(rays=0.66, along=0.7, across=2.0, turning=0.5, shrinkage=0.02)
     attempt = with_loose_odometry(state(turn=-0.05, noise=quiet), None)
     assert attempt.errors.noise == NoiseFactors(across=2.0)
+
+
+@pytest.mark.parametrize(
+    ("other", "same"),
+    [
+        ([1] * 500 + [0] * 500, True),  # The objects have other numbers.
+        ([0] * 500 + [1] * 500 + [2] * 30, True),  # A further object of rays that the map leaves without one.
+        ([-1] * 100 + [0] * 400 + [1] * 500, True),
+        ([0] * 505 + [1] * 495, True),
+        ([0] * 450 + [2] * 50 + [1] * 500, False),  # An object twice.
+        ([0] * 1000, False),  # Both objects in one.
+        ([0] * 450 + [1] * 550, False),
+    ],
+)
+def test_an_exploration_that_finds_the_objects_of_the_map_is_not_solved(other, same):
+    """The map has two objects of 500 rays, and 30 rays of none."""
+    rays = np.full(1030, -1)
+    rays[:500], rays[500:1000] = 0, 1
+    found = np.full(1030, -1)
+    found[: len(other)] = other
+    state, start = (SimpleNamespace(association=Association(one, np.zeros(3, dtype=np.int64))) for one in (rays, found))
+    assert finds_same_objects(state, start) == same
