@@ -72,6 +72,7 @@ def test_an_exploration_that_cannot_be_sure_ends_early():
 
 
 def test_rounding_of_stamps_changes_nothing():
+    """Stamps of 1.7e9 s are multiples of 2.4e-7 s, so a shift that is none rounds each of them in another way."""
     one, _ = explored(0, frames=300)
-    other, _ = explored(0, frames=300, shift=1e-9)
+    other, _ = explored(0, frames=300, shift=1 / 3)
     np.testing.assert_array_equal(one.association.object, other.association.object)
