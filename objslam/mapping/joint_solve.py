@@ -85,9 +85,10 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         state = _without_confused_rows(state, found) if start is None else found
     else:
         begin = _with_turns(state)
-        first = _from_start(*solved_if_sure(begin, *explored(begin)))
+        start, sure = explored(begin)
+        first = _from_start(*solved_if_sure(begin, start, sure))
         state = _improved(first, JointState.relocalized)
-        noisier = with_loose_odometry(first, begin.theta)
+        noisier = with_loose_odometry(first, begin.theta, sure)
         if noisier is not None:
             other, sure = explored(noisier)
             if not finds_same_objects(state, other):

@@ -90,6 +90,15 @@ def test_turns_that_the_exploration_began_with_are_no_reason_to_explore_again():
     assert with_loose_odometry(state(turn=-0.05), np.array([0.0, 0.02, 0.0, 0.0])) is not None
 
 
+@pytest.mark.parametrize(("turning", "sure", "again"), [(2.0, True, True), (2.0, False, False), (1.2, True, False)])
+def test_noise_of_the_odometry_is_reason_enough_for_the_filter(turning, sure, again):
+    """A map that shows objects twice can explain nearly all rays. Another exploration by the filter takes little time."""
+    attempt = with_loose_odometry(state(turn=0.0, agree=0.97, noise=NoiseFactors(turning=turning)), None, sure)
+    assert (attempt is not None) == again
+    if attempt is not None:
+        assert attempt.errors.noise.turning == turning
+
+
 def test_a_log_is_not_explored_with_less_noise_than_the_settings_say():
     """The noise that a solve finds is that of a path which is solved together with its turns, perhaps to a wrong map."""
     quiet = NoiseFactors(rays=0.66, along=0.7, across=2.0, turning=0.5, shrinkage=0.02)

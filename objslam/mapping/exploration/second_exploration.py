@@ -20,8 +20,9 @@ _NOISIER = 1.5
 """The factor on the noise of rays or odometry, found by a solve, above which a looser odometry is tried as well.
 A larger factor explores fewer logs twice."""
 _CLEAR = 0.95
-"""The share of agreeing rays above which a log is not explored again, whatever its noise. A larger share explores more logs
-twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few."""
+"""The share of agreeing rays above which a log is not explored again without the filter for ranges, whatever its noise. A
+larger share explores more logs twice. In simulation, maps that show objects twice explained at most 0.93 of the rays, but up
+to 0.96 with ranges. A good map can explain as few."""
 _SAME = 0.01
 """The rounds of a second exploration are left out if at most this share of the rays belongs to other objects than in the
 map. Two explorations of one drive assign a few rays between neighbours in different ways. A larger share leaves out more."""
@@ -33,7 +34,7 @@ _LOOSE = 3.0
 factor suits worse odometry, and loses more objects of good odometry."""
 
 
-def with_loose_odometry(state: JointState, assumed: Floats | None) -> JointState | None:
+def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = False) -> JointState | None:
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
     None if the noise is about nominal and the shared errors are about those `assumed` (P,) by the first exploration, if the
@@ -47,17 +48,21 @@ def with_loose_odometry(state: JointState, assumed: Floats | None) -> JointState
     If nearly all rays agree, wrong distances of centres behind surfaces may still have misled the exploration: an object
     that is seen from another side then seems to be another object. If the distances differ by more than those of single
     objects do, the log is explored with them.
+
+    sure: whether the filter for logs with ranges was sure of the first exploration. Another exploration by it takes little
+    time, so noise of the odometry is reason enough, even if nearly all rays agree with a map that shows objects twice.
     """
     if state.errors is None or "odometry" not in state.errors.unknown_noise:
         return None
     found, values = state.errors.noise, state.theta
-    if state.agree.mean() >= _CLEAR:
+    noisier = max(found.along, found.turning) > _NOISIER
+    if state.agree.mean() >= _CLEAR and not (sure and noisier):
         start = state.errors.mean if assumed is None else assumed
         if abs(surface_of(state.errors, values) - surface_of(state.errors, start)) <= state.settings.depth.centre_sigma:
             return None
         of_surface = np.array([name == "surface" for name in state.errors.names])
         found, values = NOMINAL, np.where(of_surface, surface_of(state.errors, values), start)
-    elif max(found.along, found.turning) <= _NOISIER:
+    elif not noisier:
         if found.rays > _NOISIER:
             found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), assumed
         elif not _drives_otherwise(state, assumed):
