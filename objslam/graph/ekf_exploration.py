@@ -64,6 +64,8 @@ def explore(
 ) -> InitialEstimate:
     """Return poses, landmarks and an association. A ray without a sure match has no landmark.
 
+    The exploration ends as soon as it cannot be sure any more (`is_sure`). The rays that are left have no landmark then.
+
     errors: gives the keyframes and rays for any values of the shared errors. The filter estimates these errors, starting
     from their mean. surface: the value of the shared error of this name, which the filter does not estimate.
     progress(done, total) is called with numbers of keyframes.
@@ -128,6 +130,9 @@ class _Exploration:
                 self._forget(k)
                 self._close(k)
                 progress(int(self.frames.first[k]) + 1, len(self.keyframes))
+                # A ray that has no landmark after its frame never gets one.
+                if (self.owner[: begin[k + 1]] < 0).sum() > (1 - _EXPLAINED) * len(self.rays):
+                    break
         map_T_camera = self.path[self.frames.number] @ self.base_T_camera
         return InitialEstimate(map_T_camera, Association(self.owner, self.label), self.filter.position)
 

@@ -239,6 +239,8 @@ class JointState:
         attempt = self.attempt().counted(found).solve("split", found, self.solved_poses).merged()
         assert attempt.association is not None
         assert attempt.estimate is not None
+        if rays_moved(self.association.object, attempt.association.object) == 0:
+            return self  # All bundles have merged again.
         attempt = attempt.alternated(attempt.estimate.map_T_base, (attempt.association, attempt.estimate.positions))
         assert attempt.association is not None
         same = rays_moved(self.association.object, attempt.association.object) == 0

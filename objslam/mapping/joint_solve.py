@@ -11,7 +11,6 @@ import numpy as np
 
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.geometry import inverse
-from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
 from objslam.frontend.turning_odometry import with_turns_of_tracks
@@ -23,6 +22,8 @@ from objslam.mapping.doubted_labels import (
     has_several,
     needs_noisy_boxes,
 )
+from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
+from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
 from objslam.mapping.fixed.camera_calibration import associate_rows
 from objslam.mapping.fixed.fixed_poses import FixedPoses
 from objslam.mapping.joint_alternation import JointState
@@ -38,23 +39,7 @@ from objslam.mapping.labels import (
 from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
-    from objslam.core.arrays import Floats
-    from objslam.frontend.shared_errors import SharedErrors
     from objslam.graph.init_unknown_correspondences import InitialEstimate
-
-_NOISIER = 1.5
-"""The factor on the noise of rays or odometry, found by a solve, above which a looser odometry is tried as well.
-A larger factor explores fewer logs twice."""
-_CLEAR = 0.95
-"""The share of agreeing rays above which a log is not explored again, whatever its noise. A larger share explores more logs
-twice. In simulation, maps that show objects twice explained at most 0.93 of the rays. A good map can explain as few: the log
-of a real robot in a forest is explored twice without need."""
-_CLEARLY = 3.0
-"""A log is explored again with the shared errors of its odometry that the solve found, if one of them is this number of
-standard deviations from what the exploration assumed. A larger number explores fewer logs twice."""
-_LOOSE = 3.0
-"""The factor on the noise of the odometry in the second exploration, if the solve found only the rays to be noisy. A larger
-factor suits worse odometry, and loses more objects of good odometry."""
 
 
 def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
@@ -100,11 +85,15 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         state = _without_confused_rows(state, found) if start is None else found
     else:
         begin = _with_turns(state)
-        explored = _from_start(*_explored(begin))
-        state = _improved(explored, JointState.relocalized)
-        noisier = _with_loose_odometry(explored, begin.theta)
+        start, sure = explored(begin)
+        first = _from_start(*solved_if_sure(begin, start, sure))
+        state = _improved(first, JointState.relocalized)
+        noisier = with_loose_odometry(first, begin.theta, sure)
         if noisier is not None:
-            state = state.better(_improved(_from_start(*_explored(noisier)), JointState.relocalized))
+            other, sure = explored(noisier)
+            if not finds_same_objects(state, other):
+                attempt = _from_start(*solved_if_sure(noisier, other, sure))
+                state = state.better(_improved(attempt, JointState.relocalized))
         state = _improved(state, JointState.split)
     assert state.association is not None
     if state.unsettled:
@@ -249,83 +238,3 @@ def _with_doubles(state: JointState) -> tuple[JointState, bool]:
     assert state.estimate is not None
     solved = state.rays, nearest, state.estimate, state.keyframes, state.solved_poses
     return state, not shows_second_object(*solved, state.settings)
-
-
-def _explored(state: JointState) -> tuple[JointState, InitialEstimate]:
-    """Explore a log without a localisation. Return the state and a first association. If the filter for logs with ranges is
-    sure of the association, the state is solved with it and holds the shared errors."""
-    from objslam.graph import ekf_exploration
-    from objslam.graph.init_unknown_correspondences import initialize_unknown
-
-    exploring = partial(state.progress, "explore")
-    start: InitialEstimate | None = None
-    if np.isfinite(state.rays.range).any():
-        surface = 0.0 if state.errors is None else _surface(state.errors, state.theta)
-        start = ekf_exploration.explore(state.keyframes, state.rays, state.settings, exploring, state.errors, surface)
-    if start is None or not ekf_exploration.is_sure(start):
-        return state, initialize_unknown(state.keyframes, state.rays, state.cameras, state.settings, exploring)
-    solved = state.solve("association", start.association)
-    assert solved.estimate is not None
-    start = replace(start, map_T_camera=solved.solved_poses, positions=solved.estimate.positions)
-    return replace(solved, hold=True, association=None), start
-
-
-def _with_loose_odometry(state: JointState, assumed: Floats | None) -> JointState | None:
-    """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
-
-    None if the noise is about nominal and the shared errors are about those `assumed` (P,) by the first exploration, if the
-    settings fix the noise, or if nearly all rays agree. The solve finds them, but the exploration needs them before. A wrong
-    map can hide the noise of the odometry in the noise of the rays.
-
-    The noise is at least nominal. A solve estimates the shared errors and the noise together, so the rest may be small. An
-    exploration has the shared errors fixed, and those of a wrong map are wrong by more than their sigma. With half the noise
-    it expects known objects within gates that they miss, and maps them again.
-
-    If nearly all rays agree, wrong distances of centres behind surfaces may still have misled the exploration: an object
-    that is seen from another side then seems to be another object. If the distances differ by more than those of single
-    objects do, the log is explored with them.
-    """
-    if state.errors is None or "odometry" not in state.errors.unknown_noise:
-        return None
-    found, values = state.errors.noise, state.theta
-    if state.agree.mean() >= _CLEAR:
-        start = state.errors.mean if assumed is None else assumed
-        if abs(_surface(state.errors, values) - _surface(state.errors, start)) <= state.settings.depth.centre_sigma:
-            return None
-        of_surface = np.array([name == "surface" for name in state.errors.names])
-        found, values = NOMINAL, np.where(of_surface, _surface(state.errors, values), start)
-    elif max(found.along, found.turning) <= _NOISIER:
-        if found.rays > _NOISIER:
-            found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), assumed
-        elif not _drives_otherwise(state, assumed):
-            return None
-    errors = state.errors.with_noise(_at_least_nominal(found))
-    keyframes, rays, _ = errors.at(errors.mean if values is None else values)
-    unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
-    return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
-
-
-def _at_least_nominal(noise: NoiseFactors) -> NoiseFactors:
-    """Return the noise of an exploration: no noise of rays or odometry below that of the settings, and no shrinkage."""
-    odometry = {name: max(getattr(noise, name), 1.0) for name in ("along", "across", "turning")}
-    return replace(noise, rays=max(noise.rays, 1.0), shrinkage=0.0, **odometry)
-
-
-def _surface(errors: SharedErrors, values: Floats | None) -> float:
-    """Return the shared error `surface` among values (P,), 0 if it is not estimated."""
-    return 0.0 if values is None else float(values[[name == "surface" for name in errors.names]].sum())
-
-
-def _drives_otherwise(state: JointState, assumed: Floats | None) -> bool:
-    """Return whether the solve found that the robot turns or drives clearly less or more than the exploration assumed.
-
-    An exploration with this error may take neighbours of one label for one object. The map then bends between them.
-    """
-    assert state.errors is not None
-    assert state.estimate is not None
-    found = state.estimate.calibration
-    if found is None:
-        return False
-    of_odometry = np.array([name.startswith("odometry.") for name in found.names])
-    off = np.abs(found.values - (state.errors.mean if assumed is None else assumed)) > _CLEARLY * found.sigma
-    return bool((off & of_odometry).any())

@@ -141,9 +141,10 @@ def test_rays_taken_in_parts_give_the_same_path(monkeypatch):
     np.testing.assert_array_equal(most_likely_path(*ask).map_T_base, whole.map_T_base)
 
 
-@pytest.mark.parametrize("drift", [0.3, 1.0, 4.0])
+@pytest.mark.parametrize("drift", [0.3, 1.0, 4.0, 20.0])
 def test_states_are_the_best_of_all_sequences_of_states(drift, monkeypatch):
-    """Against the total costs of all pairs of states, motion after motion. Steps reach the edges of the grid."""
+    """Against the total costs of all pairs of states, motion after motion. Steps reach the edges of the grid, and with the
+    largest drift some motions leave it from all states."""
     monkeypatch.setattr(state_grid, "_SHIFTS", 2)
     monkeypatch.setattr(state_grid, "_TURNS", 1)
     grid, rng, count = state_grid.Grid(0.1, 0.05), np.random.default_rng(0), 40

@@ -59,7 +59,20 @@ def test_what_the_filter_cannot_tell_is_not_sure():
     assert not is_sure(start)
 
 
+def test_an_exploration_that_cannot_be_sure_ends_early():
+    """It ends when more rays have no landmark than a sure exploration leaves."""
+    keyframes, rays, _, errors = drive(0, frames=200, false=0.2, missed=0.2)
+    done = []
+    start = explore(keyframes, rays, SETTINGS, lambda number, _: done.append(number), errors)
+    assert not is_sure(start)
+    assert done[-1] < 0.9 * len(keyframes)
+    later = rays.keyframe >= done[-1]
+    assert (start.association.object[later] < 0).all()
+    assert (start.association.object[~later] < 0).sum() > 0.2 * len(rays)
+
+
 def test_rounding_of_stamps_changes_nothing():
+    """Stamps of 1.7e9 s are multiples of 2.4e-7 s, so a shift that is none rounds each of them in another way."""
     one, _ = explored(0, frames=300)
-    other, _ = explored(0, frames=300, shift=1e-9)
+    other, _ = explored(0, frames=300, shift=1 / 3)
     np.testing.assert_array_equal(one.association.object, other.association.object)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from objslam.association.path_search.state_grid import Cells, Grid
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse, log_se3
 from objslam.core.types import Keyframes
 
@@ -75,12 +75,7 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
     """
     stored, total = list[NDArray[np.uint8]](), np.zeros(0, dtype=np.float32)
     for k, seen in enumerate(costs):
-        if k:
-            x, y, yaw = motions.costs(k - 1, grid)
-            total = _least(np.swapaxes(_least(total, x), 1, 2), y)
-            total = np.minimum(_least_turn(np.swapaxes(total, 1, 2), yaw), _SLIP) + seen
-        else:
-            total = seen
+        total = _reached(total, *motions.costs(k - 1, grid)) + seen if k else seen
         total = total - total.min()
         stored.append(np.minimum(np.rint(total * (_LEVELS / _SLIP)), _LEVELS + 1).astype(np.uint8))
     found = np.zeros((len(stored), 3))
@@ -104,37 +99,56 @@ def _steps_to(state: int, count: int) -> slice:
     return slice(state + count - 1, state - 1 if state else None, -1)
 
 
-def _least(total: Cells, cost: Cells) -> Cells:
-    """Return for each state the least sum (Y, X, n) of the costs of a state before and of the step from it along the second
-    axis.
+def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
+    """Return for each state the least sum (Y, X, X) of the costs of a state before and of the motion from it, at most
+    `_SLIP`.
+
+    Only states below `_SLIP` can lead to such a sum. So the search is in the part of the grid that contains them. It is
+    small where the rays tell well where the robot is.
+
+    Args:
+        total: (Y, X, X) of the states before.
+        x, y, yaw: as of `Motions.costs`.
+    """
+    below = total < _SLIP
+    turns, east, north = (_extent(np.any(below, axis=others, keepdims=True).ravel()) for others in ((1, 2), (0, 2), (0, 1)))
+    part = total[turns, east, north]
+    part, east = _least(part, x[:, turns], east, total.shape[1])
+    part, north = _least(np.swapaxes(part, 1, 2), y[:, turns], north, total.shape[2])
+    part, turns = _least(np.transpose(part, (2, 0, 1)), yaw[:, None], turns, len(total))
+    reached = np.full_like(total, _SLIP)
+    reached[turns, east, north] = np.swapaxes(part, 0, 1)
+    return reached
+
+
+def _extent(there: Bools) -> slice:
+    """Return the slice from the first to the last entry of a mask (n,) that is true."""
+    return slice(int(there.argmax()), len(there) - int(there[::-1].argmax()))
+
+
+def _least(total: Cells, cost: Cells, states: slice, count: int) -> tuple[Cells, slice]:
+    """Return for each state the least sum (m, W, n) of the costs of a state before and of the step from it along the second
+    axis, and the slice of the W states along this axis that are reached.
 
     The sum counts as at most `_SLIP`, so only the steps that cost less are tried. These are few steps, because the odometry
     drifts little between two stretches. All sums at once take three times as long.
 
     Args:
-        total: (Y, X, n) of the states before.
-        cost: (2 X - 1, Y) of the steps.
+        total: (m, V, n) of the states before.
+        cost: (2 count - 1, m) of the steps. The second axis may have length 1.
+        states: the V states along the second axis, out of `count` states.
     """
     total = np.ascontiguousarray(total)
-    least, count = np.full_like(total, _SLIP), total.shape[1]
-    for i in np.flatnonzero(cost.min(axis=1) < _SLIP).tolist():
-        before, after = _shifted(i, count)
-        np.minimum(least[:, after], total[:, before] + cost[i, :, None, None], out=least[:, after])
-    return least
-
-
-def _least_turn(total: Cells, cost: Cells) -> Cells:
-    """Return for each state the least sum (Y, X, X) of the costs of a state before and of the turn from it. cost: (2 Y -
-    1,)."""
-    total = np.ascontiguousarray(total)
-    least, count = np.full_like(total, _SLIP), len(total)
-    for i in np.flatnonzero(cost < _SLIP).tolist():
-        before, after = _shifted(i, count)
-        np.minimum(least[after], total[before] + cost[i], out=least[after])
-    return least
-
-
-def _shifted(index: int, count: int) -> tuple[slice, slice]:
-    """Return the states before and after a step, by its index in `Motions.costs`, that are both on the grid."""
-    step = index - (count - 1)
-    return slice(max(0, -step), count - max(0, step)), slice(max(0, step), count - max(0, -step))
+    cheap = np.flatnonzero(cost.min(axis=1) < _SLIP)
+    steps = (cheap - (count - 1)).tolist() or [0]
+    after = slice(max(states.start + steps[0], 0), min(states.stop + steps[-1], count))
+    if not len(cheap) or after.start >= after.stop:  # No state is reached but by a slip.
+        return np.full_like(total, _SLIP), states
+    least = np.full((len(total), after.stop - after.start, total.shape[2]), _SLIP, dtype=total.dtype)
+    for step, of_step in zip(steps, cost[cheap], strict=True):
+        begin, end = max(states.start + step, 0), min(states.stop + step, count)
+        if begin < end:
+            here = least[:, begin - after.start : end - after.start]
+            before = total[:, begin - step - states.start : end - step - states.start]
+            np.minimum(here, before + of_step[:, None, None], out=here)
+    return least, after

@@ -1,0 +1,110 @@
+"""Whether a log is explored a second time, and with which odometry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.core.noise import NOMINAL, NoiseFactors
+from objslam.mapping.solution import rays_moved
+
+if TYPE_CHECKING:
+    from objslam.core.arrays import Floats
+    from objslam.frontend.shared_errors import SharedErrors
+    from objslam.graph.init_unknown_correspondences import InitialEstimate
+    from objslam.mapping.joint_alternation import JointState
+
+_NOISIER = 1.5
+"""The factor on the noise of rays or odometry, found by a solve, above which a looser odometry is tried as well.
+A larger factor explores fewer logs twice."""
+_CLEAR = 0.95
+"""The share of agreeing rays above which a log is not explored again without the filter for ranges, whatever its noise. A
+larger share explores more logs twice. In simulation, maps that show objects twice explained at most 0.93 of the rays, but up
+to 0.96 with ranges. A good map can explain as few."""
+_SAME = 0.01
+"""The rounds of a second exploration are left out if at most this share of the rays belongs to other objects than in the
+map. Two explorations of one drive assign a few rays between neighbours in different ways. A larger share leaves out more."""
+_CLEARLY = 3.0
+"""A log is explored again with the shared errors of its odometry that the solve found, if one of them is this number of
+standard deviations from what the exploration assumed. A larger number explores fewer logs twice."""
+_LOOSE = 3.0
+"""The factor on the noise of the odometry in the second exploration, if the solve found only the rays to be noisy. A larger
+factor suits worse odometry, and loses more objects of good odometry."""
+
+
+def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = False) -> JointState | None:
+    """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
+
+    None if the noise is about nominal and the shared errors are about those `assumed` (P,) by the first exploration, if the
+    settings fix the noise, or if nearly all rays agree. The solve finds them, but the exploration needs them before. A wrong
+    map can hide the noise of the odometry in the noise of the rays.
+
+    The noise is at least nominal. A solve estimates the shared errors and the noise together, so the rest may be small. An
+    exploration has the shared errors fixed, and those of a wrong map are wrong by more than their sigma. With half the noise
+    it expects known objects within gates that they miss, and maps them again.
+
+    If nearly all rays agree, wrong distances of centres behind surfaces may still have misled the exploration: an object
+    that is seen from another side then seems to be another object. If the distances differ by more than those of single
+    objects do, the log is explored with them.
+
+    sure: whether the filter for logs with ranges was sure of the first exploration. Another exploration by it takes little
+    time, so noise of the odometry is reason enough, even if nearly all rays agree with a map that shows objects twice.
+    """
+    if state.errors is None or "odometry" not in state.errors.unknown_noise:
+        return None
+    found, values = state.errors.noise, state.theta
+    noisier = max(found.along, found.turning) > _NOISIER
+    if state.agree.mean() >= _CLEAR and not (sure and noisier):
+        start = state.errors.mean if assumed is None else assumed
+        if abs(surface_of(state.errors, values) - surface_of(state.errors, start)) <= state.settings.depth.centre_sigma:
+            return None
+        of_surface = np.array([name == "surface" for name in state.errors.names])
+        found, values = NOMINAL, np.where(of_surface, surface_of(state.errors, values), start)
+    elif not noisier:
+        if found.rays > _NOISIER:
+            found, values = NoiseFactors(along=_LOOSE, across=_LOOSE, turning=_LOOSE), assumed
+        elif not _drives_otherwise(state, assumed):
+            return None
+    errors = state.errors.with_noise(_at_least_nominal(found))
+    keyframes, rays, _ = errors.at(errors.mean if values is None else values)
+    unknown = replace(state.attempt(), association=None, estimate=None, hold=False, theta=values)
+    return replace(unknown, errors=errors, keyframes=keyframes, rays=rays)
+
+
+def _at_least_nominal(noise: NoiseFactors) -> NoiseFactors:
+    """Return the noise of an exploration: no noise of rays or odometry below that of the settings, and no shrinkage."""
+    odometry = {name: max(getattr(noise, name), 1.0) for name in ("along", "across", "turning")}
+    return replace(noise, rays=max(noise.rays, 1.0), shrinkage=0.0, **odometry)
+
+
+def surface_of(errors: SharedErrors, values: Floats | None) -> float:
+    """Return the shared error `surface` among values (P,), 0 if it is not estimated."""
+    return 0.0 if values is None else float(values[[name == "surface" for name in errors.names]].sum())
+
+
+def _drives_otherwise(state: JointState, assumed: Floats | None) -> bool:
+    """Return whether the solve found that the robot turns or drives clearly less or more than the exploration assumed.
+
+    An exploration with this error may take neighbours of one label for one object. The map then bends between them.
+    """
+    assert state.errors is not None
+    assert state.estimate is not None
+    found = state.estimate.calibration
+    if found is None:
+        return False
+    of_odometry = np.array([name.startswith("odometry.") for name in found.names])
+    off = np.abs(found.values - (state.errors.mean if assumed is None else assumed)) > _CLEARLY * found.sigma
+    return bool((off & of_odometry).any())
+
+
+def finds_same_objects(state: JointState, start: InitialEstimate) -> bool:
+    """Return whether a start has the same objects as the map of a state, so that its rounds would lead to the same map.
+
+    Rays without an object in one of them do not count, because the rounds assign them again.
+    """
+    assert state.association is not None
+    before, after = state.association.object, start.association.object
+    both = (before >= 0) & (after >= 0)
+    return rays_moved(before[both], after[both]) <= _SAME * len(before)
