@@ -80,6 +80,7 @@ def associate_globally(
     seed: int = 0,
     guess: tuple[Association, Floats] | None = None,
     drifts: bool = False,
+    solved: bool = False,
 ) -> Association:
     """Assign rays to objects at known camera poses.
 
@@ -92,6 +93,7 @@ def associate_globally(
         sigma: (R,) rad, position_sigma: m, the noise of rays and poses. flat_scale: as `Observations.scale`.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
+        solved: whether the poses are those of a joint solve. The rays of one thing meet there, as at localised poses.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma, flat_scale)
     view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts)
@@ -109,7 +111,8 @@ def associate_globally(
     state, likely, dropped = _merged_and_dropped(task, _add_distant(task, state))
     refuted |= dropped
     sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
-    if keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
+    meets = solved or bool(keyframes.localized_every)
+    if meets:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
         state, likely, dropped = _without_crossings(task, state, likely, sized)
         refuted |= dropped
     if state.ratio is not None:
@@ -118,7 +121,7 @@ def associate_globally(
         landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
     state, likely = _by_size(task, state, likely, sized)
-    if keyframes.localized_every:
+    if meets:
         # The things of these bundles are no landmarks, so that their rays always return.
         state = without_smaller_bundles(state, sized)
         stays = _plausible(task, state)

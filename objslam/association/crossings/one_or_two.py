@@ -148,7 +148,7 @@ def _excess(gain: Floats) -> Floats:
     # Without a landmark's own gain, all gains behind it move one place ahead.
     middle = [(len(every) - 2) // 2, (len(every) - 1) // 2]
     usual = np.mean([every[order[at + (at >= rank)]] for at in middle], axis=0)
-    return np.maximum(1.0, usual / _USUAL_GAIN)
+    return usual / _USUAL_GAIN
 
 
 def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
