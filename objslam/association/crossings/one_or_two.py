@@ -33,6 +33,12 @@ landmarks. To split one thing may lose it."""
 _ASSUMED = 3
 """The number of landmarks that are assumed to have the usual gain, beside those of the log. With a larger number, errors
 that rays share make more landmarks two."""
+_LEAST_EXCESS = 1 / 16
+"""The least factor on the gain of two points: that of rays with a quarter of the nominal noise. A smaller factor makes more
+landmarks two."""
+_OFF_CENTRE = 0.02
+"""By how much the middles of all boxes of a bundle are off the middle of their thing, as a share of their size. By perspective
+alone, this is the share of a cube seen from six times its size. A larger share makes fewer large things two."""
 _FREE = 3
 """The degrees of freedom of a second point."""
 _USUAL_GAIN = 2.366
@@ -84,7 +90,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     one, one_cost = _as_one(bundles)
     free, free_cost = fit_freely(bundles)
     other, other_cost = _as_another(bundles)
-    excess = _excess(one_cost - free_cost.reshape(-1, 2).sum(axis=1))
+    excess = np.maximum(_excess(one_cost - free_cost.reshape(-1, 2).sum(axis=1)), _of_offsets(bundles))
     two_things = _as_two((_most(bundles, free), free_cost), (other, other_cost))
     odds = one - (two_things[0] + _bearing_odds(one_cost - two_things[1], excess, len(two))).max(axis=0)
     position, open_ = free.position.copy(), np.flatnonzero(odds < 0)
@@ -137,10 +143,11 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
 
 
 def _excess(gain: Floats) -> Floats:
-    """Return for each landmark (S,) the factor, at least 1, by which two points gain more than by noise.
+    """Return for each landmark (S,) the factor by which two points gain more than by the nominal noise.
 
-    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. The
-    median gain of the other landmarks tells how much better. gain: (S,) by how much two free points lower the cost.
+    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses can
+    also be better than their nominal noise. Then two points gain less, and a small misfit shows a second thing. The median
+    gain of the other landmarks tells the factor. gain: (S,) by how much two free points lower the cost.
     """
     every = np.append(gain, np.full(_ASSUMED, _USUAL_GAIN))
     order = np.argsort(every, kind="stable")
@@ -148,7 +155,19 @@ def _excess(gain: Floats) -> Floats:
     # Without a landmark's own gain, all gains behind it move one place ahead.
     middle = [(len(every) - 2) // 2, (len(every) - 1) // 2]
     usual = np.mean([every[order[at + (at >= rank)]] for at in middle], axis=0)
-    return usual / _USUAL_GAIN
+    return np.asarray(np.maximum(_LEAST_EXCESS, usual / _USUAL_GAIN))
+
+
+def _of_offsets(bundles: Bundles) -> Floats:
+    """Return for each landmark (S,) the factor by which two points gain more because the boxes of a bundle share an offset.
+
+    More rays do not average such an offset out, so the gain grows with them.
+    """
+    obs, ray, count = bundles.state.obs, bundles.ray, bundles.count // 2
+    rays = np.bincount(bundles.group, minlength=2 * count).reshape(-1, 2)
+    offset2 = (_OFF_CENTRE / obs.sigma[ray]) ** 2 * obs.size[ray].prod(axis=1)
+    mean = np.bincount(bundles.group // 2, offset2, count) / rays.sum(axis=1)
+    return np.asarray(mean * rays.prod(axis=1) / rays.sum(axis=1))
 
 
 def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
