@@ -37,8 +37,8 @@ _LEAST_EXCESS = 1 / 16
 """The least factor on the gain of two points: that of rays with a quarter of the nominal noise. A smaller factor makes more
 landmarks two."""
 _OFF_CENTRE = 0.02
-"""By how much the middles of all boxes of a bundle are off the middle of their thing, as a share of their size. By perspective
-alone, this is the share of a cube seen from six times its size. A larger share makes fewer large things two."""
+"""By how much the middles of all boxes of a bundle are off the middle of their thing, as a share of their size. By
+perspective alone, this is the share of a cube seen from six times its size. A larger share makes fewer large things two."""
 _FREE = 3
 """The degrees of freedom of a second point."""
 _USUAL_GAIN = 2.366
@@ -145,9 +145,9 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
 def _excess(gain: Floats) -> Floats:
     """Return for each landmark (S,) the factor by which two points gain more than by the nominal noise.
 
-    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses can
-    also be better than their nominal noise. Then two points gain less, and a small misfit shows a second thing. The median
-    gain of the other landmarks tells the factor. gain: (S,) by how much two free points lower the cost.
+    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses
+    can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second thing. The
+    median gain of the other landmarks tells the factor. gain: (S,) by how much two free points lower the cost.
     """
     every = np.append(gain, np.full(_ASSUMED, _USUAL_GAIN))
     order = np.argsort(every, kind="stable")
