@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from objslam.core.result import DOUBT_KINDS, RunResult
+from objslam.core.result import DOUBT_KINDS, Doubt, RunResult
 from objslam.mapping.doubts import cut_things as cut_off
 from objslam.mapping.doubts import disagreeing as apart
 from objslam.mapping.doubts import unsure as wide
@@ -67,14 +67,8 @@ def with_doubts(result: RunResult) -> RunResult:
     # One doubt says why boxes are no object.
     lacking = {one.label for one in unmapped}
     cut = [thing for thing in cut if result.rays.label_names[thing.label] not in lacking]
-    doubts = (
-        *doubts,
-        *unsure,
-        *cut_off.in_doubts(cut, result),
-        *disagreeing,
-        *mixed,
-        *(one for one in unmapped if one.label not in told),
-    )
+    of_things = [*unsure, *cut_off.in_doubts(cut, result), *_unnamed(disagreeing, doubts), *mixed]
+    doubts = (*doubts, *of_things, *(one for one in unmapped if one.label not in told))
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
@@ -99,6 +93,15 @@ def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -
     if assessment["level"] == "good":  # The first reason praises the map. The others only describe it.
         return {**assessment, "level": "check", "reasons": [*doubles, *lost, *assessment["reasons"][1:]]}
     return {**assessment, "reasons": [*doubles, *assessment["reasons"], *lost]}
+
+
+def _unnamed(found: list[Doubt], earlier: tuple[Doubt, ...]) -> list[Doubt]:
+    """Return the first doubt about each object that no earlier doubt calls two."""
+    called = {one.objects for one in earlier if one.kind == "split"}
+    first: dict[tuple[int, ...], Doubt] = {}
+    for one in found:
+        first.setdefault(one.objects, one)
+    return [one for objects, one in first.items() if objects not in called]
 
 
 def _of_mixed(mixed: int) -> list[str]:
