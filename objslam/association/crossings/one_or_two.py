@@ -93,7 +93,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     one, one_cost = _as_one(bundles)
     free, free_cost = fit_freely(bundles)
     other, other_cost = _as_another(bundles)
-    excess = np.maximum(_excess(one_cost - free_cost.reshape(-1, 2).sum(axis=1)), _of_offsets(bundles))
+    excess = np.maximum(excess_of(one_cost - free_cost.reshape(-1, 2).sum(axis=1)), _of_offsets(bundles))
     two_things = _as_two((_most(bundles, free), free_cost), (other, other_cost))
     odds = one - (two_things[0] + _bearing_odds(one_cost - two_things[1], excess, len(two))).max(axis=0)
     position, open_ = free.position.copy(), np.flatnonzero(odds < 0)
@@ -145,7 +145,7 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
     return replace(state, matched=matched)
 
 
-def _excess(gain: Floats) -> Floats:
+def excess_of(gain: Floats) -> Floats:
     """Return for each landmark (S,) the factor by which two points gain more than by the nominal noise.
 
     Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses
@@ -183,7 +183,7 @@ def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
     The excess is as uncertain as the number of landmarks says, so that the odds are those of an F distribution.
 
     gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) as of
-    `_excess`. landmarks: how many gains told it.
+    `excess_of`. landmarks: how many gains told it.
     """
     number = landmarks - 1 + _ASSUMED
     tail = 0.5 * (number + _FREE) * np.log1p(np.maximum(gain, 0.0) / (excess * number))
