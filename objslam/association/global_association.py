@@ -37,8 +37,7 @@ _FRAMES = 12
 """The fewest frames that a search uses. An object is where rays of several frames meet. A larger number costs time."""
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
 _MIN_SUPPORT = 2.5
-"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger support finds fewer, surer
-points."""
+"""The least support of a point in a search. A ray that fits perfectly counts 1. A larger one finds fewer, surer points."""
 _ABOVE_CHANCE = 3.0
 """The least excess of a point's support over the support by stray rays, in standard deviations. A larger excess finds fewer,
 surer points."""
@@ -80,11 +79,12 @@ def associate_globally(
     seed: int = 0,
     guess: tuple[Association, Floats] | None = None,
     drifts: bool = False,
+    solved: bool = False,
 ) -> Association:
     """Assign rays to objects at known camera poses.
 
-    Objects are sorted by label, then by their first frame. Rays that no static object explains get no object. The result
-    does not depend on the order of rays and keyframes.
+    Objects are sorted by label, then by their first frame. Rays that no static object explains get no object. The order of
+    rays and keyframes does not matter.
 
     Args:
         keyframes: all observed frames. Frames without a box count as misses.
@@ -92,6 +92,7 @@ def associate_globally(
         sigma: (R,) rad, position_sigma: m, the noise of rays and poses. flat_scale: as `Observations.scale`.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
+        solved: whether the poses are those of a joint solve. The rays of one thing meet there, as at localised poses.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma, flat_scale)
     view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts)
@@ -109,7 +110,7 @@ def associate_globally(
     state, likely, dropped = _merged_and_dropped(task, _add_distant(task, state))
     refuted |= dropped
     sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
-    if keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
+    if solved or keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
         state, likely, dropped = _without_crossings(task, state, likely, sized)
         refuted |= dropped
     if state.ratio is not None:
@@ -118,7 +119,7 @@ def associate_globally(
         landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
     state, likely = _by_size(task, state, likely, sized)
-    if keyframes.localized_every:
+    if solved or keyframes.localized_every:
         # The things of these bundles are no landmarks, so that their rays always return.
         state = without_smaller_bundles(state, sized)
         stays = _plausible(task, state)
@@ -311,8 +312,7 @@ def _without_crossings(task: _Task, state: State, likely: Floats, sized: Bools) 
 
 
 def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
-    """Drop landmarks until all that are left are likely enough to exist. Also return the probability (N,) that each
-    exists."""
+    """Drop landmarks until all left are likely enough to exist. Also return the probability (N,) that each exists."""
     while True:
         likely = existence(state, task.gate)
         left = _drop(task, state, likely)
@@ -339,8 +339,8 @@ def _drop(task: _Task, state: State, likely: Floats) -> State:
 
 
 def _result(state: State, existence: Floats, ray: Ints) -> Association:
-    """Return the association with its objects in their final order. existence: (N,) probability of each landmark. ray: (R,)
-    the ray of each observation."""
+    """Return the association with its objects in their final order. existence: (N,) of each landmark. ray: (R,) of each
+    observation."""
     counts, label = state.label_count, state.label
     first = np.full(len(label), len(ray))
     np.minimum.at(first, state.owner, state.assigned)

@@ -330,4 +330,5 @@ class JointState:
             guess=guess,
             # The landmarks of a solve hold the path together. Before the first solve, only the odometry does.
             drifts=rough and frames.odom_T_base is not None and not frames.localized_every,
+            solved=not rough,
         )

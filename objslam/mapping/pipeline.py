@@ -25,6 +25,7 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.jumps import taken_out
+from objslam.mapping.checks.misfits import find_misfits, with_misfits
 from objslam.mapping.checks.residuals import check_pose_noise, check_residuals
 from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.upright import lies_on_its_side
@@ -124,7 +125,9 @@ def run(
         missing = noisy or check_residuals(objects, *held, residual, settings, calibrated=calibrated)
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
-    objects = widened(objects, keyframes, solution.rays, solution.association, estimate.weight, diagnosis)
+    used = keyframes, solution.rays, solution.association
+    objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
+    objects = widened(objects, *used, estimate.weight, diagnosis)
     where = None
     if known is not None:
         with _stage("localize", seconds, progress):

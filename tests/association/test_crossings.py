@@ -7,7 +7,7 @@ import pytest
 from association_scenes import Scene, watch
 
 from objslam.association.crossings.bundles import second_bundle
-from objslam.association.crossings.one_or_two import find_crossings
+from objslam.association.crossings.one_or_two import excess_of, find_crossings
 from objslam.association.crossings.usual_views import UsualViews
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.observations import observe
@@ -63,6 +63,38 @@ def test_no_object_is_where_rays_to_two_things_cross(seed: int) -> None:
     whole = [np.unique(scene.whose[association.object == j]) for j in range(association.count)]
     assert all(len(things) == 1 for things in whole)
     assert {2, 3, 4, 5} <= {int(things[0]) for things in whole}
+
+
+@pytest.mark.parametrize("solved", [False, True])
+def test_crossings_are_told_apart_at_solved_poses_and_not_at_poses_that_drift(solved: bool) -> None:
+    """Without a localisation, rays of one thing meet only after a solve."""
+    scene = hall(0, np.array([AHEAD, BEYOND, *BESIDE]))
+    drifting = replace(scene.keyframes, localized_every=0.0)
+    association = scene.associate(keyframes=drifting, solved=solved)
+    whole = [np.unique(scene.whose[association.object == j]) for j in range(association.count)]
+    assert all(len(things) == 1 for things in whole) == solved
+
+
+@pytest.mark.parametrize("times", [1.0, 3.0])
+def test_rays_better_than_their_nominal_noise_tell_as_much(times: float) -> None:
+    """The gains of the other landmarks show the noise of the rays, so the odds hardly depend on the nominal noise."""
+    scene = hall(2, np.array([AHEAD, BEYOND, *BESIDE]), step=0.04)
+    noisier = replace(scene, rays=replace(scene.rays, sigma=times * scene.rays.sigma))
+    found = find_crossings(true_state(noisier, {1: 0}), np.ones(len(scene.rays), dtype=bool), 3)
+    assert found.landmark[found.two].tolist() == [0]
+
+
+def test_gains_count_against_those_of_the_other_landmarks() -> None:
+    """Three landmarks of the usual gain are assumed. The quantiles are those of chi-squared with 3 degrees of freedom."""
+    rng = np.random.default_rng(0)
+    gain = 0.3 * rng.chisquare(3, 400)
+    assert excess_of(gain) == pytest.approx(0.3, abs=0.06)
+    # A ghost does not count for itself.
+    assert excess_of(np.append(gain, 500.0))[-1] == pytest.approx(excess_of(gain).min(), rel=0.05)
+    # Errors of a quarter of the landmarks show in the second quantile.
+    lasting = np.concatenate([gain[:300], 10 * gain[300:]])
+    others = np.sort(np.append(lasting[1:], [2.366] * 3))
+    assert excess_of(lasting)[0] == pytest.approx(np.quantile(others, 0.8) / 4.642)
 
 
 @pytest.mark.parametrize("seed", [2, 3, 4])

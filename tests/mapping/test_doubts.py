@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from doubtful_drives import DEFAULT, LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled, with_boxes
+from scipy.spatial.transform import Rotation
 
 from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
 from objslam.mapping.doubts import words
 from objslam.mapping.doubts.groups import REASONS
-from objslam.mapping.doubts.sizes import mixed_sizes
+from objslam.mapping.doubts.sizes import _alike, mixed_sizes
 from objslam.simulation import pair, preset, simulate
 from objslam.simulation.settings import DepthNoise
 
@@ -205,6 +206,25 @@ def test_an_object_whose_boxes_have_two_sizes():
     # A third of the logarithms is ln 2 less: their standard deviation is ln 2 times the root of 1/3 * 2/3.
     assert found.numbers["size_scatter"] == pytest.approx(np.log(2) * np.sqrt(2) / 3, abs=0.06)
     assert set(mine.tolist()) < set(found.rays.tolist())
+
+
+def test_boxes_that_show_the_vertical_otherwise_tell_no_size():
+    """A wrist camera sees a tall thing upright from the side and short from above. A robot's camera sees it alike."""
+    result = mapped(simulate(preset("rooms", false=0.0, tracks="perfect"), 4))
+    mine = np.arange(len(result.rays))
+    assert _alike(result, mine[result.association.object >= 0]).all()
+    held = np.flatnonzero(result.association.object == 0)
+    turned, poses = held[::3], result.map_T_base.copy()
+    first = result.rays.keyframe[turned]
+    # The camera of these boxes rolls by 60 degrees about the rays, so that each ray stays.
+    for k, way in zip(first, result.directions[turned], strict=True):
+        poses[k, :3, :3] = Rotation.from_rotvec(np.radians(60) * way).as_matrix() @ poses[k, :3, :3]
+    only_these = np.setdiff1d(held[~np.isin(result.rays.keyframe[held], first)], turned)
+    both = np.union1d(only_these, turned)
+    told = _alike(replace(result, map_T_base=poses), both)
+    assert not told[np.isin(both, turned)].any()
+    # The mean of both lies 20 degrees from the level boxes: atan(sin 60 / (2 + cos 60)) is 19.1.
+    assert told[np.isin(both, only_these)].mean() > 0.5
 
 
 def test_a_camera_that_observes_no_sizes_tells_none():

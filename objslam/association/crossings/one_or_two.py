@@ -33,11 +33,20 @@ landmarks. To split one thing may lose it."""
 _ASSUMED = 3
 """The number of landmarks that are assumed to have the usual gain, beside those of the log. With a larger number, errors
 that rays share make more landmarks two."""
+_LEAST_EXCESS = 1 / 16
+"""The least factor on the gain of two points: that of rays with a quarter of the nominal noise. A smaller factor makes more
+landmarks two."""
+_OFF_CENTRE = 0.02
+"""By how much the middles of all boxes of a bundle are off the middle of their thing, as a share of their size. By
+perspective alone, this is the share of a cube seen from six times its size. A larger share makes fewer large things two."""
 _FREE = 3
 """The degrees of freedom of a second point."""
 _USUAL_GAIN = 2.366
 """The median by which the cost of the rays of one thing falls if two points explain them: that of chi-squared with `_FREE`
 degrees of freedom."""
+_USUAL_GAINS = ((0.5, _USUAL_GAIN), (0.8, 4.642))
+"""Quantiles of this chi-squared distribution. Errors that last for a while, as of a wheel that slips, concern some landmarks
+only, and show in the second one. One landmark in five may be two things without effect on it."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +93,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     one, one_cost = _as_one(bundles)
     free, free_cost = fit_freely(bundles)
     other, other_cost = _as_another(bundles)
-    excess = _excess(one_cost - free_cost.reshape(-1, 2).sum(axis=1))
+    excess = np.maximum(excess_of(one_cost - free_cost.reshape(-1, 2).sum(axis=1)), _of_offsets(bundles))
     two_things = _as_two((_most(bundles, free), free_cost), (other, other_cost))
     odds = one - (two_things[0] + _bearing_odds(one_cost - two_things[1], excess, len(two))).max(axis=0)
     position, open_ = free.position.copy(), np.flatnonzero(odds < 0)
@@ -136,19 +145,36 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
     return replace(state, matched=matched)
 
 
-def _excess(gain: Floats) -> Floats:
-    """Return for each landmark (S,) the factor, at least 1, by which two points gain more than by noise.
+def excess_of(gain: Floats) -> Floats:
+    """Return for each landmark (S,) the factor by which two points gain more than by the nominal noise.
 
-    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. The
-    median gain of the other landmarks tells how much better. gain: (S,) by how much two free points lower the cost.
+    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses
+    can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second thing. The
+    gains of the other landmarks tell the factor. gain: (S,) by how much two free points lower the cost.
     """
     every = np.append(gain, np.full(_ASSUMED, _USUAL_GAIN))
     order = np.argsort(every, kind="stable")
     rank = np.argsort(order, kind="stable")[: len(gain)]
-    # Without a landmark's own gain, all gains behind it move one place ahead.
-    middle = [(len(every) - 2) // 2, (len(every) - 1) // 2]
-    usual = np.mean([every[order[at + (at >= rank)]] for at in middle], axis=0)
-    return np.maximum(1.0, usual / _USUAL_GAIN)
+    found = np.full(len(gain), _LEAST_EXCESS)
+    for quantile, usual in _USUAL_GAINS:
+        at = quantile * (len(every) - 2)
+        low, high = int(at), int(np.ceil(at))
+        # Without a landmark's own gain, all gains behind it move one place ahead.
+        below, above = (every[order[k + (k >= rank)]] for k in (low, high))
+        found = np.maximum(found, (below + (at - low) * (above - below)) / usual)
+    return found
+
+
+def _of_offsets(bundles: Bundles) -> Floats:
+    """Return for each landmark (S,) the factor by which two points gain more because the boxes of a bundle share an offset.
+
+    More rays do not average such an offset out, so the gain grows with them.
+    """
+    obs, ray, count = bundles.state.obs, bundles.ray, bundles.count // 2
+    rays = np.bincount(bundles.group, minlength=2 * count).reshape(-1, 2)
+    offset2 = (_OFF_CENTRE / obs.sigma[ray]) ** 2 * obs.size[ray].prod(axis=1)
+    mean = np.bincount(bundles.group // 2, offset2, count) / rays.sum(axis=1)
+    return np.asarray(mean * rays.prod(axis=1) / rays.sum(axis=1))
 
 
 def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
@@ -157,7 +183,7 @@ def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
     The excess is as uncertain as the number of landmarks says, so that the odds are those of an F distribution.
 
     gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) as of
-    `_excess`. landmarks: how many gains told it.
+    `excess_of`. landmarks: how many gains told it.
     """
     number = landmarks - 1 + _ASSUMED
     tail = 0.5 * (number + _FREE) * np.log1p(np.maximum(gain, 0.0) / (excess * number))

@@ -29,6 +29,10 @@ _LOOSE = 9.0
 """A result needs a look if the noise of the odometry is this multiple of the settings, or more. Right maps of recorded
 robots have up to 8.1. If the multiple is larger, the fault is often not in the odometry: a camera that turns on the robot
 looks the same. A larger value gives fewer warnings."""
+_NAMED = 3.0
+"""The noise of the odometry is named from this multiple of the settings on: nine tenths of its variance are then not in the
+settings. Wheels slip that much, and so does a path that is bent to make one object of two things. A larger value names it
+less often."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
 gives more warnings."""
@@ -154,6 +158,11 @@ def _about(e: Evidence) -> list[str]:
         found.append(f"The map is of a part of the recording: {part}.")
     if e.odometry_frame:
         found.append("The map lies in the frame of the odometry, which begins where the robot began.")
+    if _NAMED <= e.odometry < _LOOSE:
+        found.append(
+            f"The odometry counts as {e.odometry:.1f} times as noisy as the settings say: its wheels slip, or the path is "
+            "bent to make one object of two things."
+        )
     if e.scale is not None:
         found.append(
             "The log does not tell the scale of the odometry: all distances may be too long or too short by one factor, "

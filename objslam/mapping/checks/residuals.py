@@ -32,16 +32,18 @@ def misses(
     At fixed poses, the expected noise contains the noise of the localisation. residual: (R,) rad between each ray and its
     object.
     """
-    held = _held(objects, association)
+    held = held_rays(objects, association)
     if not held.any():
         return float("nan")
-    promised = _promised(objects, keyframes, rays, association, settings)
+    promised = promised_noise(objects, keyframes, rays, association, settings)
     return float(np.median(residual[held] / promised)) / RAYLEIGH_MEDIAN
 
 
-def _promised(objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings) -> Floats:
+def promised_noise(
+    objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings
+) -> Floats:
     """Return the standard deviations (H,), rad, of the rays whose objects are ok, seen from their cameras."""
-    held = _held(objects, association)
+    held = held_rays(objects, association)
     angle, place = pose_noise(rays, keyframes, settings) if settings.mode == "fixed" else (rays.sigma, 0.0)
     origins, _ = rays.in_map(keyframes.map_T_camera)
     positions = np.array([one.position for one in objects.objects])
@@ -57,10 +59,10 @@ def check_pose_noise(
     The covariances of the map contain this noise, so they are honest. With better poses, the map would be more exact.
     calibrated: whether the cameras were calibrated against the poses.
     """
-    if keyframes.pose_noise == (1.0, 1.0) or not _held(objects, association).any():
+    if keyframes.pose_noise == (1.0, 1.0) or not held_rays(objects, association).any():
         return None
     usual = replace(keyframes, pose_noise=(1.0, 1.0))
-    found, promised = (_promised(objects, frames, rays, association, settings) for frames in (keyframes, usual))
+    found, promised = (promised_noise(objects, frames, rays, association, settings) for frames in (keyframes, usual))
     if np.median(found / promised) < _MOST:
         return None
     (yaw, place), (turns, shifts) = noise_of_poses(keyframes, settings), keyframes.pose_noise
@@ -77,7 +79,7 @@ def check_pose_noise(
     )
 
 
-def _held(objects: ObjectMap, association: Association) -> Bools:
+def held_rays(objects: ObjectMap, association: Association) -> Bools:
     """Return a mask (R,) of the rays whose objects are ok."""
     ok = np.array([one.status == "ok" for one in objects.objects] + [False])
     held: Bools = ok[association.object]  # The index -1 (no object) gives the last entry.
@@ -100,7 +102,7 @@ def check_residuals(
     residual: (R,) rad between each ray and its object. calibrated: whether the cameras were calibrated against the poses.
     All rays of an object count, also rejected ones. Rays of one keyframe share its pose error, so they count as one.
     """
-    held = _held(objects, association)
+    held = held_rays(objects, association)
     if not held.any():
         return None
     times = misses(objects, keyframes, rays, association, residual, settings)

@@ -16,7 +16,7 @@ often."""
 _CAUSES = {
     "clock": "do the stamps of the camera and of the poses use the same clock?",
     "scale": "is the odometry in metres?",
-    "turn_scale": "is the odometry's rotation in radians, and its wheel base right?",
+    "turn_scale": "does the robot skid as it turns (tracks, four driven wheels), and is its wheel base right?",
     "turn_bias": "does the odometry turn while the robot stands?",
     "yaw": "is base_T_camera right?",
     "tilt": "is base_T_camera right?",

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from objslam.core.result import DOUBT_KINDS, RunResult
+from objslam.core.result import DOUBT_KINDS, Doubt, RunResult
 from objslam.mapping.doubts import cut_things as cut_off
+from objslam.mapping.doubts import disagreeing as apart
 from objslam.mapping.doubts import unsure as wide
 from objslam.mapping.doubts.evidence import Evidence, evidence_of
 from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
@@ -51,20 +52,23 @@ def find_doubts(result: RunResult, evidence: Evidence) -> Doubts:
 def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
-    A map is not called good in five cases: some objects are more likely doubles than not, a place is in the map twice, an
-    object has many sizes, most objects have a wide sigma, or many boxes of a label meet where the map has no object. A label
-    without an object is named, and so is a thing with cut off boxes only, but the boxes may be false, so the level stays.
+    A map is not called good in six cases: some objects are more likely doubles than not, a place is in the map twice, the
+    rays of an object do not agree on one thing, an object has many sizes, most objects have a wide sigma, or many boxes of a
+    label meet where the map has no object. A label without an object is named, and so is a thing with cut off boxes only,
+    but the boxes may be false, so the level stays.
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)
     doubts = tuple(in_words(result, found.pairs, found.splits, found.groups))
     cut = cut_off.cut_things(result)
     unmapped, told = unmapped_labels(result, evidence, cut), {one.label for one in doubts if one.kind == "boxes"}
+    disagreeing = [*apart.crossing(result, evidence), *apart.disagreeing(result, apart.misfits_of(result))]
     mixed, unsure = mixed_sizes(result), wide.unsure_objects(result)
     # One doubt says why boxes are no object.
     lacking = {one.label for one in unmapped}
     cut = [thing for thing in cut if result.rays.label_names[thing.label] not in lacking]
-    doubts = (*doubts, *unsure, *cut_off.in_doubts(cut, result), *mixed, *(one for one in unmapped if one.label not in told))
+    of_things = [*unsure, *cut_off.in_doubts(cut, result), *_unnamed(disagreeing, doubts), *mixed]
+    doubts = (*doubts, *of_things, *(one for one in unmapped if one.label not in told))
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
     doubles = int((found.pairs.probability >= _DOUBLE).sum())
@@ -73,7 +77,8 @@ def with_doubts(result: RunResult) -> RunResult:
         if wide.are_most(unsure, result):
             lost, named = [*named, *lost], []
         twice = find_twice(result.map)
-        doubled = [*([twice.in_words()] if twice else []), *_of_mixed(len(mixed)), *_of_doubles(doubles)]
+        doubled = [*([twice.in_words()] if twice else []), *apart.in_assessment(disagreeing), *_of_mixed(len(mixed))]
+        doubled += _of_doubles(doubles)
         assessment = _assessed(summary["assessment"], doubled, lost)
         named += [*in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *named]}
@@ -88,6 +93,15 @@ def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -
     if assessment["level"] == "good":  # The first reason praises the map. The others only describe it.
         return {**assessment, "level": "check", "reasons": [*doubles, *lost, *assessment["reasons"][1:]]}
     return {**assessment, "reasons": [*doubles, *assessment["reasons"], *lost]}
+
+
+def _unnamed(found: list[Doubt], earlier: tuple[Doubt, ...]) -> list[Doubt]:
+    """Return the first doubt about each object that no earlier doubt calls two."""
+    called = {one.objects for one in earlier if one.kind == "split"}
+    first: dict[tuple[int, ...], Doubt] = {}
+    for one in found:
+        first.setdefault(one.objects, one)
+    return [one for objects, one in first.items() if objects not in called]
 
 
 def _of_mixed(mixed: int) -> list[str]:

@@ -6,9 +6,10 @@ import numpy as np
 
 from objslam.association.observations import size_per_metre
 from objslam.association.refinement import grouped_sums
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.result import Doubt, RunResult
 from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
+from objslam.frontend.up import up_axis, up_vector
 
 _FEWEST = 10
 """The fewest boxes of an object that tell how far its size scatters. A larger number finds fewer mixed objects."""
@@ -21,18 +22,25 @@ _LEAST = 0.2
 """The least scatter of a doubted object, in natural logarithms of its size. Right objects of simulated halls have up to
 0.13. A larger value finds fewer mixed objects."""
 
+_TURNED = np.cos(np.radians(20.0))
+"""The cosine of the largest angle between the vertical as a box shows it and its mean over the boxes of the object. From
+other sides, the same thing has another height in the image: within 20 deg, the height of a flat thing changes by 6 %. A
+larger angle judges more objects of cameras that are not level."""
+
 
 def mixed_sizes(result: RunResult) -> list[Doubt]:
     """Return a doubt for each object whose boxes show sizes that scatter much more than those of other objects.
 
     A box and the distance to its object tell the size of the thing in the box. The size of one thing stays the same, at
-    least its height for a camera that is level. So the smaller scatter of width and height counts. It must exceed that of
-    other objects, and what the noise of the boxes explains. Boxes of two things have two sizes, also where their rays
-    happen to meet. If a thing is put too far away, its boxes grow faster than its distance falls.
+    least its height in boxes that show the vertical alike, as those of a level camera do. So only such boxes count, and the
+    smaller scatter of width and height. It must exceed that of other objects, and what the noise of the boxes explains.
+    Boxes of two things have two sizes, also where their rays happen to meet. If a thing is put too far away, its boxes grow
+    faster than its distance falls.
     """
     if len(result.map) < _OTHERS:
         return []
     mine = _boxes(result)
+    mine = mine[_alike(result, mine)]
     number = np.bincount(result.association.object[mine], minlength=len(result.map))
     judged = np.flatnonzero((number >= _FEWEST) & np.array([o.status == "ok" for o in result.map.objects], dtype=bool))
     if len(judged) < _OTHERS:
@@ -52,6 +60,24 @@ def _boxes(result: RunResult) -> Ints:
     used &= sized[result.keyframes.camera[result.rays.keyframe]]
     used &= (size_per_metre(result.rays, result.keyframes, result.cameras) > 0).all(axis=1)
     return np.flatnonzero(used)
+
+
+def _alike(result: RunResult, mine: Ints) -> Bools:
+    """Return which of the rays (n,) show the vertical nearly as the mean of their object's rays does.
+
+    The vertical is compared in the frame of the box: along the ray, and across it in the image.
+    """
+    turn = (result.map_T_base @ result.keyframes.base_T_camera)[result.rays.keyframe[mine], :3, :3]
+    vertical = np.einsum("nji,j->ni", turn, up_vector(up_axis(result.keyframes)))
+    ray = np.einsum("nji,nj->ni", turn, result.directions[mine])
+    along = np.einsum("ni,ni->n", vertical, ray)
+    across = (vertical - along[:, None] * ray)[:, :2]
+    length = np.sqrt(np.maximum(1 - along**2, 0.0)) / np.maximum(np.linalg.norm(across, axis=1), 1e-9)
+    shown = np.column_stack([across * length[:, None], along])
+    owner = result.association.object[mine]
+    mean = grouped_sums(shown, owner, len(result.map))
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
+    return np.asarray(np.einsum("ni,ni->n", shown, mean[owner]) >= _TURNED)
 
 
 def _scatter(result: RunResult, mine: Ints) -> tuple[Floats, Floats]:

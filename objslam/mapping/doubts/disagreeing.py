@@ -1,0 +1,85 @@
+"""Doubts about objects that may be several things: their rays do not agree with one point, or come from two that cross."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.association.crossings.one_or_two import find_crossings
+from objslam.core.result import Doubt, RunResult
+from objslam.mapping.checks.misfits import Misfits, find_misfits
+from objslam.mapping.doubts.evidence import Evidence
+
+_NAMED = 3
+"""The most objects that the assessment names. A larger number makes the assessment longer."""
+
+
+def misfits_of(result: RunResult) -> Misfits:
+    """Return how well the rays of each object of a result agree."""
+    held = result.keyframes, result.rays, result.association
+    return find_misfits(result.map, *held, result.residual, result.weight, result.settings)
+
+
+def disagreeing(result: RunResult, misfits: Misfits) -> list[Doubt]:
+    """Return a doubt for each object whose rays do not agree, those that agree least first."""
+    odd = np.flatnonzero(misfits.odd)
+    found = []
+    for j in odd[np.argsort(-misfits.times[odd], kind="stable")].tolist():
+        o, times = result.map.objects[j], float(misfits.times[j])
+        found.append(
+            Doubt(
+                "split",
+                "rays disagree",
+                o.label,
+                f"{o.label} #{o.id} may be several things, or its boxes show parts of it: its rays miss it by {times:.1f} "
+                f"times their noise, and those of most objects by {misfits.usual:.1f} times. Its sigma allows for this.",
+                (o.id,),
+                o.position,
+                np.flatnonzero(result.association.object == j),
+                {"misfit": times, "usual_misfit": misfits.usual},
+            )
+        )
+    return found
+
+
+def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
+    """Return a doubt for each object that is clearly more likely two things whose rays cross than one, the likeliest first.
+
+    The association divides such objects. It allows for more noise than the solved poses have, so some are left.
+    """
+    state = evidence.state
+    sized = np.array([camera.sees_size for camera in result.cameras], dtype=bool)
+    if not state.count or not sized.any():
+        return []
+    found = find_crossings(state, sized[result.keyframes.camera[result.rays.keyframe[evidence.ray]]], fewest=1)
+    doubts = []
+    for s in np.argsort(found.odds, kind="stable")[: int(found.two.sum())].tolist():
+        j = int(found.landmark[s])
+        o, mine = result.map.objects[evidence.object[j]], state.matched == j
+        second, number = int((found.second & mine).sum()), int(mine.sum())
+        doubts.append(
+            Doubt(
+                "split",
+                "crossing",
+                o.label,
+                f"{o.label} #{o.id} may be where the rays of two things cross: {number - second} of its rays and {second} "
+                "others come from two sides, and two things explain them and the sizes of their boxes better (log odds "
+                f"{-found.odds[s]:.1f}).",
+                (o.id,),
+                o.position,
+                evidence.ray[np.flatnonzero(mine)],
+                {"log_odds": -float(found.odds[s]), "rays": number - second, "other_rays": second},
+            )
+        )
+    return doubts
+
+
+def in_assessment(doubts: list[Doubt]) -> list[str]:
+    """Return the sentence about the objects for the assessment."""
+    if not doubts:
+        return []
+    names = list(dict.fromkeys(f"{one.label} #{one.objects[0]}" for one in doubts))
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    one = len(names) == 1
+    many = "1 object has" if one else f"{len(names)} objects have"
+    what = "it may be several things, or at a wrong place" if one else "each may be several things, or at a wrong place"
+    return [f"{many} rays that do not agree on one thing ({', '.join(names[:_NAMED])}{more}): {what}."]
