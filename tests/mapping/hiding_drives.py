@@ -1,11 +1,11 @@
 """Simulated drives among things that hide each other in part, as logs with boxes of the visible parts and a truth.
 
-All solids stand on the floor, and no two touch, so a line on the floor separates each pair. The solid on the camera's side of
-the line is in front. The images of all solids are drawn from the back to the front, and each box goes around the pixels that
-stay visible. So the boxes know nothing of the bodies that objslam fits.
+All solids stand on the floor, and no two touch, so a line on the floor separates each pair. The solid on the camera's side
+of the line is in front. The images of all solids are drawn from the front to the back, and each box goes around the pixels
+that no solid in front covers. So the boxes know nothing of the bodies that objslam fits.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -71,6 +71,11 @@ def apart(first, second, gap=0.0):
     return best
 
 
+def lines_between(solids):
+    """The line of `apart` between each two solids, by their numbers."""
+    return {(i, j): apart(solids[i].footprint, solids[j].footprint) for j in range(len(solids)) for i in range(j)}
+
+
 def front_to_back(solids, lines, place):
     """The solids' numbers from the front to the back, seen from a place (2,) on the floor."""
     behind = np.zeros((len(solids), len(solids)), dtype=bool)
@@ -121,15 +126,17 @@ def boxes_at(solids, lines, pose, *, hiding=True):
 
 
 def scene(rng, *, groups=7, pillars=False):
-    """Groups of two or three things around the origin, of 0.3 to 1.5 m, the front ones nearer to the middle. pillars: whether
-    posts and ends of walls without a box stand in front of the groups in place of the front things."""
+    """Groups of two or three things around the origin, of 0.3 to 1.5 m, the front ones nearer to the middle.
+
+    pillars: whether posts and ends of walls without a box stand in place of the front things.
+    """
     solids = []
 
     def place(label, at, size, shape):
         for _ in range(60):
             half = np.clip(size * np.exp(rng.normal(0, 0.25, 3)), 0.3, 1.5) / 2
             if label is None:
-                half = np.array([*rng.uniform([0.06, 0.1], [0.12, 0.5]), 1.2])
+                half = np.array([*rng.uniform([0.05, 0.05], [0.1, 0.25]), 1.2])
             where = at + rng.normal(0, 0.25, 2)
             one = Solid(shape, label, np.array([*where, half[2]]), half, float(rng.uniform(-1.5, 1.5)))
             near = np.linalg.norm(one.footprint / [2.2, 1.8], axis=1).min() < 1.15
@@ -158,7 +165,9 @@ def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, n
     rng = np.random.default_rng(seed)
     solids = scene(rng, pillars=pillars)
     lines = {
-        (i, j): apart(solids[i].footprint, solids[j].footprint) for i in range(len(solids)) for j in range(i + 1, len(solids))
+        (i, j): apart(solids[i].footprint, solids[j].footprint)
+        for i in range(len(solids))
+        for j in range(i + 1, len(solids))
     }
     turn = np.linspace(0, 4 * np.pi, frames)
     place = np.column_stack([1.8 * np.cos(turn), 1.5 * np.sin(turn)])
@@ -172,11 +181,17 @@ def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, n
     for step in steps:
         odometry.append(odometry[-1] @ step)
     localised = lift_se2(plane + [0.01, 0.01, 0.0035] * rng.standard_normal((frames, 3)))
-    found = [(k, *one) for k, pose in enumerate(true @ FORWARD) for one in zip(*boxes_at(solids, lines, pose, hiding=hiding))]
+    found = [
+        (k, *one)
+        for k, pose in enumerate(true @ FORWARD)
+        for one in zip(*boxes_at(solids, lines, pose, hiding=hiding), strict=True)
+    ]
     frame, thing = (np.array([one[at] for one in found]) for at in (0, 1))
     box = np.array([one[2] for one in found])
     inside = np.concatenate([box[:, :2] > 0, box[:, 2:] < CAMERA.size], axis=1)
     box = np.clip(box + inside * rng.normal(0, noise, box.shape), 0, np.tile(CAMERA.size, 2))
+    if joint:  # From odometry alone, a name for each thing leaves the association out of the comparison.
+        solids = [one if one.label is None else replace(one, label=f"{one.label} {i}") for i, one in enumerate(solids)]
     names = tuple(sorted({s.label for s in solids if s.label is not None}))
     unknown = np.full(len(box), np.nan), np.full(len(box), -1)
     label = np.array([names.index(solids[i].label) for i in thing])
