@@ -58,7 +58,7 @@ def solve(
     elif not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:  # The fixed mode does without these modules, and the many below them.
-        from objslam.mapping.bodies.centre_bearings import solve_to_centres, to_centres
+        from objslam.mapping.bodies.centre_bearings import solve_to_centres
         from objslam.mapping.joint_alternation import JointState
         from objslam.mapping.joint_solve import solve_joint
 
@@ -72,7 +72,7 @@ def solve(
         if errors is not None:
             keyframes, rays_of_keyframes = without_errors(errors, estimate)
         if added is not None:
-            rays_of_keyframes = to_centres(rays_of_keyframes, added)
+            rays_of_keyframes = added.apply(rays_of_keyframes)
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     solved = Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)

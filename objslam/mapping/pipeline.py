@@ -21,6 +21,7 @@ from objslam.frontend.known_errors import take_out_expected, take_out_known
 from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
+from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
@@ -114,7 +115,7 @@ def run(
         solution = with_lasting_errors(solution, settings)
     if diagnosis.jumps is not None:
         solution = with_jumps(solution, diagnosis.jumps)
-    solution = with_bodies(solution, cameras, settings)
+    solution = with_hidden_parts(with_bodies(solution, cameras, settings), cameras)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     trusted = not diagnosis.spoilt

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import PlacedBody
 from objslam.core.trace import Round
 from objslam.core.types import Association, Keyframes, Rays
@@ -19,16 +19,38 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class CentreShift:
+    """What turns R rays to the centres of bodies.
+
+    direction: (R, 3), added to the direction of each ray, in the camera frame. sigma: (R,) rad, the noise that this adds. It
+    is 0 unless something hides a part of the object in the image.
+    """
+
+    direction: Floats
+    sigma: Floats
+
+    def only(self, rays: Bools) -> CentreShift:
+        """Return the shift of some rays (R,). The others stay."""
+        return CentreShift(np.where(rays[:, None], self.direction, 0.0), np.where(rays, self.sigma, 0.0))
+
+    def apply(self, rays: Rays) -> Rays:
+        """Return the rays to the centres of bodies."""
+        direction = rays.direction + self.direction
+        direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        return replace(rays, direction=direction, sigma=np.hypot(rays.sigma, self.sigma))
+
+
+@dataclass(frozen=True)
 class Solution:
     """The solved association and estimate, with the keyframes and rays that were solved.
 
     keyframes: all with at least one ray. rays: with indices into these keyframes. rounds: counts of each round of
     association and solve. trace: the rounds in detail, empty without a recording. bodies: the body of each object, None for
     a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
-    the box. to_centre: (R, 3) is added to the direction of each ray, in the camera frame, to point to the centre of its
-    body. bodies, body_share and to_centre are None if no bodies were solved. doubted: the labels of which it is not clear
-    whether they name one object or several. unsettled: the objects that the last round changed, as of `objects_changed`,
-    although no further round was allowed.
+    the box. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
+    object in the box of each ray. bodies, body_share, to_centre and hidden are None if no bodies were solved. doubted: the
+    labels of which it is not clear whether they name one object or several. unsettled: the objects that the last round
+    changed, as of `objects_changed`, although no further round was allowed.
     """
 
     keyframes: Keyframes
@@ -39,7 +61,8 @@ class Solution:
     trace: tuple[Round, ...] = ()
     bodies: tuple[PlacedBody | None, ...] | None = None
     body_share: float | None = None
-    to_centre: Floats | None = None
+    to_centre: CentreShift | None = None
+    hidden: Bools | None = None
     doubted: tuple[str, ...] = ()
     unsettled: int = 0
 

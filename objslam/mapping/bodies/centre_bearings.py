@@ -16,7 +16,7 @@ from objslam.core.arrays import Bools, Floats
 from objslam.core.statistics import grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.mapping.bodies.fitting import with_bodies
-from objslam.mapping.solution import Solution, with_noise_of, without_errors
+from objslam.mapping.solution import CentreShift, Solution, with_noise_of, without_errors
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -31,10 +31,10 @@ bearing. A shift repeats in all bearings of the object. So a shift of 0.1 equals
 larger value solves fewer logs again."""
 
 
-def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, Floats | None]:
-    """Return the estimate from bearings to the centres of bodies, and what was added (R, 3) to the directions of the rays.
+def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, CentreShift | None]:
+    """Return the estimate from bearings to the centres of bodies, and the shift of the rays.
 
-    Nothing is added to a ray that the solve rejects.
+    A ray that the solve rejects stays as it was.
     The bearings of an object that would be lost stay at the centres of its boxes. The estimate stays as before, and the
     second value is None, in two cases: no body shifts its bearings enough (`_WORTH`), or an object would still be lost.
     There is no second round, from the bodies at the new poses. In 24 simulated drives between large objects, it would change
@@ -57,7 +57,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     solved = _solve(state, keyframes, rays, association, estimate, shift)
     lost = estimate.solved & ~solved.solved
     if lost.any():
-        shift = np.where((held & lost[association.object])[:, None], 0.0, shift)
+        shift = shift.only(~(held & lost[association.object]))
         solved = _solve(state, keyframes, rays, association, estimate, shift)
     if (estimate.solved & ~solved.solved).any():
         return estimate, None
@@ -65,20 +65,20 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
         state.trace.end_round("bodies", association, solved)
     # A rejected ray may show a second thing, so it keeps its direction. Rays that were turned to the centre of this body
     # would no longer meet at the second thing.
-    return solved, np.where((solved.weight > 0)[:, None], shift, 0.0)
+    return solved, shift.only(solved.weight > 0)
 
 
 def _solve(
-    state: JointState, keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, shift: Floats
+    state: JointState, keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, shift: CentreShift
 ) -> Estimate:
-    """Solve poses and objects once more, from the estimate, with `shift` (R, 3) added to the measured directions.
+    """Solve poses and objects once more, from the estimate, with the measured rays turned by `shift`.
 
     keyframes, rays: those of the state, with the shared errors of the estimate removed.
     """
     from objslam.graph import batch_solver
 
     measured = state.rays if state.errors is None else state.errors.rays
-    turned, errors = to_centres(measured, shift), None
+    turned, errors = shift.apply(measured), None
     if state.errors is not None:
         errors = replace(with_noise_of(state.errors, estimate), rays=turned, settings=state.settings)
     return batch_solver.solve_joint(
@@ -96,17 +96,11 @@ def _solve(
     )
 
 
-def to_centres(rays: Rays, added: Floats) -> Rays:
-    """Return rays with a vector (R, 3) added to each direction, in the camera frame."""
-    direction = rays.direction + added
-    return replace(rays, direction=direction / np.linalg.norm(direction, axis=1, keepdims=True))
-
-
-def worth_turning(shift: Floats, sigma: Floats, association: Association) -> Bools:
+def worth_turning(shift: CentreShift, sigma: Floats, association: Association) -> Bools:
     """Return for which objects (N,) the bearings to the centre of the body are worth another solve (`_WORTH`).
 
-    shift: (R, 3) to add to the directions of the rays. sigma: (R,) rad, their noise.
+    sigma: (R,) rad, the noise of the rays.
     """
     held = association.object >= 0
-    deviation = (np.linalg.norm(shift, axis=1) / sigma)[held]
+    deviation = (np.linalg.norm(shift.direction, axis=1) / sigma)[held]
     return np.asarray(grouped_median(deviation, association.object[held], association.count) > _WORTH)

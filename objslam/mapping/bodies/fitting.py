@@ -17,8 +17,9 @@ from objslam.frontend.up import up_axis
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.bodies.box_views import BoxViews
+from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes
 from objslam.mapping.bodies.cut_boxes import cut_edges_of
-from objslam.mapping.solution import Solution
+from objslam.mapping.solution import CentreShift, Solution
 from objslam.triangulation.bodies.prior import apparent_half_axes
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 
@@ -28,7 +29,9 @@ _CLEAR = 1.0
 """The least angle between the centre of a body and the centre of its box, in standard deviations of the boxes' shared error.
 Above it, the position is the centre of the body. The angle is 4 for a cabinet from close by. It is below 0.6 for things on a
 table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
-
+_HIDDEN = 0.1
+"""The share of an object's boxes of which something hides a part, above which the position is the centre of the body. The
+rays of these boxes miss the object, all to one side. A larger share trusts the place more where rays meet."""
 _UNLIKE = 0.02
 """The least error of a centre that repeats from all sides, as a share of half the size, because no thing has exactly the
 shape of its body. The centres of simulated pots, cones, seats, monitors and people were off by 1 to 4 % of half the height
@@ -46,7 +49,7 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
         return solution
     views = _views(solution, cameras, settings)
     if not len(views.ray):
-        return solution
+        return replace(solution, hidden=views.hidden)
     boxes = views.boxes
     prior = settings.rays.box_sigma
     told = settings.noise.rays
@@ -63,24 +66,35 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
         bent=boxes.bent,
         more=lambda bodies: cut_edges_of(bodies, boxes, views.objects, solution),
     )
+    # A box that the image's edge cuts off is here only if the settings or the detector say that it is whole.
+    at_border = views.border.reshape(-1, 2, 2).sum(axis=1)
+    found = replace(found, hidden=np.maximum(found.hidden - at_border, 0))
     clear = _shifts_clearly(found, views)
     bodies: list[PlacedBody | None] = [None] * solution.association.count
     extra = _beyond_rays(solution, settings, views)
     for at, j in enumerate(views.objects.tolist()):
         if found.shape[at]:
             bodies[j] = _body(found, at, extra[at], clear=bool(clear[at]))
-    to_centre = np.zeros((len(solution.rays), 3))
-    to_centre[views.ray] = np.einsum("bji,bj->bi", boxes.poses[:, :3, :3], found.to_centre)
-    return replace(solution, bodies=tuple(bodies), body_share=float(found.share[0]), to_centre=to_centre)
+    to_centre = CentreShift(np.zeros((len(solution.rays), 3)), np.zeros(len(solution.rays)))
+    to_centre.direction[views.ray] = np.einsum("bji,bj->bi", boxes.poses[:, :3, :3], found.to_centre)
+    to_centre.sigma[views.ray] = _noise_of_hidden(found, boxes)
+    hidden = views.hidden.copy()
+    hidden[views.ray] |= found.hidden.any(axis=1)
+    share = float(found.share[0])
+    return replace(solution, bodies=tuple(bodies), body_share=share, to_centre=to_centre, hidden=hidden)
 
 
 @dataclass(frozen=True)
 class _Views:
-    """The boxes of objects with a point. objects: (n,) the objects. ray: (B,) the used rays. boxes: their boxes."""
+    """The boxes of objects with a point. objects: (n,) the objects. ray: (B,) the used rays. boxes: their boxes. border:
+    (B, 4) which edges are at the image's edge. hidden: (R,) whether a thing in front may hide an edge of the box of each
+    ray, also of objects with few boxes."""
 
     objects: Ints
     ray: Ints
     boxes: BoxViews
+    border: Bools
+    hidden: Bools
 
 
 def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> _Views:
@@ -100,6 +114,8 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     origin = map_T_camera[rays.keyframe[ray], :3, 3]
     # A point that its rays do not determine may lie at the camera. Such a point has no direction.
     ray = ray[np.linalg.norm(estimate.positions[association.object[ray]] - origin, axis=1) > MIN_DEPTH]
+    behind = np.zeros((len(rays), 4), dtype=bool)
+    behind[ray] = edges_behind_boxes(solution, cameras, settings, map_T_camera, sizes.max(axis=1) / 2, ray)
     number = np.bincount(association.object[ray], minlength=association.count)
     objects = np.flatnonzero(fit & (number >= FEWEST))
     ray = ray[np.isin(association.object[ray], objects)]
@@ -108,12 +124,12 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     points, half = estimate.positions[objects], apparent_half_axes(*sizes[objects].T)
     border = max(settings.rays.border, 0.0)
     size = np.array([c.size for c in cameras])[keyframes.camera[used.keyframe]]
-    bound = np.concatenate([used.box[:, :2] <= border, used.box[:, 2:] >= size - 1 - border], axis=1)
+    at_border = np.concatenate([used.box[:, :2] <= border, used.box[:, 2:] >= size - 1 - border], axis=1)
     calibration = estimate.calibration
     errors = {} if calibration is None else dict(zip(calibration.names, calibration.values.tolist(), strict=True))
     used = replace(used, range=used.range / centre_factors(errors, half_widths_of_rays(used, keyframes, cameras), settings))
-    boxes = BoxViews(keyframes, used, cameras, settings, map_T_camera, body, points, half, bound)
-    return _Views(objects, ray, boxes)
+    boxes = BoxViews(keyframes, used, cameras, settings, map_T_camera, body, points, half, at_border | behind[ray])
+    return _Views(objects, ray, boxes, at_border, np.asarray(behind.any(axis=1)))
 
 
 def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
@@ -125,7 +141,24 @@ def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
     edges = views.boxes.edges()
     shared = found.share[0] * edges.size / 2 * edges.turn.mean(axis=1)
     ratio = np.linalg.norm(found.to_centre, axis=1) / np.maximum(shared, 1e-12)
-    return np.asarray(grouped_median(ratio, views.boxes.body, len(views.objects)) > _CLEAR)
+    body, number = views.boxes.body, len(views.objects)
+    hidden = np.bincount(body, found.hidden.any(axis=1), number) > _HIDDEN * np.bincount(body, minlength=number)
+    return np.asarray(hidden | (grouped_median(ratio, body, number) > _CLEAR))
+
+
+def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
+    """Return the noise (B,), rad, of directions to the centres of bodies that hidden edges of boxes add to that of rays.
+
+    The centre of a box is the mean of two edges. If one is hidden, the other tells the centre, with the noise of one edge
+    and of half the size of the body. If both are hidden, the centre may be anywhere in the box.
+    """
+    edges, rays, half = boxes.edges(), boxes.rays, found.axes[:, [3, 5]]
+    half = half * np.sqrt(found.covariance[:, [3, 6], [3, 6]])  # From the noise of logarithms.
+    away = np.maximum(np.linalg.norm(found.axes[boxes.body, :3] - edges.origin, axis=1), MIN_DEPTH)[:, None]
+    one = np.hypot(rays.sigma[:, None], half[boxes.body] / away)
+    size = (rays.box[:, 2:] - rays.box[:, :2]) * edges.turn[:, :2]
+    noise = np.select([found.hidden == 1, found.hidden == 2], [one, np.hypot(one, size / 2)], 0.0)
+    return np.asarray(noise.max(axis=1))
 
 
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:

@@ -131,14 +131,14 @@ def _calibrated_by_centres(
     """
     from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
     from objslam.graph.fixed_pose_triangulation import largest_noise
-    from objslam.mapping.bodies.centre_bearings import to_centres, worth_turning
+    from objslam.mapping.bodies.centre_bearings import worth_turning
     from objslam.mapping.bodies.fitting import with_bodies
 
     solution = Solution(now.seen, now.rays_seen, association, estimate, ())
     shift = with_bodies(solution, now.cameras, now.settings).to_centre
     if shift is None or not worth_turning(shift, now.rays_seen.sigma, association).any():
         return None
-    turned = replace(errors, rays=to_centres(errors.rays, np.where((estimate.weight > 0)[:, None], shift, 0.0)))
+    turned = replace(errors, rays=shift.only(estimate.weight > 0).apply(errors.rays))
     noise = largest_noise(now.seen, now.settings)
     try:
         return calibrate_at_poses(turned, association, placed_objects(estimate), theta, noise)

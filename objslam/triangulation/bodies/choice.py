@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import CAUCHY_K
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, Prior, Weights
@@ -23,19 +23,21 @@ _REPEATS = 20
 """How often `with_shares_of_shapes` repeats its expectation. More are slower and change little."""
 
 
-def log_evidence(edges: BoxEdges, fit: Fit, prior: Prior, weights: Weights, *, free_side: Floats | None = None) -> Floats:
+def log_evidence(
+    edges: BoxEdges, fit: Fit, prior: Prior, weights: Weights, side: Floats, *, free: Bools | None = None
+) -> Floats:
     """Return the logarithm of the evidence (N,) of a fit.
 
-    free_side: (B,) px, only for points: half the length of the image, the range of half the side of a box. None if the shape
-    explains the sides. Boxes from one direction share an error, so together they count as one measurement.
+    side: (B,) px, half the length of the image, the range of a measurement that the shape does not explain. free: (B, 4)
+    which shifts and sizes a point does not explain. None for other shapes, which explain all but the bounds that they reach
+    beyond. Boxes from one direction share an error, so together they count as one measurement.
     """
     now, spread, worth = fit.found, weights.spread[:, :4], np.minimum(weights.spread**2 / weights.variance, 1.0)[:, :4]
-    squared = now.use[:, :4] * (now.value[:, :4] / spread) ** 2
-    likelihood = -np.log(spread * np.sqrt(2 * np.pi))
-    if free_side is not None:
-        squared[:, 2:], likelihood[:, 2:] = 0.0, -np.log(free_side)[:, None]
+    unexplained = now.use[:, :4] == 0 if free is None else free
+    squared = np.where(unexplained, 0.0, (now.value[:, :4] / spread) ** 2)
+    likelihood = np.where(unexplained, -np.log(side)[:, None], -np.log(spread * np.sqrt(2 * np.pi)))
     lost = CAUCHY_K**2 * np.log1p(squared.sum(axis=1) / 2 / CAUCHY_K**2)  # `fit` also has one Cauchy loss per box.
-    each = (worth * now.use[:, :4] * likelihood).sum(axis=1) - worth.mean(axis=1) * lost
+    each = (worth * likelihood).sum(axis=1) - worth.mean(axis=1) * lost
     off = fit.values - prior.mean
     own = np.bincount(edges.body, each, len(fit.values))
     penalty = 0.5 * np.einsum("ni,nij,nj->n", off, prior.information, off)

@@ -25,7 +25,8 @@ class BoxEdges:
     body: (B,) the object of each box. origin: (B, 3) m, the camera in map. normal: (B, 4, 3) unit, in map, away from the
     box. turn: (B, 4) rad per px, by how much a plane turns if its edge moves. sigma: (B,) px, the noise of an edge. shift:
     (B,) px, noise that moves a whole box, such as pose noise. bound: (B, 4) whether the object may reach farther than an
-    edge, because the image's border cuts it off there. size: (B,) px, the geometric mean of the sides of each box.
+    edge, because the image's border cuts it off there, or because something hides a part. A share between 0 and 1 says how
+    much less an edge counts if the body reaches farther. size: (B,) px, the geometric mean of the sides of each box.
     direction: (B, 3) unit, in map, through the centre of the box. range: (B,) m along `direction` to the surface, NaN if
     unknown. range_sigma: (B,) m. range_bias: (B,) m, the error that all ranges of a body share.
     """

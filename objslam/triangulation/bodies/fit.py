@@ -17,6 +17,10 @@ _ITERATIONS = 40
 STILL = 1e-9
 """The fit of a body goes on if a step decreases the cost by at least this. The cost is half the sum of squared deviations.
 The decrease is that of the linear model of a step. A larger value ends sooner."""
+ENOUGH = 1e-3
+"""`STILL` for a fit that chooses a shape: it ends when a step would lower the cost by less. A larger value ends sooner."""
+STEPS = 12
+"""The most steps of a fit that chooses a shape. A fit of the right shape needs fewer. More steps are slower."""
 _UPHILL = 1e-3
 """A step may raise the cost by this share. The derivatives leave out that the distance to a body changes, so steps near the
 optimum may raise the cost slightly. A larger share accepts worse steps."""

@@ -72,7 +72,7 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     row, axis = _axes_with_bound(edges)
     for place in (axis, axis + 2):
         value[row, place], jacobian[row, place] = off[row, place], by[row, place]
-        use[row, place] = ~(edges.bound[row, place] & (off[row, place] > 0))
+        use[row, place] = 1.0 - edges.bound[row, place] * (off[row, place] > 0)
     value[:, 4], jacobian[:, 4], use[:, 4] = _ranges(edges, values, kind)
     return Residuals(value, jacobian, use)
 
@@ -136,8 +136,13 @@ def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
     return rows
 
 
+def whole_axes(edges: BoxEdges) -> Bools:
+    """Return which of the residuals (B, 4) of boxes are shifts and sizes: those of an axis without a bound."""
+    return np.tile((edges.bound[:, :2] == 0) & (edges.bound[:, 2:] == 0), 2)
+
+
 def _axes_with_bound(edges: BoxEdges) -> tuple[Ints, Ints]:
-    row, axis = np.nonzero(edges.bound[:, :2] | edges.bound[:, 2:])
+    row, axis = np.nonzero((edges.bound[:, :2] > 0) | (edges.bound[:, 2:] > 0))
     return row, axis
 
 

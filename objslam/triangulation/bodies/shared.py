@@ -15,7 +15,7 @@ from objslam.core.geometry import evenly_spread
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import Fit, grouped
-from objslam.triangulation.bodies.residuals import ROWS, Residuals, at_edges, nominal_noise, on_shift_and_size
+from objslam.triangulation.bodies.residuals import ROWS, Residuals, at_edges, nominal_noise, on_shift_and_size, whole_axes
 
 SIDES = 103
 """The number of sides from which an object can be seen, evenly over the sphere, 20 degrees apart. All boxes from one side
@@ -29,6 +29,9 @@ mean error of a side has this share of the variance of a single error. With a la
 _ALONG = 1.0
 """The change of the error of a side over a distance that is larger by the factor e, in standard deviations of this error.
 With a larger change, the growth of boxes tells less about the distance."""
+_BEYOND = 0.5
+"""The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. It is that of
+lengths between 0 and 0.9 of the size. A larger share makes objects that something hides less sure."""
 _SHARES = 41
 """The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
@@ -90,14 +93,16 @@ def white_factors(edges: BoxEdges, now: Residuals, sides: Sides, which: Bools) -
 
     which: (B,) the boxes that count.
     """
-    number, sigma = np.bincount(sides.cell), at_edges(edges, nominal_noise(edges))
-    free = np.sqrt(1 - 1 / number)[sides.cell]
+    whole, sigma = whole_axes(edges), nominal_noise(edges)
+    number = np.stack([np.bincount(sides.cell, part) for part in whole.T], axis=1)
+    free = np.sqrt(1 - 1 / np.maximum(number, 1))[sides.cell]
     factors = np.ones(2)
     for kind, rows in enumerate((slice(0, 2), slice(2, 4))):
-        deviation = now.value[:, rows] / sigma[:, rows]
-        mean = np.stack([np.bincount(sides.cell, part) for part in deviation.T], axis=1) / number[:, None]
-        some = (which & (number[sides.cell] > 1))[:, None] & (now.use[:, rows] > 0)
-        off = np.abs(deviation - mean[sides.cell])[some] / np.broadcast_to(free[:, None], some.shape)[some]
+        deviation = np.where(whole[:, rows], now.value[:, rows] / sigma[:, rows], 0.0)
+        total = np.stack([np.bincount(sides.cell, part) for part in deviation.T], axis=1)
+        mean = total / np.maximum(number[:, rows], 1)
+        some = which[:, None] & (number[sides.cell, rows] > 1) & whole[:, rows]
+        off = np.abs(deviation - mean[sides.cell])[some] / free[:, rows][some]
         if len(off):
             found = (np.median(off) / NORMAL_MEDIAN) ** 2
             factors[kind] = np.sqrt((len(off) / 2 * found + _NOMINAL) / (len(off) / 2 + _NOMINAL))
@@ -138,7 +143,7 @@ def share_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, prior: fl
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
     likelihood = np.tile(-0.5 * (shares / prior) ** 2, (2, 1))
     white, size = at_edges(edges, _white(edges, factors))[:, :4], edges.size / 2
-    weight = fit.weight[:, :4] > 0
+    weight = (fit.weight[:, :4] > 0) & whole_axes(edges)
     total = np.stack([np.bincount(sides.cell, w) for w in (weight / white**2).T], axis=1)
     total = np.maximum(total, 1e-12)
     mean, scale = (
@@ -192,9 +197,13 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
     its distance exactly, however wrong its outline is.
     """
     count = len(fit.values)
-    pulled = on_shift_and_size(edges, fit.found.by * fit.weight[..., None])
+    loose = np.zeros((len(edges), ROWS))
+    loose[:, : ROWS - 1] = _weights_of_bounds(edges, fit.found)
+    weighted = fit.found.by * np.where(loose > 0, 0.0, fit.weight)[..., None]
+    pulled = on_shift_and_size(edges, weighted)
     noisy = pulled * _white(edges, factors)[..., None]
-    middle = grouped(edges.body, np.swapaxes(noisy, 1, 2) @ noisy, count) + fit.prior
+    of_bounds = grouped(edges.body, np.swapaxes(fit.found.by, 1, 2) @ (fit.found.by * loose[..., None]), count)
+    middle = grouped(edges.body, np.swapaxes(noisy, 1, 2) @ noisy, count) + fit.prior + of_bounds
     together = pulled * _scale(edges, share)[..., None]
     by_side = grouped(sides.cell, together, len(sides.owner))
     bounds = np.searchsorted(sides.owner, np.arange(count + 1))
@@ -206,9 +215,21 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
     away = _ALONG * _ln_distances(edges, fit)
     change = grouped(edges.body, together[:, : ROWS - 1] * away[:, None, None], count)
     middle += np.swapaxes(change, 1, 2) @ change
-    inverse = np.linalg.inv(fit.information)
+    information = grouped(edges.body, np.swapaxes(weighted, 1, 2) @ fit.found.by, count) + fit.prior + of_bounds
+    inverse = np.linalg.inv(information)
     covariance = inverse @ middle @ inverse
     return np.asarray((covariance + np.swapaxes(covariance, 1, 2)) / 2)
+
+
+def _weights_of_bounds(edges: BoxEdges, found: Residuals) -> Floats:
+    """Return the weights (B, 4), 1/px^2, with which bounds count in a covariance, 0 for residuals that are no bounds.
+
+    A body that just reaches a bound may go on beyond it. So a bound is a measurement of the edge with the error of the
+    hidden length, at least `_BEYOND`. All boxes of a body share this error, so they count as one.
+    """
+    length = np.hypot(_BEYOND * np.maximum(edges.size, 1.0)[:, None], np.maximum(found.value[:, : ROWS - 1], 0.0))
+    number = np.bincount(edges.body)[edges.body, None]
+    return np.asarray(edges.bound / (number * length**2))
 
 
 def _ln_distances(edges: BoxEdges, fit: Fit) -> Floats:

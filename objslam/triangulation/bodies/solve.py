@@ -10,11 +10,13 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES
 from objslam.triangulation.bodies.choice import log_evidence, shapes_disagree, with_shares_of_shapes
+from objslam.triangulation.bodies.cuboid_fits import best_cuboids, cuboid_starts, mixed_fit
 from objslam.triangulation.bodies.edges import BoxEdges
-from objslam.triangulation.bodies.fit import Fit, Prior, Weights, fit
+from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Fit, Prior, Weights, fit
+from objslam.triangulation.bodies.hidden_edges import hidden_edges, with_hidden
 from objslam.triangulation.bodies.prior import cuboid_prior, dot_prior, known_sizes, label_prior, sphere_prior, weak_prior
-from objslam.triangulation.bodies.residuals import Residuals, residuals_of_shapes, touched_points
-from objslam.triangulation.bodies.shapes import CUBOID, CYLINDER, ELLIPSOID, KINDS, rows_of_kinds
+from objslam.triangulation.bodies.residuals import residuals_of_shapes, touched_points, whole_axes
+from objslam.triangulation.bodies.shapes import CYLINDER, ELLIPSOID, KINDS, rows_of_kinds
 from objslam.triangulation.bodies.shared import (
     Sides,
     covariance_of,
@@ -25,6 +27,7 @@ from objslam.triangulation.bodies.shared import (
     spread_of,
     white_factors,
 )
+from objslam.triangulation.bodies.to_centre import directions_to_centres, shifts_of
 
 Measure = Callable[[Floats | None], BoxEdges]
 """The edges of the boxes, given points (B, 4, P, 3) in map at which bodies may touch them. None means unknown points."""
@@ -41,10 +44,6 @@ _PER_SIDE = 3
 are slower and hardly help. The last fit uses all boxes."""
 _RARE = 20.0
 """The prior odds against a sphere, because few things are balls. With larger odds, fewer bodies are spheres."""
-_STEPS = 12
-"""The most steps of a fit that chooses a shape. A fit of the right shape needs fewer. More steps are slower."""
-_ENOUGH = 1e-3
-"""`STILL` for a fit that chooses a shape: it ends when a step would lower the cost by less. A larger value ends sooner."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,8 @@ class Bodies:
     is (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share: (2,) the standard deviations of the
     errors of shift and size that boxes of one side share, as shares of half their size. factors: (2,) on the nominal noise
     of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus that to the centre of its
-    predicted box, in map. It is 0 for a point. between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over
+    predicted box, in map. It is 0 for a point. hidden: (B, 2) how many edges of each axis something hides a part beyond.
+    between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over
     the shapes, about the chosen one. It is not in `covariance`.
     """
 
@@ -68,6 +68,7 @@ class Bodies:
     share: Floats
     factors: Floats
     to_centre: Floats
+    hidden: Ints
     between_shapes: Floats
 
     @property
@@ -134,7 +135,8 @@ def solve_bodies(
 
     names: the label of each object. side: (B,) px, half the length of the image. share: the prior of `Bodies.share`. learn:
     whether the share and the noise are estimated. sizes: known length, width and height, m, by label. bent: whether the
-    images are distorted, so that `measure` depends on the points.
+    images are distorted, so that `measure` depends on the points. Edges that something hides a part beyond are found in each
+    round, and are bounds in the next one (`hidden_edges`).
     """
     edges = measure(None)
     sides = sides_of(edges, points)
@@ -146,31 +148,44 @@ def solve_bodies(
     nothing = np.zeros((len(SHAPES), count)), none, none, None, np.zeros((count, 7, 7))
     sized = np.array([name in (sizes or {}) for name in names])
     now = _State(np.ones(2), np.full(2, share), weak, starts, *nothing, sized)
+    hidden = np.zeros((len(edges), 4), dtype=bool)
     for number in range(_ROUNDS + 1):
-        some = edges.take(few)
-        some_sides = sides_of(some, points)
-        now = _round(some, some_sides, now, side[few], label)
+        some = with_hidden(edges, hidden).take(few)
+        now = _round(some, sides_of(some, points, _counted(some, now)), now, side[few], label)
         best = now.best
-        if number == _ROUNDS or best is None:
-            break
+        assert best is not None
         # An object that fits a point best has no size to learn from, such as a mark that is always drawn at one size.
-        own = np.where(now.shape != _POINT, label, -1)
-        prior = label_prior(weak, best.values, now.covariance, own, now.solid == _CUBOID)
+        which, solid = now.shape != _POINT, np.where(np.isin(now.shape, _SOLID), now.shape, _ELLIPSOID)
+        start = _of_shapes(now.fitted, solid)
+        doubt = hidden_edges(edges, few, start, solid, now.prior, side, now.factors, now.share)
+        hidden = doubt.edges & which[edges.body, None]
+        if number == _ROUNDS:
+            break
+        prior = label_prior(weak, best.values, now.covariance, np.where(which, label, -1), now.solid == _CUBOID)
         if sizes:
             prior = known_sizes(prior, now.fitted[_ELLIPSOID], names, sizes)
         now = replace(now, prior=prior)
-        if learn and (now.shape != _POINT).any():
-            which = now.shape != _POINT
+        if learn and which.any():
+            some = with_hidden(edges, hidden).take(few)
+            best = replace(best, found=residuals_of_shapes(some, best.values, now.solid))
+            some_sides = sides_of(some, points)
             factors = white_factors(some, best.found, some_sides, which[some.body])
             found = share_of(some, best, some_sides, factors, share, which)
             now = replace(now, factors=factors, share=found)
         if bent:
-            solid = np.where(np.isin(now.shape, _SOLID), now.shape, _ELLIPSOID)
             edges = measure(touched_points(edges, _of_shapes(now.fitted, solid), solid))
-    between = shapes_disagree(now.evidence, _axes_of_shapes(now), now.shape)
-    bodies = _finished(edges, sides, now, between)
+    between = shapes_disagree(now.evidence, _axes_of_shapes(now), now.shape) + doubt.between
+    edges = with_hidden(edges, hidden)
+    bodies = _finished(edges, sides_of(edges, points, _counted(edges, now)), now, between)
     others = None if more is None else more(bodies)
     return bodies if others is None else _refitted(edges, others, now, bodies)
+
+
+def _counted(edges: BoxEdges, now: _State) -> Floats | None:
+    """Return which residuals (B, 4) count at the bodies of the last round, None before the first."""
+    if now.best is None:
+        return None
+    return residuals_of_shapes(edges, now.best.values, now.solid).use[:, :4]
 
 
 def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints) -> _State:
@@ -178,26 +193,26 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints
     weights, first = _weights(edges, sides, now), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
     ball_prior = sphere_prior(now.prior)
-    ball = fit(edges, now.fitted[_SPHERE], ball_prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
-    rounds = fit(edges, now.fitted[_ELLIPSOID], now.prior, weights, ELLIPSOID, still=_ENOUGH, most=_STEPS)
+    ball = fit(edges, now.fitted[_SPHERE], ball_prior, weights, ELLIPSOID, still=ENOUGH, most=STEPS)
+    rounds = fit(edges, now.fitted[_ELLIPSOID], now.prior, weights, ELLIPSOID, still=ENOUGH, most=STEPS)
     # The first fits of the cuboid and of the cylinder begin at the ellipsoid.
-    starts = _cuboid_starts(rounds.values) if first else (now.fitted[_CUBOID],)
-    square, square_prior = _best_cuboids(edges, starts, now.prior, weights)
+    starts = cuboid_starts(rounds.values) if first else (now.fitted[_CUBOID],)
+    square, square_prior = best_cuboids(edges, starts, now.prior, weights, side)
     start = rounds.values if first else now.fitted[_CYLINDER]
-    tube = fit(edges, start, now.prior, weights, CYLINDER, still=_ENOUGH, most=_STEPS)
+    tube = fit(edges, start, now.prior, weights, CYLINDER, still=ENOUGH, most=STEPS)
     evidence = np.stack(
         [
             dot_evidence,
-            log_evidence(edges, ball, ball_prior, weights) - np.log(_RARE) - 1e9 * now.sized,
-            log_evidence(edges, rounds, now.prior, weights),
-            log_evidence(edges, square, square_prior, weights),
-            log_evidence(edges, tube, now.prior, weights),
+            log_evidence(edges, ball, ball_prior, weights, side) - np.log(_RARE) - 1e9 * now.sized,
+            log_evidence(edges, rounds, now.prior, weights, side),
+            log_evidence(edges, square, square_prior, weights, side),
+            log_evidence(edges, tube, now.prior, weights, side),
         ]
     )
     evidence = with_shares_of_shapes(evidence, label)
     solid = np.array(_SOLID)[evidence[list(_SOLID)].argmax(axis=0)]
-    best = _mixed(solid == _CUBOID, edges.body, square, rounds)
-    best = _mixed(solid == _CYLINDER, edges.body, tube, best)
+    best = mixed_fit(solid == _CUBOID, edges.body, square, rounds)
+    best = mixed_fit(solid == _CYLINDER, edges.body, tube, best)
     return replace(
         now,
         fitted=(dots, ball.values, rounds.values, square.values, tube.values),
@@ -233,7 +248,7 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bo
     weights = _weights(edges, sides, now)
     count, boxes = len(now.shape), len(edges)
     values, covariance = np.zeros((count, 7)), np.zeros((count, 7, 7))
-    gap, weight = np.zeros((boxes, 2)), np.zeros(boxes)
+    shift, weight = np.zeros((boxes, 2)), np.zeros(boxes)
     for shape in np.unique(now.shape).tolist():
         mine = np.flatnonzero(now.shape == shape)
         at = np.flatnonzero(np.isin(edges.body, mine))
@@ -244,14 +259,15 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bo
         if shape == _CUBOID:
             loose = cuboid_prior(loose, start)
         tight = sphere_prior(loose) if shape in (_POINT, _SPHERE) else loose
-        best = fit(own, start, tight, some, kind, still=_ENOUGH)
+        best = fit(own, start, tight, some, kind, still=ENOUGH)
         if tight is not loose:  # A sphere may really be an ellipsoid, so its covariance is that of an ellipsoid.
             best = fit(own, best.values, loose, some, kind, most=0)
         values[mine] = best.values
         covariance[mine] = covariance_of(own, best, sides_of(own, best.values[:, :3]), now.factors, now.share)
-        gap[at], weight[at] = best.found.value[:, :2], best.weight[:, 0] * some.variance[:, 0]
-    to_centre = np.where((now.shape != _POINT)[edges.body, None], _to_centre(edges, values[:, :3], gap), 0.0)
-    return Bodies(values, covariance, now.shape, now.evidence, weight, now.share, now.factors, to_centre, between)
+        shift[at], weight[at] = shifts_of(own, best.found), (best.weight * some.variance)[:, :4].max(axis=1)
+    to_centre = np.where((now.shape != _POINT)[edges.body, None], directions_to_centres(edges, values[:, :3], shift), 0.0)
+    bound = edges.bound.reshape(boxes, 2, 2).sum(axis=1)
+    return Bodies(values, covariance, now.shape, now.evidence, weight, now.share, now.factors, to_centre, bound, between)
 
 
 def _axes_of_shapes(now: _State) -> Floats:
@@ -273,74 +289,12 @@ def _weights(edges: BoxEdges, sides: Sides, now: _State) -> Weights:
     return Weights(variance, spread_of(edges, now.factors, now.share))
 
 
-def _to_centre(edges: BoxEdges, centre: Floats, gap: Floats) -> Floats:
-    """Return unit directions (B, 3) to the centres (N, 3), m, of bodies, minus the unit directions to the centres of
-    predicted boxes.
-
-    gap: (B, 2) px, by how much the predicted box lies to the right of the detected one, and below it.
-    """
-    ray = edges.direction
-    predicted = ray.copy()
-    for axis in range(2):
-        across = edges.normal[:, axis + 2] - edges.normal[:, axis]
-        across = across - (across * ray).sum(axis=1, keepdims=True) * ray
-        across = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-        turn = edges.turn[:, [axis, axis + 2]].mean(axis=1)
-        predicted += (gap[:, axis] * turn)[:, None] * across
-    predicted /= np.linalg.norm(predicted, axis=1, keepdims=True)
-    towards = centre[edges.body] - edges.origin
-    away = np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    return np.asarray(towards / away - predicted)
-
-
 def _dots(edges: BoxEdges, now: _State, weights: Weights, side: Floats) -> tuple[Floats, Floats]:
     """Return points (N, 7), which do not explain the sides of boxes, and the logarithm of their evidence (N,)."""
     prior, variance, spread = dot_prior(now.prior), weights.variance.copy(), weights.spread.copy()
-    variance[:, 2:4] = spread[:, 2:4] = np.inf
+    free_rows = ~whole_axes(edges)
+    free_rows[:, 2:] = True  # The size of a box is free, and the place of one edge of it too.
+    variance[:, :4][free_rows] = spread[:, :4][free_rows] = np.inf
     free = replace(weights, variance=variance, spread=spread)
-    found = fit(edges, now.fitted[_POINT], prior, free, ELLIPSOID, still=_ENOUGH, most=_STEPS)
-    return found.values, log_evidence(edges, found, prior, weights, free_side=side)
-
-
-def _cuboid_starts(rounds: Floats) -> tuple[Floats, Floats]:
-    """Return two starts (N, 7) of cuboids, along the axes of ellipsoids (N, 7) and at 45 degrees to them."""
-    starts = []
-    for turn in (0.0, np.pi / 4):
-        start = rounds.copy()
-        start[:, 4], start[:, 5] = np.hypot(rounds[:, 4], rounds[:, 5]) * np.cos(2 * turn), ELLIPSOID.heading(rounds) + turn
-        start[:, [3, 6]] -= np.log(2) / 4  # The ellipsoid around a cuboid is larger than the cuboid.
-        starts.append(start)
-    return starts[0], starts[1]
-
-
-def _best_cuboids(edges: BoxEdges, starts: tuple[Floats, ...], prior: Prior, weights: Weights) -> tuple[Fit, Prior]:
-    """Fit cuboids from each of the starts (N, 7). Return the cuboids with the most evidence, and their priors."""
-    best: tuple[Fit, Prior, Floats] | None = None
-    for start in starts:
-        own = cuboid_prior(prior, start)
-        found = fit(edges, start, own, weights, CUBOID, still=_ENOUGH, most=_STEPS)
-        evidence = log_evidence(edges, found, own, weights)
-        if best is None:
-            best = found, own, evidence
-            continue
-        turned = evidence > best[2]
-        mean, information = (_rows(turned, getattr(own, k), getattr(best[1], k)) for k in ("mean", "information"))
-        best = _mixed(turned, edges.body, found, best[0]), Prior(mean, information), np.maximum(evidence, best[2])
-    assert best is not None
-    return best[0], best[1]
-
-
-def _mixed(which: Bools, body: Ints, first: Fit, second: Fit) -> Fit:
-    """Return the first fit for some bodies (N,), and the second for the others."""
-    boxes = which[body]
-    found = Residuals(
-        *(_rows(boxes, a, b) for a, b in zip(vars(first.found).values(), vars(second.found).values(), strict=True))
-    )
-    weight = _rows(boxes, first.weight, second.weight)
-    rest = (_rows(which, getattr(first, k), getattr(second, k)) for k in ("values", "information", "prior"))
-    values, information, prior = rest
-    return Fit(values, weight, found, information, prior)
-
-
-def _rows(which: Bools, first: Floats, second: Floats) -> Floats:
-    return np.where(which.reshape(-1, *[1] * (first.ndim - 1)), first, second)
+    found = fit(edges, now.fitted[_POINT], prior, free, ELLIPSOID, still=ENOUGH, most=STEPS)
+    return found.values, log_evidence(edges, found, prior, weights, side, free=free_rows)

@@ -1,0 +1,130 @@
+"""Edges of boxes beyond which something hides a part of the object.
+
+A box goes around the visible part of an object, which is never larger than the object. So if something hides a part, the box
+ends short of the body. An edge that ends short by more than the noise may be hidden. Then it is a bound, as at the image's
+border. No edge is hidden because it reaches too far.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.triangulation.bodies.choice import log_evidence
+from objslam.triangulation.bodies.edges import BoxEdges
+from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Prior, Weights, fit
+from objslam.triangulation.bodies.prior import cuboid_prior
+from objslam.triangulation.bodies.residuals import residuals
+from objslam.triangulation.bodies.shapes import CUBOID, KINDS, Kind
+from objslam.triangulation.bodies.shared import effective_variance, sides_of, spread_of
+
+_OUTER = 0.05
+"""The weight of an edge that the outer body reaches beyond, as a share of its weight if the body does not reach it. With a
+smaller weight, the outer body goes around the noise of more edges. With a larger one, hidden edges make it smaller."""
+_CLEAR = 2.0
+"""An edge may be hidden if the body reaches beyond it by this number of standard deviations. The evidence decides whether it
+is. With a larger number, bodies still bend to hidden edges. With a smaller one, noise hides the others."""
+_TURNS = 5
+"""How often hidden edges and the body without them are found in turns. Two to four are usual. More are slower."""
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """The hidden edges of N bodies. edges: (B, 4) which are hidden. between: (N, 6, 6) the second moment of centre and half
+    axes, m, between the bodies with and without hidden edges, about the likelier one."""
+
+    edges: Bools
+    between: Floats
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of boxes. factors, share: as in `Bodies`."""
+
+    factors: Floats
+    share: Floats
+
+
+def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
+    """Return edges with those that are hidden (B, 4) as bounds."""
+    return replace(edges, bound=edges.bound | hidden)
+
+
+def hidden_edges(
+    edges: BoxEdges, some: Ints, start: Floats, shape: Ints, prior: Prior, side: Floats, factors: Floats, share: Floats
+) -> Hidden:
+    """Return the edges that are hidden, of the objects whose boxes this explains better than a body that bends to them.
+
+    The first body bends to fit hidden edges too, and then none stands out. So an outer body is fitted, which reaches beyond
+    edges at little cost. Edges far inside it are taken to be hidden, and a body is fitted without them, in turns. It
+    competes with the body of all edges by the evidence. Both are equally probable before.
+
+    some: indices of the boxes that the fits use. start, shape: (N, 7) and (N,), bodies and their shapes. prior: of
+    ellipsoids. side: (B,) px as in `log_evidence`. factors, share: as in `Bodies`.
+    """
+    found = Hidden(np.zeros((len(edges), 4), dtype=bool), np.zeros((len(start), 6, 6)))
+    chosen = np.zeros(len(edges), dtype=bool)
+    chosen[some] = True
+    for number in np.unique(shape).tolist():
+        mine = np.flatnonzero(shape == number)
+        at = np.flatnonzero(np.isin(edges.body, mine))
+        own, noise = _of_bodies(edges, at, mine), Noise(factors, share)
+        loose = Prior(prior.mean[mine], prior.information[mine])
+        if KINDS[number] is CUBOID:
+            loose = cuboid_prior(loose, start[mine])
+        one = _of_kind(own, np.flatnonzero(chosen[at]), start[mine], KINDS[number], loose, side[at], noise)
+        found.edges[at], found.between[mine] = one.edges, one.between
+    return found
+
+
+def _of_kind(edges: BoxEdges, some: Ints, start: Floats, kind: Kind, prior: Prior, side: Floats, noise: Noise) -> Hidden:
+    """Return the hidden edges of bodies of one kind (see `hidden_edges`)."""
+    found = Hidden(np.zeros((len(edges), 4), dtype=bool), np.zeros((len(start), 6, 6)))
+    few, near = edges.take(some), side[some]
+    bent, before = _fitted(few, start, kind, prior, near, noise)
+    outer, _ = _fitted(replace(few, bound=np.where(few.bound, 1.0, 1 - _OUTER)), bent, kind, prior, near, noise)
+    mine = np.unique(few.body[_inside(few, outer, kind, noise).any(axis=1)])
+    if not len(mine):
+        return found
+    at = np.flatnonzero(np.isin(few.body, mine))
+    few, near = _of_bodies(few, at, mine), near[at]
+    prior, now, most = Prior(prior.mean[mine], prior.information[mine]), outer[mine], np.full(len(mine), -np.inf)
+    best = now
+    for _ in range(_TURNS):
+        now, evidence = _fitted(with_hidden(few, _inside(few, now, kind, noise)), now, kind, prior, near, noise)
+        best = np.where((evidence > most)[:, None], now, best)
+        most = np.maximum(evidence, most)
+    chance = 1 / (1 + np.exp(-np.clip(most - before[mine], -50, 50)))
+    off = _axes(best, kind) - _axes(bent[mine], kind)
+    found.between[mine] = np.minimum(chance, 1 - chance)[:, None, None] * off[:, :, None] * off[:, None, :]
+    at = np.flatnonzero(np.isin(edges.body, mine[chance > 0.5]))
+    found.edges[at] = _inside(_of_bodies(edges, at, mine), best, kind, noise) & ~edges.bound[at]
+    return found
+
+
+def _of_bodies(edges: BoxEdges, boxes: Ints, bodies: Ints) -> BoxEdges:
+    """Return some boxes, with the numbers of their bodies among the given ones."""
+    own = edges.take(boxes)
+    return replace(own, body=np.searchsorted(bodies, own.body))
+
+
+def _fitted(edges: BoxEdges, start: Floats, kind: Kind, prior: Prior, side: Floats, noise: Noise) -> tuple[Floats, Floats]:
+    """Return the best bodies (N, 7) of one kind, and the logarithm of their evidence (N,)."""
+    sides = sides_of(edges, start[:, :3])
+    variance = effective_variance(edges, sides, noise.factors, noise.share)
+    weights = Weights(variance, spread_of(edges, noise.factors, noise.share))
+    found = fit(edges, start, prior, weights, kind, still=ENOUGH, most=STEPS)
+    return found.values, log_evidence(edges, found, prior, weights, side)
+
+
+def _inside(edges: BoxEdges, values: Floats, kind: Kind, noise: Noise) -> Bools:
+    """Return which edges (B, 4) lie clearly inside bodies (N, 7) of one kind."""
+    bare = replace(edges, bound=np.ones_like(edges.bound))  # Then the residuals are those of the edges.
+    beyond = residuals(bare, values, kind).value[:, :4]
+    return np.asarray(beyond > _CLEAR * spread_of(bare, noise.factors, noise.share)[:, :4])
+
+
+def _axes(values: Floats, kind: Kind) -> Floats:
+    return np.column_stack([values[:, :3], kind.half_axes(values)])

@@ -1,0 +1,117 @@
+"""Things that hide each other in part: which edges count as hidden, and what that does to a map."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mapping.hiding_drives import FORWARD, boxes_at, hiding_drive, lines_between, scene
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Rays
+from objslam.evaluation.evaluate import INSIDE_95_3D, evaluate
+from objslam.mapping import pipeline
+from objslam.mapping.bodies import fitting
+from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes, with_hidden_parts
+from objslam.mapping.solution import CentreShift
+from objslam.triangulation.bodies import solve
+from objslam.triangulation.bodies.hidden_edges import Hidden
+
+SETTINGS = load_settings(None, ("mode=fixed", "output.recording=false"))
+
+
+def mapped(log):
+    """The scores of a map at known poses: errors, squared Mahalanobis errors and size errors of the matched objects."""
+    result = pipeline.run(log, SETTINGS, Ledger())
+    matches = evaluate(result.map, log.truth, radius=1.0).objects.matches
+    sizes = [m.body.size_error for m in matches if m.body is not None]
+    return np.array([m.error for m in matches]), np.array([m.squared_3d for m in matches]), np.array(sizes)
+
+
+@pytest.fixture
+def no_hidden_edges(monkeypatch):
+    """Every edge counts as the outline of its body."""
+
+    def turn_off():
+        none = lambda solution, cameras, settings, map_T_camera, half, ray: np.zeros((len(ray), 4), dtype=bool)  # noqa: E731
+        monkeypatch.setattr(fitting, "edges_behind_boxes", none)
+        flat = lambda edges, some, start, *_: Hidden(np.zeros((len(edges), 4), bool), np.zeros((len(start), 6, 6)))  # noqa: E731
+        monkeypatch.setattr(solve, "hidden_edges", flat)
+
+    return turn_off
+
+
+def test_things_in_front_move_and_shrink_no_objects(no_hidden_edges):
+    logs = [hiding_drive(seed) for seed in (0, 2)]
+    errors, squared, sizes = (np.concatenate(part) for part in zip(*map(mapped, logs), strict=True))
+    no_hidden_edges()
+    plain, _, plain_sizes = (np.concatenate(part) for part in zip(*map(mapped, logs), strict=True))
+    assert len(errors) >= len(plain) - 1
+    assert np.median(errors) < 0.75 * np.median(plain)
+    assert (squared <= INSIDE_95_3D).mean() > 0.9
+    assert np.median(sizes[:, 2]) > np.median(plain_sizes[:, 2])  # Things in front mostly hide the lower parts.
+    assert abs(np.median(sizes)) < 0.05
+
+
+def test_edges_of_visible_parts_are_found_behind_boxes(monkeypatch):
+    """Against the boxes that the things would have if nothing hid them."""
+    log, found = hiding_drive(1, noise=0.5, frames=200), []
+
+    def noted(solution, cameras, settings, map_T_camera, half, ray):
+        hidden = edges_behind_boxes(solution, cameras, settings, map_T_camera, half, ray)
+        found.append((solution, ray, hidden))
+        return hidden
+
+    monkeypatch.setattr(fitting, "edges_behind_boxes", noted)
+    pipeline.run(log, SETTINGS, Ledger())
+    solution, ray, hidden = found[-1]
+    solids = scene(np.random.default_rng(1))
+    lines, truth = lines_between(solids), log.truth.trajectory.poses
+    true = np.zeros_like(hidden)
+    for at, one in enumerate(ray.tolist()):
+        pose = truth[solution.keyframes.frame[solution.rays.keyframe[one]]] @ FORWARD
+        shown, boxes = boxes_at(solids, lines, pose)
+        mine = np.abs(boxes - solution.rays.box[one]).max(axis=1).argmin()
+        alone, whole = boxes_at([solids[shown[mine]]], {}, pose)
+        true[at] = np.abs(whole[0] - boxes[mine]) > 12
+        assert alone
+    assert true.sum() > 60
+    assert hidden[true].mean() > 0.9
+    assert hidden[~true].mean() < 0.15
+
+
+def test_hidden_boxes_make_a_position_by_rays_less_sure():
+    log = hiding_drive(0, frames=200)
+    solution, found = None, []
+    given = fitting.with_bodies
+
+    def noted(*arguments):
+        found.append(given(*arguments))
+        return found[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "with_bodies", noted)
+        pipeline.run(log, SETTINGS, Ledger())
+    solution, cameras = found[-1], tuple(c.camera for c in log.cameras)
+    assert solution.hidden.any()
+    assert not solution.hidden.all()
+    more = with_hidden_parts(solution, cameras).estimate.covariance - solution.estimate.covariance
+    used = (solution.association.object >= 0) & (solution.estimate.weight > 0)
+    for j in range(solution.association.count):
+        mine = used & (solution.association.object == j)
+        assert (np.trace(more[j]) > 0) == solution.hidden[mine].any()
+    clear = replace(solution, hidden=np.zeros_like(solution.hidden))
+    assert with_hidden_parts(clear, cameras) is clear
+
+
+def test_a_shift_turns_rays_and_makes_them_noisier():
+    count, flat = 4, np.zeros(4)
+    ahead = np.tile([0.0, 0.0, 1.0], (count, 1))
+    unknown = np.full(count, np.nan)
+    none = np.zeros(count, dtype=int)
+    rays = Rays(none, ahead, flat + 0.03, unknown, flat + 1, flat, none, flat, np.zeros((count, 4)), none - 1, ("thing",))
+    shift = CentreShift(np.tile([0.1, 0.0, 0.0], (count, 1)), flat + 0.04).only(np.array([True, True, False, False]))
+    turned = shift.apply(rays)
+    np.testing.assert_allclose(np.arctan2(turned.direction[:, 0], turned.direction[:, 2]), np.arctan([0.1, 0.1, 0, 0]))
+    np.testing.assert_allclose(np.linalg.norm(turned.direction, axis=1), 1.0)
+    np.testing.assert_allclose(turned.sigma, [0.05, 0.05, 0.03, 0.03])
