@@ -163,7 +163,7 @@ def _few(
     `position_sigma` and `flat_scale`."""
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, *noise)
     positions = flattened_points(positions, obs.scale)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, cut=rays.cut)
     known = np.isfinite(positions).all(axis=1)
     labels = len(rays.label_names)
     held = Landmarks.new(positions[known], np.ones(known.sum()), association.label[known], labels)
