@@ -169,9 +169,9 @@ def rest_odds(state: State, fitted: int = 0) -> Floats:
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
     the share of the squared deviations that a velocity explains. The errors of poses last for seconds, so they look like a
     motion too. So a way that such errors explain counts only as far as the deviations exceed their nominal noise. A box
-    centre wanders over its object as the view changes, which also looks like motion. So only a few rays count, and motion within the object's size
-    does not count, nor motion within the drift of the path. fitted: the number of measured coordinates that a moving point
-    explains even by chance. They matter if there are few rays.
+    centre wanders over its object as the view changes, which also looks like motion. So only a few rays count, and motion
+    within the object's size does not count, nor motion within the drift of the path. fitted: the number of measured
+    coordinates that a moving point explains even by chance. They matter if there are few rays.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]

@@ -40,8 +40,9 @@ _FILLED = 0.6  # The share of a box's width and height that its object certainly
 class CameraFrames:
     """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
     (F, 4, 4). A box counts if it is at least `margin` px, and at least `margin_share` of its size, away from the image edge.
-    With a negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift. cut: the boxes
-    in these frames that the image's edge cuts off, None if unknown. Their `frame` is the index of an observed frame."""
+    With a negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift. cut: the
+    boxes in these frames that the image's edge cuts off, None if unknown. Their `frame` is the index of an observed frame.
+    """
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -121,10 +122,10 @@ def detection_history(
 ) -> DetectionHistory:
     """Return in which frames the objects are or should be detected.
 
-    An object should be detected under four conditions. Its box lies in the image, and no box of its label that the edge cuts
-    off is there. Its distance is in the usual range of its class, extended to the median distance of its own boxes. No closer
-    box hides it. The camera sees its front, if it has one. matched: (R,) the object of each observation, -1 for none. position, label: (N, 3) m and (N,), of the objects, in
-    the world of the observations.
+    An object should be detected under four conditions. Its box lies in the image, where no cut off box of its label is. Its
+    distance is in the usual range of its class, extended to the median distance of its own boxes. No closer box hides it.
+    The camera sees its front, if it has one. matched: (R,) the object of each observation, -1 for none.
+    position, label: (N, 3) m and (N,), of the objects, in the world of the observations.
     """
     position = raised_points(position, obs.scale)
     obs = replace(obs, origin=raised_points(obs.origin, obs.scale))
@@ -275,7 +276,8 @@ def _mean_size(extent: Floats) -> Floats:
 
 
 def _cut_off(frame: Ints, label: Ints, pixel: Floats, cut: CutBoxes) -> Bools:
-    """Return whether a cut off box of the same label contains each pixel (V, 2). frame, label: (V,). cut: sorted by frame."""
+    """Return whether a cut off box of the same label contains each pixel (V, 2). frame, label: (V,), as the pixels. cut:
+    sorted by frame."""
     begin, end = (np.searchsorted(cut.frame, frame, side=side) for side in ("left", "right"))
     inside = np.zeros(len(frame), dtype=bool)
     for k in range(int((end - begin).max(initial=0))):  # Each step checks the k-th box of all frames that have one.
