@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.association.gating import gated_edges
 from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.association.visibility import DetectionHistory
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import grouped_quantiles, logistic, poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
@@ -19,6 +20,9 @@ their sides is hard to detect. With a larger share, misses drop fewer objects, a
 _UNUSUAL_RATE = (0.6, 12.0)
 """The mean rate of these objects, as a share of the rate of their class, and the concentration of their rates: about a half,
 as of a thing that is hidden on one visit of two. With a larger mean, misses drop more objects."""
+_SHARED_RAYS = 0.5
+"""The largest share of the rays of such an object that also pass another landmark of their label. With a larger share, fewer
+neighbours are dropped, and more phantoms stay."""
 _CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
 _POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
@@ -54,10 +58,11 @@ class Rates:
         """Return ln of the probability of all detections and misses of objects with these labels (N,)."""
         return float(_beta_binomial(history.seen, history.expected, self.mean[label], self.concentration).sum())
 
-    def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:
+    def log_odds(self, history: DetectionHistory, label: Ints, rarer: Bools | bool = True) -> Floats:
         """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses.
 
-        An object has a rate of its class or, with the probability `_UNUSUAL_SHARE`, a lower one.
+        An object has a rate of its class or, with the probability `_UNUSUAL_SHARE`, a lower one. rarer: (N,) whether it may
+        have a lower one.
         """
         seen, expected, rate = history.seen, history.expected, self.mean[label]
         phantom = rate * _PHANTOM_SHARE
@@ -65,7 +70,9 @@ class Rates:
         as_phantom = _beta_binomial(seen, expected, phantom, 1 / phantom)
         usual = np.log1p(-_UNUSUAL_SHARE) + _beta_binomial(seen, expected, rate, self.concentration)
         lower, concentration = _UNUSUAL_RATE
-        unusual = np.log(_UNUSUAL_SHARE) + _beta_binomial(seen, expected, lower * rate, concentration)
+        unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + _beta_binomial(
+            seen, expected, lower * rate, concentration
+        )
         return np.asarray(np.logaddexp(usual, unusual) - as_phantom)
 
 
@@ -105,15 +112,34 @@ def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) ->
 
 def existence(state: State, gate: float) -> Floats:
     """Return the probability (N,) that each landmark is a static object."""
-    return np.asarray(logistic(static_odds(state)) * logistic(chance_odds(state, gate)))
+    return np.asarray(logistic(static_odds(state, gate)) * logistic(chance_odds(state, gate)))
 
 
-def static_odds(state: State, fitted: int = 0) -> Floats:
+def static_odds(state: State, gate: float, fitted: int = 0) -> Floats:
     """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
-    motion. fitted: see `rest_odds`."""
+    motion. gate: see `rarer_objects`. fitted: see `rest_odds`."""
     rates = detection_rates(state.history, state.label, len(state.unassigned))
-    by_rate = prior_odds(state) + rates.log_odds(state.history, state.label)
+    by_rate = prior_odds(state) + rates.log_odds(state.history, state.label, rarer_objects(state, rates, gate))
     return np.asarray(by_rate + size_odds(state) + rest_odds(state, fitted))
+
+
+def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
+    """Return which landmarks (N,) may be objects that are detected more rarely than their class.
+
+    The rays of a phantom belong to other things. So a landmark whose rays also pass other landmarks within the gate (a
+    squared deviation) must be detected as often as its class.
+    """
+    rarer = np.ones(state.count, dtype=bool)
+    usual = rates.log_odds(state.history, state.label, False)
+    asked = usual + prior_odds(state) < 0
+    if asked.any():
+        rays = np.flatnonzero(np.append(asked, False)[state.matched])
+        edges = gated_edges(state.obs.take(rays), state.landmarks, gate)
+        own = state.matched[rays]
+        shared = np.zeros(len(rays), dtype=bool)
+        shared[edges.ray[edges.landmark != own[edges.ray]]] = True
+        rarer = np.bincount(own, shared, state.count) <= _SHARED_RAYS * state.ray_count
+    return rarer
 
 
 def chance_odds(state: State, gate: float) -> Floats:

@@ -166,13 +166,6 @@ def overlap(one: Floats, two: Floats) -> Floats:
     return np.asarray(common / np.maximum(total, 1e-12))
 
 
-def shared_part(one: Floats, two: Floats) -> Floats:
-    """Return the intersection as a share of the smaller of two boxes (..., 4) whose shapes broadcast together."""
-    low, high = np.maximum(one[..., :2], two[..., :2]), np.minimum(one[..., 2:], two[..., 2:])
-    area = np.minimum((one[..., 2:] - one[..., :2]).prod(axis=-1), (two[..., 2:] - two[..., :2]).prod(axis=-1))
-    return np.asarray(np.maximum(high - low, 0.0).prod(axis=-1) / np.maximum(area, 1e-12))
-
-
 @dataclass(frozen=True)
 class UsualSizes:
     """What the boxes of N landmarks usually measure.

@@ -285,7 +285,9 @@ class _Few:
         every = self.joined(found)
         rates = detection_rates(every.history, every.label, len(every.unassigned))
         odds = chance_odds(every, self.gate, self.strays, rates) + _alike_odds(every)
-        return np.asarray(logistic(static_odds(every, fitted=_MOVING)) * logistic(_POWER * odds))[self.known.count :]
+        return np.asarray(logistic(static_odds(every, self.gate, fitted=_MOVING)) * logistic(_POWER * odds))[
+            self.known.count :
+        ]
 
     def joined(self, found: State) -> State:
         """Return the known landmarks, followed by the new ones."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.association.gating import gated_edges
-from objslam.association.observations import shared_part
+from objslam.association.observations import overlap
 from objslam.core.arrays import Bools, Ints
 from objslam.mapping.doubts.chance import LEAST_LOG_ODDS, crowded
 from objslam.mapping.doubts.evidence import Evidence
@@ -18,15 +18,16 @@ _FEWEST = 5
 _AROUND = 9.0
 """The surroundings of an object end at this multiple of its gate, a squared deviation. They show how many boxes lie on it by
 chance. A larger multiple gives a surer estimate, of a larger area."""
-_INSIDE = 0.5
-"""A box shows the same thing as another box of its frame if at least this share of the smaller one lies in the other. With a
-larger share, fewer boxes lie on an object."""
+_SAME = 0.5
+"""The least intersection over union of two boxes in one frame that show one thing. With a larger overlap, fewer boxes lie on
+an object."""
 
 
 def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
     """Yield landmarks and the rays without an object that lie on them. left: (M,) the rays without an object.
 
-    A ray does not lie on a landmark that has a box of its own elsewhere in the image: it shows a neighbour.
+    A ray does not lie on a landmark that has a box of its own elsewhere in the image: it shows a neighbour. If most rays of
+    a label at a landmark do so, the others show this neighbour too.
     """
     state, gate = evidence.state, evidence.gate
     if not state.count or not len(left):
@@ -35,15 +36,16 @@ def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
     every = replace(state.landmarks, accepts=np.ones((state.count, labels), dtype=bool))
     edges = gated_edges(state.obs.take(left), every, _AROUND * gate)
     order = np.lexsort((edges.deviation, edges.ray))
-    order = order[~_elsewhere(evidence, left[edges.ray[order]], edges.landmark[order])]
     order = order[np.append(True, np.diff(edges.ray[order]) > 0)[: len(order)]]
     ray, landmark, inside = left[edges.ray[order]], edges.landmark[order], edges.deviation[order] <= gate
     key = landmark * labels + state.obs.label[ray]
     pairs, group = np.unique(key, return_inverse=True)
     around, number = np.bincount(group, minlength=len(pairs)), np.bincount(group[inside], minlength=len(pairs))
     odds = crowded(number, around, 1 / _AROUND, max(len(pairs), 1))
-    for one in np.flatnonzero((number >= _FEWEST) & (odds > LEAST_LOG_ODDS)):
-        yield int(pairs[one] // labels), ray[(group == one) & inside]
+    elsewhere = _elsewhere(evidence, ray, landmark) & inside
+    beside = 2 * np.bincount(group[elsewhere], minlength=len(pairs)) > number
+    for one in np.flatnonzero((number >= _FEWEST) & (odds > LEAST_LOG_ODDS) & ~beside):
+        yield int(pairs[one] // labels), ray[(group == one) & inside & ~elsewhere]
 
 
 def _elsewhere(evidence: Evidence, ray: Ints, landmark: Ints) -> Bools:
@@ -57,5 +59,5 @@ def _elsewhere(evidence: Evidence, ray: Ints, landmark: Ints) -> Bools:
     found = np.flatnonzero(key[at] == wanted) if len(key) else np.zeros(0, dtype=np.int64)
     elsewhere = np.zeros(len(ray), dtype=bool)
     theirs = obs.box[state.assigned[own[at[found]]]]
-    elsewhere[found] = shared_part(obs.box[ray[found]], theirs) < _INSIDE
+    elsewhere[found] = overlap(obs.box[ray[found]], theirs) < _SAME
     return elsewhere

@@ -15,6 +15,7 @@ from objslam.mapping.doubts.groups import REASONS, BoxGroups
 from objslam.mapping.doubts.pairs import Pairs
 from objslam.mapping.doubts.splits import Splits
 
+_CLOSE = np.log(20.0)  # Log odds below this are called close. With larger odds, more are.
 _DISAGREE = 2.0
 """The rays of an object disagree if they pass it at more than this multiple of their noise (root mean square). With a larger
 number, fewer objects are said to have rays that disagree."""
@@ -201,7 +202,8 @@ def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> s
             return ": as many rays of other boxes of this label would meet there by chance"
         case _:
             odds = f"{np.exp(np.abs(groups.odds[g])):.1f} to 1 {'for' if groups.odds[g] > 0 else 'against'}"
-            return f": their rays meet within {miss}, and the odds of an object are close, {odds}"
+            odds = f"{'close, ' if abs(groups.odds[g]) < _CLOSE else ''}{odds}"
+            return f": their rays meet within {miss}, and the odds of an object are {odds}"
 
 
 def _frames(count: int) -> str:
