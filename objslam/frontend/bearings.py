@@ -208,7 +208,7 @@ def _without_parts(boxes: Detections, camera: Camera, settings: Settings, ledger
     some = boxes.take(sure)
     cut = np.zeros(len(sure), dtype=bool)
     if settings.rays.border >= 0 and not boxes.whole:
-        cut = cut_edges(some.boxes, camera, settings).any(axis=1)
+        cut = np.asarray(cut_edges(some.boxes, camera, settings).any(axis=1))
     part = np.zeros(len(boxes), dtype=bool)
     part[sure] = parts_of_boxes(some.boxes, some.frame, some.label, some.scores, cut)
     ledger.drop(PARTS, int(part.sum()), _where(camera, boxes.stamps, part), of=len(boxes))
