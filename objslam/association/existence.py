@@ -5,14 +5,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.association.gating import gated_edges
 from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.association.visibility import DetectionHistory
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import grouped_quantiles, log_beta, logistic, poisson_tail
 
 _PHANTOM_SHARE = 1 / 8  # The detection rate of a phantom landmark, as a share of the rate of its class.
 _CONCENTRATIONS = (3.0, 5.0, 8.0, 13.0, 21.0, 34.0, 55.0)  # The tried concentrations. Larger values mean similar rates.
+_UNUSUAL_SHARE = 0.05
+"""The share of objects that are detected more rarely than their class, because neighbours hide them on one visit, or one of
+their sides is hard to detect. With a larger share, misses drop fewer objects, and more phantoms stay."""
+_UNUSUAL_RATE = (0.6, 12.0)
+"""The mean rate of these objects, as a share of the rate of their class, and the concentration of their rates: about a half,
+as of a thing that is hidden on one visit of two. With a larger mean, misses drop more objects."""
+_SHARED_RAYS = 0.5
+"""The largest share of the rays of such an object that also pass another landmark of their label. With a larger share, fewer
+neighbours are dropped, and more phantoms stay."""
 _CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
 _POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
@@ -24,6 +34,10 @@ _MOST_ODDS = 20.0  # The largest absolute log odds against chance. This limit on
 _REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A larger value drops fewer objects.
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
 _DRIFTED = 2.0  # An object may seem to move by this many standard deviations of the drift of the path. More drops fewer.
+_WITHIN_NOISE = 8.0
+"""Errors of poses that last for seconds may explain a way of this many standard deviations of a ray. Things at rest seem to
+move by up to 8 if the poses err for 2 s at a time (simulated), and people who walk by 30. With a larger number, more things
+that move become objects."""
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
@@ -44,13 +58,22 @@ class Rates:
         """Return ln of the probability of all detections and misses of objects with these labels (N,)."""
         return float(_beta_binomial(history.seen, history.expected, self.mean[label], self.concentration).sum())
 
-    def log_odds(self, history: DetectionHistory, label: Ints) -> Floats:
-        """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses."""
-        rate = self.mean[label]
+    def log_odds(self, history: DetectionHistory, label: Ints, rarer: Bools | bool = True) -> Floats:
+        """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses.
+
+        An object has a rate of its class or, with the probability `_UNUSUAL_SHARE`, a lower one. rarer: (N,) whether it may
+        have a lower one.
+        """
+        seen, expected, rate = history.seen, history.expected, self.mean[label]
         phantom = rate * _PHANTOM_SHARE
         # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
-        as_phantom = _beta_binomial(history.seen, history.expected, phantom, 1 / phantom)
-        return np.asarray(_beta_binomial(history.seen, history.expected, rate, self.concentration) - as_phantom)
+        as_phantom = _beta_binomial(seen, expected, phantom, 1 / phantom)
+        usual = np.log1p(-_UNUSUAL_SHARE) + _beta_binomial(seen, expected, rate, self.concentration)
+        lower, concentration = _UNUSUAL_RATE
+        unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + _beta_binomial(
+            seen, expected, lower * rate, concentration
+        )
+        return np.asarray(np.logaddexp(usual, unusual) - as_phantom)
 
 
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
@@ -87,15 +110,34 @@ def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) ->
 
 def existence(state: State, gate: float) -> Floats:
     """Return the probability (N,) that each landmark is a static object."""
-    return np.asarray(logistic(static_odds(state)) * logistic(chance_odds(state, gate)))
+    return np.asarray(logistic(static_odds(state, gate)) * logistic(chance_odds(state, gate)))
 
 
-def static_odds(state: State, fitted: int = 0) -> Floats:
+def static_odds(state: State, gate: float, fitted: int = 0) -> Floats:
     """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
-    motion. fitted: see `rest_odds`."""
+    motion. gate: see `rarer_objects`. fitted: see `rest_odds`."""
     rates = detection_rates(state.history, state.label, len(state.unassigned))
-    by_rate = prior_odds(state) + rates.log_odds(state.history, state.label)
+    by_rate = prior_odds(state) + rates.log_odds(state.history, state.label, rarer_objects(state, rates, gate))
     return np.asarray(by_rate + size_odds(state) + rest_odds(state, fitted))
+
+
+def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
+    """Return which landmarks (N,) may be objects that are detected more rarely than their class.
+
+    The rays of a phantom belong to other things. So a landmark whose rays also pass other landmarks within the gate (a
+    squared deviation) must be detected as often as its class.
+    """
+    rarer = np.ones(state.count, dtype=bool)
+    usual = rates.log_odds(state.history, state.label, False)
+    asked = usual + prior_odds(state) < 0
+    if asked.any():
+        rays = np.flatnonzero(np.append(asked, False)[state.matched])
+        edges = gated_edges(state.obs.take(rays), state.landmarks, gate)
+        own = state.matched[rays]
+        shared = np.zeros(len(rays), dtype=bool)
+        shared[edges.ray[edges.landmark != own[edges.ray]]] = True
+        rarer = np.bincount(own, shared, state.count) <= _SHARED_RAYS * state.ray_count
+    return rarer
 
 
 def chance_odds(state: State, gate: float) -> Floats:
@@ -149,17 +191,21 @@ def rest_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
     Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
-    the share of the squared deviations that a velocity explains. A box centre wanders over its object as the view changes,
-    which looks like motion. So only a few rays count, and motion within the object's size does not count, nor motion within
-    the drift of the path. fitted: the number of measured coordinates that a moving point explains even by chance. They
-    matter if there are few rays.
+    the share of the squared deviations that a velocity explains. The errors of poses last for seconds, so they look like a
+    motion too. So a way that such errors explain counts only as far as the deviations exceed their nominal noise. A box
+    centre wanders over its object as the view changes, which also looks like motion. So only a few rays count, and motion
+    within the object's size does not count, nor motion within the drift of the path. fitted: the number of measured
+    coordinates that a moving point explains even by chance. They matter if there are few rays.
     """
     obs, landmarks = state.obs, state.landmarks
     stamps = state.view.stamps[obs.frame[state.assigned]]
     explained, way = velocity_gain(obs, state.assigned, state.owner, landmarks.position, landmarks.noise, stamps)
     size = 2.0 * np.clip(state.ray_count, 1, _COUNTED_RAYS)  # Each ray measures two coordinates.
     left = np.clip(2.0 * state.ray_count - fitted, 0.0, size)
-    odds = _REST_PRIOR + 1.5 * np.log(size) + 0.5 * left * np.log(np.clip(1 - explained, 1e-6, 1.0))
+    each = np.bincount(state.owner, state.deviation**2, state.count) / np.maximum(2 * state.ray_count, 1)
+    gain = -np.log(np.clip(1 - explained, 1e-6, 1.0))
+    gain = np.where(way > _WITHIN_NOISE * state.ray_sigma, gain, np.minimum(gain, each * explained))
+    odds = _REST_PRIOR + 1.5 * np.log(size) - 0.5 * left * gain
     allowed = np.maximum(_WITHIN_SIZE * state.size, _DRIFTED * _drift_at(state))
     return np.where(way > allowed, np.minimum(odds, 0.0), 0.0)
 

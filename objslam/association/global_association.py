@@ -95,7 +95,7 @@ def associate_globally(
         solved: whether the poses are those of a joint solve. The rays of one thing meet there, as at localised poses.
     """
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma, flat_scale)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts, cut=rays.cut)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)

@@ -9,6 +9,7 @@ from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.association.refinement import dots, grouped_sums
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.geometry import evenly_spread
 from objslam.core.ground.flattening import raised_points
@@ -27,7 +28,8 @@ _FRONT_SHARE = 0.95
 front."""
 _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
-counts. Larger values hide fewer objects."""
+counts. Things that are not that thick need only half of the sum of their sizes instead of the first: on a table, a thing may
+hide its neighbour. Larger values hide fewer objects."""
 _SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. A larger number is finer.
 _SAME_SIDE = np.cos(np.radians(45.0))
 """The cosine of the largest angle between two views of one side of an object. A smaller cosine counts more frames."""
@@ -38,7 +40,9 @@ _FILLED = 0.6  # The share of a box's width and height that its object certainly
 class CameraFrames:
     """The observed frames. stamps: (F,) s. cameras: all cameras. camera: (F,) the camera of each frame. map_T_camera:
     (F, 4, 4). A box counts if it is at least `margin` px, and at least `margin_share` of its size, away from the image edge.
-    With a negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift."""
+    With a negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift. cut: the
+    boxes in these frames that the image's edge cuts off, None if unknown. Their `frame` is the index of an observed frame.
+    """
 
     stamps: Floats
     cameras: tuple[Camera, ...]
@@ -47,6 +51,7 @@ class CameraFrames:
     margin: float
     margin_share: float
     drift: Floats | None = None
+    cut: CutBoxes | None = None
 
     @cached_property
     def solid_angle(self) -> float:
@@ -63,15 +68,29 @@ def frames_of(
     settings: Settings,
     *,
     drifts: bool = False,
+    cut: CutBoxes | None = None,
 ) -> CameraFrames:
     """Convert keyframes to observed frames.
 
     order: (K,) the keyframes, in the order of the frames. map_T_camera: (K, 4, 4) of the keyframes. drifts: whether these
-    poses drift as the odometry does.
+    poses drift as the odometry does. cut: as in `Rays`.
     """
     poses, margins = map_T_camera[order], (settings.rays.border, settings.rays.border_share)
     drift = keyframes.drift[order] if drifts and keyframes.drift is not None else None
-    return CameraFrames(keyframes.stamps[order], cameras, keyframes.camera[order], poses, *margins, drift)
+    camera, frame = keyframes.camera[order], keyframes.frame[order]
+    cut = None if cut is None else _in_frames(cut, camera, frame)
+    return CameraFrames(keyframes.stamps[order], cameras, camera, poses, *margins, drift, cut)
+
+
+def _in_frames(cut: CutBoxes, camera: Ints, frame: Ints) -> CutBoxes:
+    """Return the cut off boxes of observed frames, sorted by frame. camera, frame: (F,) as in `Keyframes`."""
+    width = int(max(frame.max(initial=0), cut.frame.max(initial=0))) + 1
+    key, wanted = camera * width + frame, cut.camera * width + cut.frame
+    order = np.argsort(key, kind="stable")
+    at = np.minimum(np.searchsorted(key[order], wanted), max(len(key) - 1, 0))
+    found = np.flatnonzero(key[order][at] == wanted) if len(key) else np.zeros(0, dtype=np.int64)
+    of = order[at[found]] if len(key) else found
+    return replace(cut.take(found), frame=of).take(np.argsort(of, kind="stable"))
 
 
 @dataclass(frozen=True)
@@ -103,10 +122,10 @@ def detection_history(
 ) -> DetectionHistory:
     """Return in which frames the objects are or should be detected.
 
-    An object should be detected under four conditions. Its box lies in the image. Its distance is in the usual range of its
-    class, extended to the median distance of its own boxes. No closer box hides it. The camera sees its front, if it has
-    one. matched: (R,) the object of each observation, -1 for none. position, label: (N, 3) m and (N,), of the objects, in
-    the world of the observations.
+    An object should be detected under four conditions. Its box lies in the image, where no cut off box of its label is. Its
+    distance is in the usual range of its class, extended to the median distance of its own boxes. No closer box hides it.
+    The camera sees its front, if it has one. matched: (R,) the object of each observation, -1 for none.
+    position, label: (N, 3) m and (N,), of the objects, in the world of the observations.
     """
     position = raised_points(position, obs.scale)
     obs = replace(obs, origin=raised_points(obs.origin, obs.scale))
@@ -131,7 +150,10 @@ def detection_history(
     usual = (away >= near[obj]) & (away <= far[obj])
     usual &= _from_the_front(obs.origin[held], index, position, obj, view.map_T_camera[frame, :3, 3])
     obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
-    clear = ~_hidden(frame, away, pixel, obs, np.where(np.isfinite(obs.range), obs.range, distance))
+    reach = np.where(np.isfinite(obs.range), obs.range, distance)
+    clear = ~_hidden(frame, away, pixel, obs, reach, _mean_size(extent[obj]))
+    if view.cut is not None:
+        clear &= ~_cut_off(frame, label[obj], pixel, view.cut)
     there = index * total + obs.frame[held]
     key = distinct(np.concatenate([obj[clear] * total + frame[clear], there]))
     detected = np.zeros(len(key), dtype=bool)
@@ -175,7 +197,7 @@ def count_looks(
             usual = away >= near[obj]
             usual &= _from_known_sides(obj, view.map_T_camera[frame, :3, 3] - position[obj], known)
             obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
-            clear = ~_hidden(frame, away, pixel, obs, distance)
+            clear = ~_hidden(frame, away, pixel, obs, distance, _mean_size(np.nan_to_num(extent[obj])))
             found += np.bincount(obj[clear], minlength=len(position))
     return found
 
@@ -248,11 +270,29 @@ def _in_image(
     return n[inside], frames[f[inside]], np.linalg.norm(local[inside], axis=1), pixel
 
 
-def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, reach: Floats) -> Bools:
+def _mean_size(extent: Floats) -> Floats:
+    """Return the geometric mean (n,) m of widths and heights (n, 2)."""
+    return np.sqrt(extent.prod(axis=1))
+
+
+def _cut_off(frame: Ints, label: Ints, pixel: Floats, cut: CutBoxes) -> Bools:
+    """Return whether a cut off box of the same label contains each pixel (V, 2). frame, label: (V,), as the pixels. cut:
+    sorted by frame."""
+    begin, end = (np.searchsorted(cut.frame, frame, side=side) for side in ("left", "right"))
+    inside = np.zeros(len(frame), dtype=bool)
+    for k in range(int((end - begin).max(initial=0))):  # Each step checks the k-th box of all frames that have one.
+        rows = np.flatnonzero(end - begin > k)
+        box = cut.box[begin[rows] + k]
+        over = ((pixel[rows] >= box[:, :2]) & (pixel[rows] <= box[:, 2:])).all(axis=1)
+        inside[rows] |= over & (cut.label[begin[rows] + k] == label[rows])
+    return inside
+
+
+def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, reach: Floats, size: Floats) -> Bools:
     """Return whether the box of a closer object covers each pixel (V, 2).
 
     frame, distance: (V,) the frame and the distance, m, of the object at each pixel. reach: (R,) m, the distance of the
-    object of each observation, NaN if unknown.
+    object of each observation, NaN if unknown. size: (V,) m, of the object at each pixel, 0 if unknown.
     """
     hidden = np.zeros(len(frame), dtype=bool)
     useful = np.flatnonzero(np.isfinite(reach))
@@ -260,14 +300,15 @@ def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, rea
     start = np.searchsorted(obs.frame[useful], frames)
     begin, end = start[frame], start[frame + 1]
     middle, half = (obs.box[:, :2] + obs.box[:, 2:]) / 2, _FILLED * (obs.box[:, 2:] - obs.box[:, :2]) / 2
-    front = distance - np.maximum(_CLOSER[0], _CLOSER[1] * distance)
+    thick = _mean_size(obs.size) * np.nan_to_num(reach)
     number = end - begin
     most = np.argsort(-number, kind="stable")
     fewer = -number[most]
     for k in range(int(number.max(initial=0))):  # Each step checks the k-th box of all frames that have one.
         rows = most[: np.searchsorted(fewer, -k)]
         box = useful[begin[rows] + k]
-        closer = reach[box] < front[rows]
+        apart = np.where(size[rows] > 0, np.minimum((thick[box] + size[rows]) / 2, _CLOSER[0]), _CLOSER[0])
+        closer = reach[box] < distance[rows] - np.maximum(apart, _CLOSER[1] * distance[rows])
         rows, box = rows[closer], box[closer]
         hidden[rows] |= (np.abs(pixel[rows] - middle[box]) <= half[box]).all(axis=1)
     return hidden

@@ -10,6 +10,7 @@ from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
 from objslam.core.types import Detections, Keyframes, Log, Rays, label_table
+from objslam.frontend.parts import PARTS, parts_of_boxes
 from objslam.frontend.surface_ranges import half_widths, to_centres
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"
@@ -24,7 +25,8 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     The ledger counts the other boxes. A box is not usable if its score is too low, if its centre is outside the image, or if
     the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
     rays.border is negative or the detections are `whole`. In each frame, the `MAX_OF_LABEL` boxes of a label with the
-    highest scores are used. `Rays.cut` has the boxes that only the image's edge made unusable.
+    highest scores are used. `Rays.cut` has the boxes that only the image's edge made unusable. The boxes of
+    `parts_of_boxes` do not count.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}
@@ -39,7 +41,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         mine = np.flatnonzero(keyframes.camera == index)
         keyframe_of_frame[keyframes.frame[mine]] = mine
         names = np.array([place[n] for n in detections.label_names], dtype=np.int64)
-        boxes = detections.take(keyframe_of_frame[detections.frame] >= 0)
+        boxes = _without_parts(detections.take(keyframe_of_frame[detections.frame] >= 0), camera, settings, ledger)
         measured = boxes.boxes, boxes.scores, boxes.stamps
         kept, directions, angle_sigma = box_rays(*measured, camera, settings, ledger, boxes.whole)
         off = boxes.take(_only_cut(boxes, camera, settings))
@@ -198,6 +200,19 @@ def cut_edges(boxes: Floats, camera: Camera, settings: Settings) -> Bools:
     low, high = boxes[:, :2], boxes[:, 2:]
     border = np.maximum(settings.rays.border, settings.rays.border_share * (high - low))
     return np.concatenate([low <= border, high >= camera.size - 1 - border], axis=1)
+
+
+def _without_parts(boxes: Detections, camera: Camera, settings: Settings, ledger: Ledger) -> Detections:
+    """Return the boxes without those of `parts_of_boxes`. Boxes with a low score are no reason to drop others."""
+    sure = np.flatnonzero(boxes.scores >= settings.rays.min_score)
+    some = boxes.take(sure)
+    cut = np.zeros(len(sure), dtype=bool)
+    if settings.rays.border >= 0 and not boxes.whole:
+        cut = np.asarray(cut_edges(some.boxes, camera, settings).any(axis=1))
+    part = np.zeros(len(boxes), dtype=bool)
+    part[sure] = parts_of_boxes(some.boxes, some.frame, some.label, some.scores, cut)
+    ledger.drop(PARTS, int(part.sum()), _where(camera, boxes.stamps, part), of=len(boxes))
+    return boxes.take(np.flatnonzero(~part)) if part.any() else boxes
 
 
 def _only_cut(boxes: Detections, camera: Camera, settings: Settings) -> Ints:

@@ -37,7 +37,7 @@ def relocalize(
     held = np.where((estimate.weight > 0) & np.isfinite(position[:, 0])[association.object], association.object, -1)
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, rays.sigma, 0.0)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, cut=rays.cut)
     history = detection_history(obs, held[ray], np.nan_to_num(position), association.label, view)
     rate = history.seen / np.maximum(history.expected, 1)
     found = most_likely_path(keyframes, rays, estimate.map_T_base, position, association.label, rate)

@@ -21,7 +21,10 @@ from objslam.association.existence import (
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.association.observations import extents, observe, overlap
-from objslam.association.visibility import CameraFrames, DetectionHistory, _hidden, detection_history
+from objslam.association.refinement import refine
+from objslam.association.visibility import CameraFrames, DetectionHistory, _hidden, detection_history, frames_of
+from objslam.config import Settings
+from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Association
 from objslam.simulation import DriveSettings, make_camera
@@ -120,7 +123,7 @@ def test_boxes_hide_alike_in_frames_of_few_and_of_many():
     middle, half = (s.box[:, :2] + s.box[:, 2:]) / 2, 0.3 * (s.box[:, 2:] - s.box[:, :2])
     closer = reach < (away - np.maximum(0.3, 0.1 * away))[:, None]
     over = closer & (np.abs(pixel[:, None] - middle) <= half).all(axis=2) & (s.frame == place[:, None])
-    np.testing.assert_array_equal(_hidden(place, away, pixel, s, reach), over.any(axis=1))
+    np.testing.assert_array_equal(_hidden(place, away, pixel, s, reach, np.zeros(240)), over.any(axis=1))
     assert 20 < over.any(axis=1).sum() < 220
 
 
@@ -171,6 +174,64 @@ def test_where_rates_differ_a_low_one_is_no_proof():
     assert (rates.log_odds(counted(seen, expected), label) > 0).all()
     assert isinstance(rates, Rates)
     assert rates.concentration <= 5
+
+
+def test_a_thing_that_one_visit_of_two_shows_is_no_phantom():
+    """All other things are seen in 19 of 20 frames, one in half of them, and phantoms in a tenth."""
+    seen, expected = np.array([57, 58, 56, 57, 59, 30, 6, 5]), np.full(8, 60)
+    label = np.zeros(8, dtype=np.int64)
+    rates = detection_rates(counted(seen, expected), label, 1)
+    odds = rates.log_odds(counted(seen, expected), label)
+    assert (odds[:5] > 10).all()
+    assert odds[5] > -np.log(3.0)  # a box of a class without strays has prior odds of 3
+    assert (odds[6:] < -3).all()
+    mean, sum_ = rates.mean[0], rates.concentration
+    usual = betabinom.pmf(seen, expected, sum_ * mean, sum_ * (1 - mean))
+    rarer = betabinom.pmf(seen, expected, 12 * 0.6 * mean, 12 * (1 - 0.6 * mean))
+    phantom = betabinom.pmf(seen, expected, 1.0, 8 / mean - 1)
+    np.testing.assert_allclose(odds, np.log((0.95 * usual + 0.05 * rarer) / phantom))
+
+
+def test_a_cut_off_box_of_the_label_is_no_miss():
+    scene = watch(np.array([[2.0, 0.0, 0.3], [2.0, 0.6, 0.3]]), straight())
+    state = state_of(scene)
+    frame, matched = state.obs.frame, np.where(state.obs.frame < 60, state.matched, -1)
+    history = detection_history(state.obs, matched, scene.points, scene.label, state.view)
+    missed = np.flatnonzero((history.object == 0) & ~history.detected)
+    assert len(missed) >= 8
+    shown = np.flatnonzero((state.matched == 0) & np.isin(frame, history.frame[missed]))
+    box, of = state.obs.box[shown] - [40, 0, 0, 0], frame[shown]
+    for label, left in ((scene.label[0], 0), (scene.label[0] + 7, len(missed))):
+        cut = CutBoxes(np.zeros(len(of), dtype=np.int64), of, np.full(len(of), label), box)
+        again = detection_history(state.obs, matched, scene.points, scene.label, replace(state.view, cut=cut))
+        assert ((again.object == 0) & ~again.detected).sum() == left
+        assert again.seen[0] == history.seen[0]
+
+
+def test_cut_off_boxes_find_their_frames():
+    scene, rng = watch(np.array([[2.0, 0.0, 0.3]]), straight()), np.random.default_rng(0)
+    keyframes, order = scene.keyframes, rng.permutation(len(scene.keyframes))
+    frame = rng.integers(0, 200, 50)
+    cut = CutBoxes(np.zeros(50, dtype=np.int64), frame, np.arange(50), np.zeros((50, 4)))
+    found = frames_of(keyframes, order, scene.cameras, keyframes.map_T_camera, Settings(), cut=cut).cut
+    assert found is not None
+    assert (np.diff(found.frame) >= 0).all()
+    want = {(int(np.flatnonzero(keyframes.frame[order] == f)[0]), i) for i, f in enumerate(frame) if f in keyframes.frame}
+    assert 0 < len(want) < 50
+    assert set(zip(found.frame.tolist(), found.label.tolist(), strict=True)) == want
+
+
+def test_small_things_hide_each_other_where_large_ones_do_not():
+    """A thing 0.15 m in front, at 1 m: it is in front if both are 0.1 m large, and may be beside it if they are 0.3 m."""
+    scene = watch(np.array([[1.0, 0.0, 0.3]]), straight(1))
+    near = rays_of_boxes(
+        np.zeros(1, dtype=int), np.array([[270.0, 190, 370, 290]]), np.zeros(1, dtype=int), scene.cameras[0], ("cup",)
+    )
+    s, _, _ = observe(near, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, near.sigma, 0.0)
+    at, pixel = np.zeros(1, dtype=np.int64), np.array([[320.0, 240.0]])
+    for size, hides in ((0.1, True), (0.3, False), (0.0, False)):
+        sized = replace(s, size=np.full((1, 2), 0.1 / 0.85))
+        assert _hidden(at, np.ones(1), pixel, sized, np.array([0.85]), np.full(1, size))[0] == hides
 
 
 def test_more_rays_and_fewer_strays_are_less_like_chance():
@@ -232,6 +293,32 @@ def test_what_moves_is_told_from_what_rests():
     # It is 2.04 m from the axis of the tilt, and lifted by 0.6 m, which is two standard deviations of a tilt of 0.147 rad.
     assert on_a_path_that_tilts(0.155) == 0.0
     assert on_a_path_that_tilts(0.135) < -5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_lasting_errors_of_poses_are_no_motion(seed):
+    """The poses of two visits err by 2 cm each, as the settings say, and all rays of a visit share the error."""
+    rng, count = np.random.default_rng(seed), 60
+    side, angle = np.linspace(-0.6, 0.6, count // 2), rng.uniform(0.8, 1.6)
+    one = np.column_stack([np.zeros(count // 2), side, np.zeros(count // 2)])
+    other = np.column_stack([2 - 1.5 * np.cos(angle) - side * np.sin(angle), -1.5 * np.sin(angle) + side * np.cos(angle)])
+    poses = lift_se2(np.vstack([one, np.column_stack([other, np.full(count // 2, angle)])]))
+    scene = watch(np.array([[2.0, 0.0, 0.4]]), poses, seed=seed)
+    state = state_of(scene)
+    visit = (state.obs.frame >= count // 2).astype(int)
+    assert min(np.bincount(visit)) > 10
+    shift = rng.normal(scale=0.02, size=(2, 3))
+    obs = replace(state.obs, origin=state.obs.origin + shift[visit], position_sigma=0.02)
+    ray = np.arange(len(obs))
+    at = refine(obs, ray, np.zeros(len(ray), dtype=np.int64), scene.points, np.ones(1))
+    small = replace(obs, size=obs.size * 0.05)  # Its own size allows no motion.
+    still = replace(state, obs=small, landmarks=replace(state.landmarks, position=at))
+    assert rest_odds(still)[0] >= 0
+    walks = 0.5 * shift[0] / np.linalg.norm(shift[0]) * np.linspace(0, 1, len(ray))[:, None]
+    moved = replace(small, origin=obs.origin + walks * [0, 1, 1])
+    there = refine(moved, ray, np.zeros(len(ray), dtype=np.int64), scene.points, np.ones(1))
+    moving = replace(state, obs=moved, landmarks=replace(state.landmarks, position=there))
+    assert rest_odds(moving)[0] < 0
 
 
 def scene_to(scene, obs):

@@ -169,7 +169,9 @@ def test_every_unusable_box_is_counted_once():
 def test_the_border_grows_with_the_box(border, share, kept):
     # 100 px wide boxes that end 50, 4 and 0 px short of the right edge, whose last pixel is 639
     boxes = np.array([[489.0, 200, 589, 240], [535, 200, 635, 240], [539, 200, 639, 240]])
-    rays, _ = rays_of(log_of(seen(lens("plumb_bob"), boxes)), rays={"border": border, "border_share": share})
+    rays, _ = rays_of(
+        log_of(seen(lens("plumb_bob"), boxes, frame=[0, 1, 2])), rays={"border": border, "border_share": share}
+    )
     assert rays.track_id.tolist() == kept
     np.testing.assert_array_equal(rays.cut.box, boxes[[] if border < 0 else [i for i in range(3) if i not in kept]])
 
@@ -177,7 +179,8 @@ def test_the_border_grows_with_the_box(border, share, kept):
 def test_of_a_label_in_a_frame_the_surest_thousand_are_looked_at():
     rng = np.random.default_rng(0)
     count = np.array([1200, 30, 1000, 1100])  # cups, then books in the first frame, cups in the second, books in the third
-    boxes = boxes_of(rng.uniform(50, 400, (count.sum(), 2)))
+    places = np.stack(np.meshgrid(*2 * [np.arange(50.0, 400.0, 10.0)]), axis=-1).reshape(-1, 2)  # 1225 places, not nested
+    boxes = boxes_of(np.concatenate([rng.permutation(places)[:n] for n in count]))
     labels, frame, scores = np.repeat([1, 0, 1, 0], count), np.repeat([0, 0, 1, 2], count), rng.uniform(size=count.sum())
     log = log_of(seen(lens("plumb_bob"), boxes, frame=frame, labels=labels, names=("book", "cup"), scores=scores))
     rays, ledger = rays_of(log)

@@ -190,6 +190,49 @@ def test_boxes_of_another_label_on_an_object():
     assert len(on) + len(pairs) == len(result.doubts) == 1
 
 
+def test_a_lost_thing_is_not_excused_by_a_neighbour_that_has_boxes_of_its_own():
+    """A ball 12 cm from a cup, within the gate of the cup's rays, is in no object. The frames show both."""
+    placed = (("cup", (1.5, -0.06, 0.4)), ("ball", (1.5, 0.06, 0.4)), ("ball", (1.5, 1.3, 0.4)))
+    log = simulate(pair(0.12, placed=placed, pixel_sigma=2.0, missed=0.1), 0)
+    exact = LEAN.localization.model_copy(update={"xy": 0.003, "yaw": 0.002})
+    settings = LEAN.model_copy(update={"rays": LEAN.rays.model_copy(update={"pixel_sigma": 4.0}), "localization": exact})
+    result = mapped(log, settings)
+    ball = min((o for o in result.map.objects if o.label == "ball"), key=lambda o: abs(o.position[1]))
+    j, mine = result.map.objects.index(ball), result.association.object
+    found = only(reassociated(result, np.where(mine == j, -1, mine - (mine > j))))
+    assert (found.kind, found.reason, found.label) == ("boxes", "unclear", "ball")
+    assert found.position == pytest.approx([1.5, 0.06, 0.4], abs=0.02)
+    assert len(found.rays) > 0.9 * (mine == j).sum()
+
+
+def test_the_verdict_says_where_boxes_of_a_thing_are_that_the_map_lacks():
+    """One of ten mugs is lost, whose boxes are fewer than a tenth of the boxes of its label."""
+    places = [(x, y, 0.4) for y in (1.2, -1.2) for x in (-2.4, -1.2, 0.0, 1.2, 2.4)]
+    log = simulate(preset("rooms", objects=0, placed=tuple(("mug", p) for p in places), false=0.0, missed=0.1), 0)
+    result = mapped(log)
+    number = np.bincount(result.association.object[result.association.object >= 0])
+    j = int(np.argsort(number)[3])
+    assert len(number) == 10
+    assert number[j] < 0.1 * len(result.rays)
+    mine = result.association.object
+    lacking = reassociated(result, np.where(mine == j, -1, mine - (mine > j)))
+    assessment = lacking.summary["assessment"]
+    (reason,) = [one for one in assessment["reasons"] if "fit no object" in one]
+    assert assessment["level"] == "check"
+    x, y, z = (float(v) for v in reason.split("(")[1].split(")")[0].split(","))
+    assert np.linalg.norm(np.array([x, y, z]) - result.map.objects[j].position) < 0.05
+
+
+def test_why_an_object_has_no_position_is_one_reason():
+    result = mapped(simulate(preset("rooms", false=0.0), 3))
+    o = replace(result.map.objects[0], parallax_deg=8.0, rays=9)
+    for rms, said, other in ((0.2, "sigma exceeds", "disagree"), (5.0, "disagree", "sigma exceeds")):
+        objects = [replace(o, rms_deg=rms), *result.map.objects[1:]]
+        told = words.why_unresolved(replace(result, map=replace(result.map, objects=tuple(objects))), 0)
+        assert said in told
+        assert other not in told
+
+
 def test_an_object_whose_boxes_have_two_sizes():
     """A third of its boxes are of a thing that is half as large."""
     log = simulate(preset("rooms", false=0.0, tracks="perfect"), 4)

@@ -163,7 +163,7 @@ def _few(
     `position_sigma` and `flat_scale`."""
     obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, *noise)
     positions = flattened_points(positions, obs.scale)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings)
+    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, cut=rays.cut)
     known = np.isfinite(positions).all(axis=1)
     labels = len(rays.label_names)
     held = Landmarks.new(positions[known], np.ones(known.sum()), association.label[known], labels)
@@ -285,7 +285,9 @@ class _Few:
         every = self.joined(found)
         rates = detection_rates(every.history, every.label, len(every.unassigned))
         odds = chance_odds(every, self.gate, self.strays, rates) + _alike_odds(every)
-        return np.asarray(logistic(static_odds(every, fitted=_MOVING)) * logistic(_POWER * odds))[self.known.count :]
+        return np.asarray(logistic(static_odds(every, self.gate, fitted=_MOVING)) * logistic(_POWER * odds))[
+            self.known.count :
+        ]
 
     def joined(self, found: State) -> State:
         """Return the known landmarks, followed by the new ones."""

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.association.gating import gated_edges
-from objslam.core.arrays import Ints
+from objslam.association.observations import overlap
+from objslam.core.arrays import Bools, Ints
 from objslam.mapping.doubts.chance import LEAST_LOG_ODDS, crowded
 from objslam.mapping.doubts.evidence import Evidence
 
@@ -17,10 +18,17 @@ _FEWEST = 5
 _AROUND = 9.0
 """The surroundings of an object end at this multiple of its gate, a squared deviation. They show how many boxes lie on it by
 chance. A larger multiple gives a surer estimate, of a larger area."""
+_SAME = 0.5
+"""The least intersection over union of two boxes in one frame that show one thing. With a larger overlap, fewer boxes lie on
+an object."""
 
 
 def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
-    """Yield landmarks and the rays without an object that lie on them. left: (M,) the rays without an object."""
+    """Yield landmarks and the rays without an object that lie on them. left: (M,) the rays without an object.
+
+    A ray does not lie on a landmark that has a box of its own elsewhere in the image: it shows a neighbour. If most rays of
+    a label at a landmark do so, the others show this neighbour too.
+    """
     state, gate = evidence.state, evidence.gate
     if not state.count or not len(left):
         return
@@ -34,5 +42,22 @@ def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
     pairs, group = np.unique(key, return_inverse=True)
     around, number = np.bincount(group, minlength=len(pairs)), np.bincount(group[inside], minlength=len(pairs))
     odds = crowded(number, around, 1 / _AROUND, max(len(pairs), 1))
-    for one in np.flatnonzero((number >= _FEWEST) & (odds > LEAST_LOG_ODDS)):
-        yield int(pairs[one] // labels), ray[(group == one) & inside]
+    elsewhere = _elsewhere(evidence, ray, landmark) & inside
+    beside = 2 * np.bincount(group[elsewhere], minlength=len(pairs)) > number
+    for one in np.flatnonzero((number >= _FEWEST) & (odds > LEAST_LOG_ODDS) & ~beside):
+        yield int(pairs[one] // labels), ray[(group == one) & inside & ~elsewhere]
+
+
+def _elsewhere(evidence: Evidence, ray: Ints, landmark: Ints) -> Bools:
+    """Return whether each landmark (E,) has a box in the frame of a ray (E,) that shows another thing than the ray's box."""
+    state = evidence.state
+    obs, frames = state.obs, len(state.view.camera)
+    own = np.lexsort((obs.frame[state.assigned], state.owner))
+    key = state.owner[own] * frames + obs.frame[state.assigned][own]
+    wanted = landmark * frames + obs.frame[ray]
+    at = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
+    found = np.flatnonzero(key[at] == wanted) if len(key) else np.zeros(0, dtype=np.int64)
+    elsewhere = np.zeros(len(ray), dtype=bool)
+    theirs = obs.box[state.assigned[own[at[found]]]]
+    elsewhere[found] = overlap(obs.box[ray[found]], theirs) < _SAME
+    return elsewhere

@@ -66,7 +66,7 @@ def evidence_of(result: RunResult) -> Evidence:
     number[known] = np.arange(len(known))
     matched = number[result.association.object[ray]]
     label = result.association.label[known]
-    view = frames_of(frames, order, result.cameras, poses, settings)
+    view = frames_of(frames, order, result.cameras, poses, settings, cut=rays.cut)
     state = State(obs, view, Landmarks.new(position[known], np.ones(len(known)), label, labels), matched)
     state = replace(state, landmarks=replace(state.landmarks, noise=state.noise))
     gate = gate_limit(settings.association.gate)

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from objslam.core.arrays import Floats
 from objslam.core.result import DOUBT_KINDS, Doubt, RunResult
+from objslam.core.statistics import grouped_median
 from objslam.mapping.doubts import cut_things as cut_off
 from objslam.mapping.doubts import disagreeing as apart
 from objslam.mapping.doubts import unsure as wide
@@ -18,20 +20,23 @@ from objslam.mapping.doubts.sizes import mixed_sizes
 from objslam.mapping.doubts.splits import Splits, find_splits
 from objslam.mapping.doubts.twice import find_twice
 from objslam.mapping.doubts.unmapped import in_assessment, unmapped_labels
-from objslam.mapping.doubts.words import in_words
+from objslam.mapping.doubts.words import in_place, in_words
 
 _DOUBLE = 0.5
 """A pair of objects counts in the assessment if it is one object with at least this probability. With a larger value, more
 maps are good."""
 
 
-_LOST = 0.1
-"""A group of boxes that became no object counts in the assessment if it has at least this share of the boxes of its label. A
-detector's false boxes of one kind at one place are rarer. With a larger share, more maps are good."""
+_LOST = (0.1, 0.5)
+"""A group of boxes that became no object counts in the assessment if it has at least the first share of the boxes of its
+label, or the second share of the boxes of an object of its label (median). A detector's false boxes of one kind at one place
+are rarer. With larger shares, more maps are good."""
 _FEWEST_LOST = 5
 """The fewest boxes of such a group. With a larger number, more maps are good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
 """The reasons of groups whose boxes agree on one place at rest, and more closely than by chance."""
+_MOVED: tuple[Reason, ...] = ("moves",)
+"""The reasons of groups whose thing seems to move. The assessment names them, but a map may lack what moves."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,8 @@ def with_doubts(result: RunResult) -> RunResult:
 
     A map is not called good in six cases: some objects are more likely doubles than not, a place is in the map twice, the
     rays of an object do not agree on one thing, an object has many sizes, most objects have a wide sigma, or many boxes of a
-    label meet where the map has no object. A label without an object is named, and so is a thing with cut off boxes only,
-    but the boxes may be false, so the level stays.
+    label meet where the map has no object. A label without an object is named, and so are a thing with cut off boxes only
+    and a thing that seems to move. Their boxes may be false, and no map has what moves, so the level stays.
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)
@@ -80,7 +85,7 @@ def with_doubts(result: RunResult) -> RunResult:
         doubled = [*([twice.in_words()] if twice else []), *apart.in_assessment(disagreeing), *_of_mixed(len(mixed))]
         doubled += _of_doubles(doubles)
         assessment = _assessed(summary["assessment"], doubled, lost)
-        named += [*in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
+        named += [*_of_moved_things(found.groups, result), *in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *named]}
     return replace(result, doubts=doubts, summary=summary)
 
@@ -120,15 +125,34 @@ def _of_doubles(doubles: int) -> list[str]:
 def _of_lost_things(groups: BoxGroups, result: RunResult) -> list[str]:
     """Return a reason for each label with a lost thing: many boxes of the label meet in one place, but the map has no object
     there."""
+    return [
+        f"{told} fit no object, but meet in one place near {in_place(place)}: a thing may be missing (`objslam explain`)."
+        for told, place in _large_groups(groups, result, _PLACED)
+    ]
+
+
+def _of_moved_things(groups: BoxGroups, result: RunResult) -> list[str]:
+    """Return a reason for each label with a thing that seems to move, of which the map has no object."""
+    return [
+        f"{told} fit no object, and the thing near {in_place(place)} seems to move (`objslam explain`)."
+        for told, place in _large_groups(groups, result, _MOVED)
+    ]
+
+
+def _large_groups(groups: BoxGroups, result: RunResult, reasons: tuple[Reason, ...]) -> list[tuple[str, Floats]]:
+    """Return in words how many boxes of its label each group with one of the reasons has, and its place (3,), if these are
+    many."""
     if not len(groups):
         return []
     labels = result.rays.label_names
     every = np.bincount(result.rays.label, minlength=len(labels))
     number = np.bincount(groups.group, minlength=len(groups))
-    placed = np.isin(groups.reason, [REASONS.index(reason) for reason in _PLACED])
-    lost = placed & (number >= np.maximum(_FEWEST_LOST, _LOST * every[groups.label]))
+    wanted = np.isin(groups.reason, [REASONS.index(reason) for reason in reasons])
+    held = np.bincount(result.association.object[result.association.object >= 0], minlength=result.association.count)
+    usual = grouped_median(held.astype(np.float64), result.association.label, len(labels))
+    least = np.fmin(_LOST[0] * every, _LOST[1] * usual)  # A label without an object has no usual number.
+    large = wanted & (number >= np.maximum(_FEWEST_LOST, least[groups.label]))
     return [
-        f"{number[g]} of {every[groups.label[g]]} boxes of {labels[groups.label[g]]!r} fit no object, but meet in one "
-        "place: a thing may be missing, and `objslam explain` says where."
-        for g in np.flatnonzero(lost)
+        (f"{number[g]} of {every[groups.label[g]]} boxes of {labels[groups.label[g]]!r}", groups.position[g])
+        for g in np.flatnonzero(large).tolist()
     ]

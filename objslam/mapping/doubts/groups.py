@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from objslam.association.existence import chance_odds, detection_rates, prior_odds, rest_odds, size_odds
+from objslam.association.existence import chance_odds, detection_rates, prior_odds, rarer_objects, rest_odds, size_odds
 from objslam.association.refinement import velocity_gain
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
@@ -138,8 +138,10 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
     state = as_landmarks(evidence, points)
     obs, label = state.obs, state.label[known:]
     rates = detection_rates(state.history, state.label, len(state.unassigned))
+    rarer = rarer_objects(state, rates, evidence.gate)
+    by_rate = rates.log_odds(state.history, state.label, rarer) + prior_odds(state)
     odds: dict[Reason, Floats] = {
-        "rare": (rates.log_odds(state.history, state.label) + prior_odds(state))[known:],
+        "rare": by_rate[known:],
         "size": size_odds(state)[known:],
         "moves": rest_odds(state)[known:],
     }

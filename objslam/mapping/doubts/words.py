@@ -6,14 +6,19 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from objslam.config import Triangulation
+from objslam.association.observations import MIN_DEPTH
 from objslam.core.arrays import Floats, Ints
 from objslam.core.object_map import MapObject
 from objslam.core.result import Doubt, RunResult
+from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.mapping.doubts.groups import REASONS, BoxGroups
 from objslam.mapping.doubts.pairs import Pairs
 from objslam.mapping.doubts.splits import Splits
 
+_CLOSE = np.log(20.0)  # Log odds below this are called close. With larger odds, more are.
+_DISAGREE = 2.0
+"""The rays of an object disagree if they pass it at more than this multiple of their noise (root mean square). With a larger
+number, fewer objects are said to have rays that disagree."""
 _BESIDE = 0.5
 """A sentence names the nearest object up to this distance (m), if the object has the label of the boxes. An object of
 another label is named within its own size. A larger distance names more objects."""
@@ -25,15 +30,29 @@ def in_words(result: RunResult, pairs: Pairs, splits: Splits, groups: BoxGroups)
     return (*_pairs(result, pairs), *_splits(result, splits), *unresolved, *_groups(result, groups))
 
 
-def why_unresolved(o: MapObject, limits: Triangulation) -> str:
-    """Return why an object has no position, with the limit from the settings."""
+def why_unresolved(result: RunResult, j: int) -> str:
+    """Return why an object j has no position, with the limit from the settings."""
+    o, limits = result.map.objects[j], result.settings.triangulation
     if o.rays < 2:
         return "a single ray gives a direction and no distance"
     if o.parallax_deg < limits.min_parallax_deg:
         least = f"triangulation.min_parallax_deg {limits.min_parallax_deg:g}"
         return f"its {o.rays} rays span {o.parallax_deg:.1f} deg ({least})"
-    most = f"{limits.max_rel_sigma:g} of its distance (triangulation.max_rel_sigma)"
-    return f"its {o.rays} rays disagree, or its sigma exceeds {most}"
+    noise = _noise_deg(result, j)
+    if o.rms_deg > _DISAGREE * noise:
+        return f"its {o.rays} rays disagree: they pass it {o.rms_deg:.2g} deg apart, where their noise is {noise:.2g} deg"
+    most = f"its sigma exceeds {limits.max_rel_sigma:g} of its distance (triangulation.max_rel_sigma)"
+    return f"its {o.rays} rays span {o.parallax_deg:.1f} deg, too little for their noise of {noise:.2g} deg: {most}"
+
+
+def _noise_deg(result: RunResult, j: int) -> float:
+    """Return the median standard deviation of the rays of an object, with that of their poses, deg."""
+    mine = np.flatnonzero(result.association.object == j)
+    sigma, place = result.rays.sigma, 0.0
+    if result.settings.mode == "fixed":
+        sigma, place = pose_noise(result.rays, result.keyframes, result.settings)
+    away = np.linalg.norm(result.origins[mine] - result.map.objects[j].position, axis=1)
+    return float(np.degrees(np.median(np.hypot(sigma[mine], place / np.maximum(away, MIN_DEPTH)))))
 
 
 def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:
@@ -89,7 +108,7 @@ def _unresolved(result: RunResult, j: int) -> Doubt:
         "unresolved",
         why,
         o.label,
-        f"{_name(o)} has no position: {why_unresolved(o, result.settings.triangulation)}.",
+        f"{_name(o)} has no position: {why_unresolved(result, j)}.",
         (o.id,),
         o.position if np.isfinite(o.position).all() else None,
         np.flatnonzero(result.association.object == j),
@@ -184,7 +203,8 @@ def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> s
             return ": as many rays of other boxes of this label would meet there by chance"
         case _:
             odds = f"{np.exp(np.abs(groups.odds[g])):.1f} to 1 {'for' if groups.odds[g] > 0 else 'against'}"
-            return f": their rays meet within {miss}, and the odds of an object are close, {odds}"
+            odds = f"{'close, ' if abs(groups.odds[g]) < _CLOSE else ''}{odds}"
+            return f": their rays meet within {miss}, and the odds of an object are {odds}"
 
 
 def _frames(count: int) -> str:

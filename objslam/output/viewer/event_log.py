@@ -65,7 +65,7 @@ def drive_events(result: RunResult) -> list[Event]:
     for j, (o, name) in enumerate(zip(result.map.objects, captions(result.map), strict=True)):
         add(o.first_seen, "INFO", f"{name}: first seen")
         if o.status != "ok":
-            add(o.last_seen, "WARN", f"{name}: unresolved, {why_unresolved(o, result.settings.triangulation)}")
+            add(o.last_seen, "WARN", f"{name}: unresolved, {why_unresolved(result, j)}")
             continue
         if np.isfinite(enough[j]):
             limit = result.settings.triangulation.min_parallax_deg
