@@ -74,7 +74,7 @@ class SizedRays:
 
 
 def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return the solution with the errors that boxes share added to its covariances.
+    """Return the solution with the errors that boxes share added to its covariances, also to those of hidden bodies.
 
     The centres of an object's boxes have one offset that is equal from all sides, and one for each side. Both are a share of
     the object's size. `rays.box_sigma` is the prior standard deviation of this share. The share is estimated from the rays
@@ -98,9 +98,16 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     )
     map_T_camera = estimate.map_T_base @ solution.keyframes.base_T_camera
     sizes = extents(solution.rays, solution.association, estimate.positions, map_T_camera, solution.keyframes, cameras)
-    covariance = estimate.covariance.copy()
+    covariance, bodies = estimate.covariance.copy(), list(solution.bodies or ())
     for j, sides in seen.items():
-        covariance[j] += offset_covariance(sides, sizes[j], share)
+        offset = offset_covariance(sides, sizes[j], share)
+        covariance[j] += offset
+        body = bodies[j] if bodies else None
+        if body is not None and body.behind:  # Its centre comes from the edges that are visible, so from few of them.
+            wider = body.covariance.copy()
+            wider[:3, :3] += offset
+            bodies[j] = replace(body, covariance=wider)
+    solution = replace(solution, bodies=tuple(bodies)) if bodies else solution
     return replace(solution, estimate=replace(estimate, covariance=covariance, box_offset=share))
 
 

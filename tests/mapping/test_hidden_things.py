@@ -104,6 +104,28 @@ def test_hidden_boxes_make_a_position_by_rays_less_sure():
     assert with_hidden_parts(clear, cameras) is clear
 
 
+def test_a_body_behind_things_has_the_errors_that_its_boxes_share():
+    log, found = hiding_drive(0, frames=200), []
+    given = pipeline.with_box_offsets
+
+    def noted(solution, cameras, settings):
+        found.append((solution, given(solution, cameras, settings)))
+        return found[-1][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pipeline, "with_box_offsets", noted)
+        pipeline.run(log, SETTINGS, Ledger())
+    before, after = found[-1]
+    wider = {
+        j: np.trace((after.bodies[j].covariance - body.covariance)[:3, :3])
+        for j, body in enumerate(before.bodies)
+        if body is not None
+    }
+    behind = {j for j in wider if before.bodies[j].behind}
+    assert behind
+    assert behind == {j for j, more in wider.items() if more > 0}
+
+
 def test_a_shift_turns_rays_and_makes_them_noisier():
     count, flat = 4, np.zeros(4)
     ahead = np.tile([0.0, 0.0, 1.0], (count, 1))

@@ -16,6 +16,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.errors import LogError, SolveError
+from objslam.frontend.parts import PARTS
 from objslam.mapping import pipeline
 from objslam.simulation import DepthNoise, make_camera, pair, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
@@ -42,7 +43,9 @@ def test_a_crowd_of_one_label_does_no_harm(mode):
     log, ledger = small_log(), Ledger()
     crowd = crowded(log, np.arange(0, 80, 8), 10_000)
     result = run(crowd, mode, ledger=ledger)
-    assert ledger.dropped["boxes beyond the 1000 surest of their label in a frame"] == 10 * 9000
+    beyond = ledger.dropped["boxes beyond the 1000 surest of their label in a frame"]
+    assert beyond + ledger.dropped[PARTS] == 10 * 9000  # A few boxes lie on others, as a second box of one thing does.
+    assert beyond > 10 * 8990
     assert worst_error(replace(result, map=ObjectMap(tuple(o for o in result.map.objects if o.label != "leaf"))), log) < 0.05
 
 

@@ -43,11 +43,13 @@ def turned(body: Body, rotation: Floats) -> Body:
 @dataclass(frozen=True)
 class PlacedBody:
     """A body in a map. centre: (3,) m, None if the position from the object's rays is as good or better. covariance: (7, 7)
-    of the centre, the size and the yaw."""
+    of the centre, the size and the yaw. behind: whether things hide parts of many of its boxes. The centre is then the
+    position."""
 
     body: Body
     centre: Floats | None
     covariance: Floats
+    behind: bool = False
 
 
 def surer_body(a: Body | None, b: Body | None) -> Body | None:

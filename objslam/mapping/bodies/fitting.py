@@ -69,12 +69,13 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     # A box that the image's edge cuts off is here only if the settings or the detector say that it is whole.
     at_border = views.border.reshape(-1, 2, 2).sum(axis=1)
     found = replace(found, hidden=np.maximum(found.hidden - at_border, 0))
-    clear = _shifts_clearly(found, views)
+    clear, behind = _shifts_clearly(found, views), _behind_things(found, views)
     bodies: list[PlacedBody | None] = [None] * solution.association.count
     extra = _beyond_rays(solution, settings, views)
     for at, j in enumerate(views.objects.tolist()):
         if found.shape[at]:
-            bodies[j] = _body(found, at, extra[at], clear=bool(clear[at]))
+            body = _body(found, at, extra[at], clear=bool(clear[at] or behind[at]))
+            bodies[j] = replace(body, behind=bool(behind[at]))
     to_centre = CentreShift(np.zeros((len(solution.rays), 3)), np.zeros(len(solution.rays)))
     to_centre.direction[views.ray] = np.einsum("bji,bj->bi", boxes.poses[:, :3, :3], found.to_centre)
     to_centre.sigma[views.ray] = _noise_of_hidden(found, boxes)
@@ -141,9 +142,13 @@ def _shifts_clearly(found: Bodies, views: _Views) -> Bools:
     edges = views.boxes.edges()
     shared = found.share[0] * edges.size / 2 * edges.turn.mean(axis=1)
     ratio = np.linalg.norm(found.to_centre, axis=1) / np.maximum(shared, 1e-12)
+    return np.asarray(grouped_median(ratio, views.boxes.body, len(views.objects)) > _CLEAR)
+
+
+def _behind_things(found: Bodies, views: _Views) -> Bools:
+    """Return whether things hide parts of many boxes of each body (n,), so that its centre is the better position."""
     body, number = views.boxes.body, len(views.objects)
-    hidden = np.bincount(body, found.hidden.any(axis=1), number) > _HIDDEN * np.bincount(body, minlength=number)
-    return np.asarray(hidden | (grouped_median(ratio, body, number) > _CLEAR))
+    return np.asarray(np.bincount(body, found.hidden.any(axis=1), number) > _HIDDEN * np.bincount(body, minlength=number))
 
 
 def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:

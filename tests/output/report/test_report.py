@@ -24,7 +24,7 @@ from objslam.config import Settings
 from objslam.core.bodies.body import UNKNOWN_YAW, Body
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
-from objslam.core.result import Doubt
+from objslam.core.result import DOUBT_KINDS, Doubt
 from objslam.errors import OutputError
 from objslam.evaluation.evaluate import evaluate
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
@@ -98,6 +98,16 @@ def evil_result(tmp_path: Path) -> Path:
     summary = {**result.summary, "warnings": [evil], "dropped": {evil: 3}, "dropped_examples": {evil: [evil]}, "log": evil}
     write_result(dataclasses.replace(result, summary=summary), tmp_path / "out", truth)
     return write_report(tmp_path / "out")
+
+
+def test_the_page_has_words_for_each_kind_of_doubt(tmp_path):
+    result, truth = synthetic_result(*clusters(), keyframes=40)
+    doubts = tuple(
+        Doubt(kind, "why", "cup", f"the {kind} doubt", (), None, np.zeros(0, dtype=np.int64), {}) for kind in DOUBT_KINDS
+    )
+    write_result(replace(result, doubts=doubts), tmp_path / "out", truth)
+    page = write_report(tmp_path / "out").read_text()
+    assert all(f"the {kind} doubt" in page for kind in DOUBT_KINDS)
 
 
 def test_text_of_others_is_text(tmp_path: Path) -> None:
