@@ -102,9 +102,8 @@ def evil_result(tmp_path: Path) -> Path:
 
 def test_the_page_has_words_for_each_kind_of_doubt(tmp_path):
     result, truth = synthetic_result(*clusters(), keyframes=40)
-    doubts = tuple(
-        Doubt(kind, "why", "cup", f"the {kind} doubt", (), None, np.zeros(0, dtype=np.int64), {}) for kind in DOUBT_KINDS
-    )
+    pair, nothing = tuple(o.id for o in result.map.objects[:2]), np.zeros(0, dtype=np.int64)
+    doubts = tuple(Doubt(kind, "why", "cup", f"the {kind} doubt", pair, None, nothing, {}) for kind in DOUBT_KINDS)
     write_result(replace(result, doubts=doubts), tmp_path / "out", truth)
     page = write_report(tmp_path / "out").read_text()
     assert all(f"the {kind} doubt" in page for kind in DOUBT_KINDS)
