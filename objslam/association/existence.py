@@ -125,8 +125,11 @@ def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
     """Return which landmarks (N,) may be objects that are detected more rarely than their class.
 
     The rays of a phantom belong to other things. So a landmark whose rays also pass other landmarks within the gate (a
-    squared deviation) must be detected as often as its class.
+    squared deviation) must be detected as often as its class. From odometry alone, all landmarks must: where the path is
+    wrong, the rays of a known thing miss it, meet elsewhere, and only misses refute what they meet in.
     """
+    if not state.view.localized:
+        return np.zeros(state.count, dtype=bool)
     rarer = np.ones(state.count, dtype=bool)
     usual = rates.log_odds(state.history, state.label, False)
     asked = usual + prior_odds(state) < 0

@@ -42,6 +42,7 @@ class CameraFrames:
     (F, 4, 4). A box counts if it is at least `margin` px, and at least `margin_share` of its size, away from the image edge.
     With a negative margin, each box counts. drift: (F, 6, 6) as in `Keyframes`, None if the poses do not drift. cut: the
     boxes in these frames that the image's edge cuts off, None if unknown. Their `frame` is the index of an observed frame.
+    localized: whether a localisation gives the poses, so that the robot comes back to the same place in the map.
     """
 
     stamps: Floats
@@ -52,6 +53,7 @@ class CameraFrames:
     margin_share: float
     drift: Floats | None = None
     cut: CutBoxes | None = None
+    localized: bool = True
 
     @cached_property
     def solid_angle(self) -> float:
@@ -79,7 +81,8 @@ def frames_of(
     drift = keyframes.drift[order] if drifts and keyframes.drift is not None else None
     camera, frame = keyframes.camera[order], keyframes.frame[order]
     cut = None if cut is None else _in_frames(cut, camera, frame)
-    return CameraFrames(keyframes.stamps[order], cameras, camera, poses, *margins, drift, cut)
+    localized = keyframes.localized_every > 0
+    return CameraFrames(keyframes.stamps[order], cameras, camera, poses, *margins, drift, cut, localized)
 
 
 def _in_frames(cut: CutBoxes, camera: Ints, frame: Ints) -> CutBoxes:

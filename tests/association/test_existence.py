@@ -15,8 +15,10 @@ from objslam.association.existence import (
     detection_rates,
     existence,
     prior_odds,
+    rarer_objects,
     rest_odds,
     size_odds,
+    static_odds,
 )
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.nearest_neighbour import associate_by_label
@@ -190,6 +192,19 @@ def test_a_thing_that_one_visit_of_two_shows_is_no_phantom():
     rarer = betabinom.pmf(seen, expected, 12 * 0.6 * mean, 12 * (1 - 0.6 * mean))
     phantom = betabinom.pmf(seen, expected, 1.0, 8 / mean - 1)
     np.testing.assert_allclose(odds, np.log((0.95 * usual + 0.05 * rarer) / phantom))
+
+
+def test_from_odometry_alone_half_of_the_boxes_are_too_few():
+    """Where the path is wrong, the rays of a known thing meet beside it, and pass no other object."""
+    scene = watch(np.array([[2.0, 0.0, 0.3], [2.0, 0.6, 0.3]]), straight())
+    whole = state_of(scene)
+    often = np.where((whole.matched == 0) & (whole.obs.frame % 3 > 0), -1, whole.matched)
+    state = replace(whole, matched=often)
+    rates = Rates(np.full(2, 0.95), 50.0)
+    at_odometry = replace(state, view=replace(state.view, localized=False))
+    assert rarer_objects(state, rates, 9.0).tolist() == [True, True]
+    assert not rarer_objects(at_odometry, rates, 9.0).any()
+    assert static_odds(state, 9.0)[0] > static_odds(at_odometry, 9.0)[0]
 
 
 def test_a_cut_off_box_of_the_label_is_no_miss():
