@@ -3,15 +3,20 @@
 import numpy as np
 import pytest
 
-from objslam.core.bodies.covered_edges import covered_edges, covered_shares, pairs_in_images
+from objslam.core.bodies import covered_edges
+from objslam.core.bodies.covered_edges import covered_shares, pairs_in_images
 
 
-def test_pairs_are_all_pairs_of_an_image():
+@pytest.mark.parametrize("at_once", [1, 7, 1000])
+def test_pairs_are_all_pairs_of_an_image(at_once, monkeypatch):
+    monkeypatch.setattr(covered_edges, "_PAIRS_AT_ONCE", at_once)
     image = np.random.default_rng(0).integers(0, 6, 25)
-    first, second = pairs_in_images(image)
-    found = sorted(zip(first.tolist(), second.tolist(), strict=True))
+    blocks = list(pairs_in_images(image))
+    found = sorted(pair for block in blocks for pair in zip(*(part.tolist() for part in block), strict=True))
     assert found == [(i, j) for i in range(25) for j in range(25) if i != j and image[i] == image[j]]
-    assert all(len(part) == 0 for part in pairs_in_images(np.zeros(0, dtype=int)))
+    assert max(len(first) for first, _ in blocks) <= 2 * (at_once + 24)
+    assert not list(pairs_in_images(np.zeros(0, dtype=int)))
+    assert not list(pairs_in_images(np.arange(5)))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -55,5 +60,3 @@ def test_two_boxes_together_cover_an_edge():
     box, noise = np.tile([10.0, 10, 50, 90], (2, 1)), np.full(2, 2.0)
     front = np.array([[50.0, 0, 90, 30], [50.0, 60, 90, 99]])  # They cover 20 and 30 px of the right edge.
     np.testing.assert_allclose(covered_shares(box, front, noise)[:, 2], [20 / 80, 30 / 80])
-    assert covered_edges(box, front, noise, np.array([0, 0]), 1, 0.6).tolist() == [[False, False, True, False]]
-    assert not covered_edges(box, front, noise, np.array([0, 0]), 1, 0.63).any()

@@ -6,24 +6,33 @@ the visible part ends at the box of the thing in front, or inside its nearer hal
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import pairwise
+
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Floats, Ints
 
 _INSIDE = 0.5
 """A thing in front leaves less than this share of the other box inside its own box. With more, the other thing is in front,
 or the two boxes are of one thing. A larger share finds more hidden edges, and more that are not."""
+_PAIRS_AT_ONCE = 1 << 18
+"""About the most pairs of boxes that are compared at once. A larger number needs more memory: 100 bytes a pair."""
 
 
-def pairs_in_images(image: Ints) -> tuple[Ints, Ints]:
-    """Return the ordered pairs (P,) and (P,) of different boxes of one image. image: (B,) of each box."""
+def pairs_in_images(image: Ints) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the ordered pairs (P,) and (P,) of different boxes of one image, some at a time. image: (B,) of each box."""
     order = np.argsort(image, kind="stable")
     end = np.searchsorted(image[order], image[order], side="right")
     left = end - np.arange(len(image)) - 1  # The number of later boxes of the image.
-    first = np.repeat(np.arange(len(image)), left)
-    step = np.arange(len(first)) - np.repeat(np.cumsum(left) - left, left) + 1
-    one, other = order[first], order[first + step]
-    return np.concatenate([one, other]), np.concatenate([other, one])
+    total = np.cumsum(left)
+    blocks = np.searchsorted(total, np.arange(0, int(left.sum()), _PAIRS_AT_ONCE), side="right")
+    for begin, stop in pairwise([*np.unique(blocks).tolist(), len(image)]):
+        number = left[begin:stop]
+        first = np.repeat(np.arange(begin, stop), number)
+        step = np.arange(len(first)) - np.repeat(np.cumsum(number) - number, number) + 1
+        one, other = order[first], order[first + step]
+        yield np.concatenate([one, other]), np.concatenate([other, one])
 
 
 def covered_shares(box: Floats, front: Floats, noise: Floats) -> Floats:
@@ -41,13 +50,3 @@ def covered_shares(box: Floats, front: Floats, noise: Floats) -> Floats:
     along = (shared / length)[:, ::-1]
     beside = (shared / length).prod(axis=1, keepdims=True) < _INSIDE
     return np.concatenate([along * ends_low, along * ends_high], axis=1) * beside
-
-
-def covered_edges(box: Floats, front: Floats, noise: Floats, of: Ints, count: int, least: float) -> Bools:
-    """Return the edges (count, 4) of boxes of which boxes in front cover more than a share `least` together.
-
-    box, front, noise: (P, 4), (P, 4) and (P,) of pairs, as in `covered_shares`. of: (P,) the number of the box of each pair.
-    """
-    total = np.zeros((count, 4))
-    np.add.at(total, of, covered_shares(box, front, noise))
-    return total > least

@@ -13,7 +13,7 @@ import numpy as np
 from objslam.association.observations import extents
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.bodies.covered_edges import covered_edges, pairs_in_images
+from objslam.core.bodies.covered_edges import covered_shares, pairs_in_images
 from objslam.core.camera import Camera
 from objslam.mapping.bodies.cut_boxes import clipped, keyframe_of
 from objslam.mapping.solution import Solution
@@ -56,15 +56,18 @@ def edges_behind_boxes(
     wanted = np.zeros(len(box), dtype=bool)
     wanted[ray] = True
     used = np.flatnonzero((image >= 0) & (box[:, 2:] > box[:, :2]).all(axis=1))
-    behind, front = (used[part] for part in pairs_in_images(image[used]))
-    margin = _NEARER * np.nan_to_num(wide[behind] + wide[front])
-    # A comparison with an unknown distance is false.
-    may = wanted[behind] & ~(away[front] > away[behind] - margin)
-    behind, front = behind[may], front[may]
-    size = np.sqrt((box[:, 2:] - box[:, :2]).prod(axis=1))
+    size = np.sqrt(np.maximum(box[:, 2:] - box[:, :2], 0.0).prod(axis=1))
     variance = 2 * (settings.rays.pixel_sigma**2 + (settings.rays.box_sigma * size) ** 2)
-    alike = _ALIKE * np.sqrt(variance[behind] + variance[front])
-    return covered_edges(box[behind], box[front], alike, behind, len(box), _COVERED)[ray]
+    covered = np.zeros((len(box), 4))
+    for pair in pairs_in_images(image[used]):
+        behind, front = (used[part] for part in pair)
+        margin = _NEARER * np.nan_to_num(wide[behind] + wide[front])
+        # A comparison with an unknown distance is false.
+        may = wanted[behind] & ~(away[front] > away[behind] - margin)
+        behind, front = behind[may], front[may]
+        alike = _ALIKE * np.sqrt(variance[behind] + variance[front])
+        np.add.at(covered, behind, covered_shares(box[behind], box[front], alike))
+    return covered[ray] > _COVERED
 
 
 def with_hidden_parts(solution: Solution, cameras: tuple[Camera, ...]) -> Solution:
