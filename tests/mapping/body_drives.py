@@ -16,6 +16,17 @@ FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.8], [0, 0, 0, 1]
 """A camera that looks ahead, 0.8 m above the floor."""
 
 
+def drifting_odometry(true: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+    """The poses (K, 4, 4) as wheels tell them, with the noise of the settings."""
+    steps = inverse(true[:-1]) @ true[1:]
+    far = np.sqrt(np.linalg.norm(steps[:, :2, 3], axis=1))[:, None]
+    steps = steps @ lift_se2(far * [0.02, 0.005, 0.02] * rng.standard_normal((len(steps), 3)))
+    odometry = [true[0]]
+    for step in steps:
+        odometry.append(odometry[-1] @ step)
+    return odometry
+
+
 def drive(seed, frames=200, objects=8, short=None, laps=1):
     """Laps on an ellipse inside a ring of objects of 0.7 to 1.6 m, with boxes of 2 px noise and drifting odometry.
 
@@ -28,12 +39,7 @@ def drive(seed, frames=200, objects=8, short=None, laps=1):
     place = np.column_stack([2.5 * np.cos(turn), 2.0 * np.sin(turn)])
     yaw = np.unwrap(np.arctan2(*np.gradient(place, axis=0).T[::-1])) + 0.5 * np.sin(5 * turn)
     true, stamps = lift_se2(np.column_stack([place, yaw])), 0.2 * np.arange(frames)
-    steps = inverse(true[:-1]) @ true[1:]
-    far = np.sqrt(np.linalg.norm(steps[:, :2, 3], axis=1))[:, None]
-    steps = steps @ lift_se2(far * [0.02, 0.005, 0.02] * rng.standard_normal((frames - 1, 3)))
-    odometry = [true[0]]
-    for step in steps:
-        odometry.append(odometry[-1] @ step)
+    odometry = drifting_odometry(true, rng)
     around, reach = np.linspace(0, 2 * np.pi, objects, endpoint=False) + 0.2, rng.uniform(4.0, 4.8, objects)
     half = np.exp(rng.uniform(np.log(0.35), np.log(0.8), (objects, 3)))
     centre = np.column_stack([reach * np.cos(around), 0.85 * reach * np.sin(around), half[:, 2]])

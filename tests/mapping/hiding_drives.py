@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from mapping.body_drives import FORWARD
+from mapping.body_drives import FORWARD, drifting_odometry
 
 from objslam.core.camera import Camera
-from objslam.core.geometry import inverse, lift_se2
+from objslam.core.geometry import lift_se2
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 
 CAMERA = Camera("front", 640, 480, np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]]), base_T_camera=FORWARD)
@@ -174,12 +174,7 @@ def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, n
     yaw = np.unwrap(np.arctan2(*np.gradient(place, axis=0).T[::-1])) - 0.7 + 0.7 * np.sin(3.5 * turn)
     stamps, plane = 0.2 * np.arange(frames), np.column_stack([place, yaw])
     true = lift_se2(plane)
-    steps = inverse(true[:-1]) @ true[1:]
-    far = np.sqrt(np.linalg.norm(steps[:, :2, 3], axis=1))[:, None]
-    steps = steps @ lift_se2(far * [0.02, 0.005, 0.02] * rng.standard_normal((frames - 1, 3)))
-    odometry = [true[0]]
-    for step in steps:
-        odometry.append(odometry[-1] @ step)
+    odometry = drifting_odometry(true, rng)
     localised = lift_se2(plane + [0.01, 0.01, 0.0035] * rng.standard_normal((frames, 3)))
     found = [
         (k, *one)
