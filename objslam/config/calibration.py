@@ -23,6 +23,10 @@ class CalibrationSettings(Section):
     turn_bias: NotNegative = 0.003
     """rad/s; the turn rate that the odometry adds at all times. At 0.3 m/s, a wheel that is 0.3 % larger than the other adds
     0.003 rad/s if the wheels are 0.3 m apart. A gyroscope without calibration adds as much."""
+    turn_slip: NotNegative = 0.02
+    """m per rad; the distance by which the odometry is too long for each radian of turning. A robot with tracks or four
+    driven wheels slips in curves, and an odometry that takes the speed of the outer wheel is too long by half the track. In
+    a sharp curve of 1 m radius, 0.02 is 2 % of the distance."""
     clock: NotNegative = 0.1
     """s; the offset of each camera's clock against the clock of the poses."""
     max_clock: Positive = 0.5

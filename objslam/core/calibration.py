@@ -26,7 +26,17 @@ MOST_SCALE = 0.5
 """The largest absolute value of a share. A larger bound lets a solve shrink lengths towards zero. An error of more than half
 means a wrong unit, and a calibration should not hide that."""
 
-UNITS = {"clock": "s", "turn_bias": "rad/s", "yaw": "rad", "tilt": "rad", "roll": "rad", "x": "m", "y": "m", "z": "m"}
+UNITS = {
+    "clock": "s",
+    "turn_bias": "rad/s",
+    "turn_slip": "m/rad",
+    "yaw": "rad",
+    "tilt": "rad",
+    "roll": "rad",
+    "x": "m",
+    "y": "m",
+    "z": "m",
+}
 """The unit of each kind of parameter. A kind that is not in this table is a share without a unit."""
 
 

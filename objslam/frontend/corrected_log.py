@@ -1,6 +1,7 @@
 """Correct known shared errors in a log, or in one part of it: odometry, cameras, directions, or stamps of frames."""
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property, lru_cache
@@ -15,7 +16,7 @@ from objslam.frontend.odometry_bridge import OdometryBridge
 from objslam.frontend.odometry_drift import DriftPath, PlanarSteps
 from objslam.frontend.recent_values import RecentValues
 
-ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias")
+ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias", "odometry.turn_slip")
 """The errors of odometry."""
 AXES = ("roll", "tilt", "yaw")
 """The rotations of a camera on the robot, about the axes x, y and z of base."""
@@ -29,8 +30,14 @@ us."""
 _LEVEL = 1e-6
 """The largest tilt (rad) and change of height (m) of a path whose drift is computed in the plane. A path with more takes
 longer, and is exact. A larger value neglects more of a tilt."""
+_CURVE = 0.5
+"""The time (s) over which the curvature of a path is measured. Over a longer time, short curves count less. Over a shorter
+time, the jitter of the headings of fast odometry looks like curves."""
+_STANDS = 1e-6
+"""A shorter way (m) within `_CURVE` counts as this: the robot stands or turns on the spot. It only avoids a division by
+zero."""
 _KEPT = 3
-"""For how many turn scales and biases the corrected path is kept. The derivatives by the other errors need no new path. A
+"""For how many turn scales, biases and slips the corrected path is kept. The derivatives by the other errors need no new path. A
 larger number takes more memory."""
 
 
@@ -71,6 +78,21 @@ class CorrectablePath:
         self._moved = RecentValues[tuple[Floats, Floats]](_KEPT)
 
     @cached_property
+    def _curvature(self) -> Floats:
+        """(N-1,) rad/m, how sharply the path turns in each step.
+
+        It is of the time `_CURVE` around the middle of the step, so the jitter of headings does not look like curves.
+        """
+        middle, seconds = (self._seconds[1:] + self._seconds[:-1]) / 2, self._seconds
+        travel = self.odometry.travel
+        way = np.append(0.0, np.cumsum(np.hypot(*self._ways[:2]) if travel is None else travel[1:, 0]))
+        turned, driven = (
+            np.interp(middle + _CURVE / 2, seconds, total) - np.interp(middle - _CURVE / 2, seconds, total)
+            for total in (self._turned, way)
+        )
+        return np.asarray(np.abs(turned) / np.maximum(driven, _STANDS))
+
+    @cached_property
     def bridge(self) -> OdometryBridge:
         """How far the path may be from the interpolated path. The errors hardly change this."""
         return OdometryBridge.of(self.odometry)
@@ -79,19 +101,20 @@ class CorrectablePath:
         """Return the corrected path, as `corrected_odometry` does."""
         travel = self.odometry.travel
         if travel is not None:
-            scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+            scale, turn_scale, turn_bias, slip = (error.get(name, 0.0) for name in ODOMETRY)
             bias = turn_bias * np.diff(self._seconds, prepend=0.0)
             turn = (1 + turn_scale) * travel[:, 2] + bias
-            travel = np.stack([(1 + scale) * travel[:, 0], np.abs(1 + turn_scale) * travel[:, 1], turn], axis=1)
+            longer = (1 + scale) * np.append(1.0, gripping(slip, self._curvature))
+            travel = np.stack([longer * travel[:, 0], np.abs(1 + turn_scale) * travel[:, 1], turn], axis=1)
         return Trajectory(self.odometry.stamps, self.poses(error), travel)
 
     def poses(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
         """Return the corrected poses (n, 4, 4) with the indices `which`, or all poses, as `corrected_odometry` does."""
-        scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+        scale, turn_scale, turn_bias, slip = (error.get(name, 0.0) for name in ODOMETRY)
         poses = self.odometry.poses if which is None else self.odometry.poses[which]
-        if scale == turn_scale == turn_bias == 0:
+        if scale == turn_scale == turn_bias == slip == 0:
             return poses
-        more, places = self._headings_and_places(turn_scale, turn_bias)
+        more, places = self._headings_and_places(turn_scale, turn_bias, slip)
         places = places if which is None else places[:, which]
         places = self.odometry.poses[0, :3, 3, None] + (1 + scale) * places
         more = more if which is None else more[which]
@@ -104,16 +127,16 @@ class CorrectablePath:
 
     def drift(self, error: Mapping[str, float]) -> DriftPath:
         """Return the steps of the corrected path, from which its drift is computed."""
-        scale, turn_scale, turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+        scale, turn_scale, turn_bias, slip = (error.get(name, 0.0) for name in ODOMETRY)
         if self._heading is None or self.odometry.travel is not None:
             return DriftPath.of(self.path(error))
-        more, (x, y, _) = self._headings_and_places(turn_scale, turn_bias)
+        more, (x, y, _) = self._headings_and_places(turn_scale, turn_bias, slip)
         heading, (begin, *_) = self._heading + more - self._heading[0], self._heading
         c, s = (1 + scale) * np.cos(begin), (1 + scale) * np.sin(begin)
         steps = PlanarSteps.between(np.cos(heading), np.sin(heading), c * x + s * y, c * y - s * x)
         return DriftPath(None, self.odometry.stamps, steps.sums())
 
-    def _headings_and_places(self, turn_scale: float, turn_bias: float) -> tuple[Floats, Floats]:
+    def _headings_and_places(self, turn_scale: float, turn_bias: float, slip: float) -> tuple[Floats, Floats]:
         """Return by how much (N,), rad, the errors turn each pose, and the places (3, N), m, seen from the first pose.
 
         The scale is not in the places, because it only multiplies them.
@@ -123,12 +146,20 @@ class CorrectablePath:
             more = turn_scale * self._turned + turn_bias * self._seconds
             middle = (more[1:] + more[:-1]) / 2  # The chord of an arc points along the mean of the two headings at its ends.
             cos, sin = np.cos(middle), np.sin(middle)
-            x, y, z = self._ways
+            x, y, z = self._ways if slip == 0 else self._ways * gripping(slip, self._curvature)
             places = np.zeros((3, len(more)))
             places[0, 1:], places[1, 1:], places[2, 1:] = cos * x - sin * y, sin * x + cos * y, z
             return more, np.cumsum(places, axis=1, out=places)
 
-        return self._moved.get((turn_scale, turn_bias), compute)
+        return self._moved.get((turn_scale, turn_bias, slip), compute)
+
+
+def gripping(slip: float, curvature: Floats) -> Floats:
+    """Return the ratio (...) of the true length of steps to the length in the odometry, from 0 to 2.
+
+    slip: m by which a length is too long for each radian of turning. curvature: (...) rad/m of the path, positive.
+    """
+    return np.asarray(np.clip(1 - slip * curvature, 0.0, 2.0))
 
 
 class OdometryCorrection:
@@ -145,7 +176,8 @@ class OdometryCorrection:
 
         said, corrected: the path so far, as the robot sent it and after the correction. None at the start of a path.
         """
-        self._scale, self._turn_scale, self._turn_bias = (error.get(name, 0.0) for name in ODOMETRY)
+        self._scale, self._turn_scale, self._turn_bias, self._slip = (error.get(name, 0.0) for name in ODOMETRY)
+        self._recent: deque[tuple[float, float, float]] = deque([(-math.inf, 0.0, 0.0)])
         self._stamp: float | None = None
         self._before = np.eye(4)
         self._place = 0.0, 0.0, 0.0
@@ -158,7 +190,7 @@ class OdometryCorrection:
 
     def correct(self, stamp: float, pose: Floats) -> Floats:
         """Return the next pose (4, 4), corrected. stamp: s."""
-        if self._scale == self._turn_scale == self._turn_bias == 0:
+        if self._scale == self._turn_scale == self._turn_bias == self._slip == 0:
             return pose
         if self._stamp is None:
             self._stamp, self._before, self._place = stamp, pose, _place_of(pose)
@@ -169,7 +201,8 @@ class OdometryCorrection:
         else:
             turn = float(rotation_vector(pose[:3, :3] @ self._before[:3, :3].T)[2])
         more = self._turn_scale * turn + self._turn_bias * (stamp - self._stamp)
-        middle, longer = self._turned + more / 2, 1 + self._scale  # as in `CorrectablePath`
+        middle = self._turned + more / 2  # as in `CorrectablePath`
+        longer = (1 + self._scale) * self._grip(stamp, turn, math.hypot(x, y))
         c, s, (px, py, pz) = longer * math.cos(middle), longer * math.sin(middle), self._place
         self._place = px, py, pz = px + c * x - s * y, py + s * x + c * y, pz + longer * z
         self._turned += more
@@ -184,6 +217,21 @@ class OdometryCorrection:
                 [0.0, 0.0, 0.0, 1.0],
             ]
         )
+
+    def _grip(self, stamp: float, turn: float, way: float) -> float:
+        """Return what `gripping` does for the step that ends at a stamp, s. turn: rad. way: m.
+
+        The curvature is of the last `_CURVE` seconds, because the steps to come are unknown.
+        """
+        if self._slip == 0:
+            return 1.0
+        _, turned, driven = self._recent[-1]
+        self._recent.append((stamp, turned + turn, driven + way))
+        while len(self._recent) > 2 and self._recent[1][0] <= stamp - _CURVE:
+            self._recent.popleft()
+        (_, turned, driven), (_, turned_now, driven_now) = self._recent[0], self._recent[-1]
+        curvature = abs(turned_now - turned) / max(driven_now - driven, _STANDS)
+        return min(max(1 - self._slip * curvature, 0.0), 2.0)
 
 
 def corrected_mount(base_T_camera: Floats, error: Mapping[str, float], name: str) -> Floats:

@@ -30,6 +30,7 @@ from objslam.simulation.shared_errors import add_shared_errors
 ERRORS = {
     "odometry.scale": -0.03,
     "odometry.turn_scale": 0.05,
+    "odometry.turn_slip": 0.04,
     "front.clock": 0.12,
     "front.roll": 0.015,
     "front.tilt": -0.02,
@@ -114,6 +115,21 @@ def test_the_errors_of_a_log_are_found(ranged):
     assert np.median(made.object_errors(found.positions, align)) < 0.7 * np.median(
         made.object_errors(plain.positions, align)
     )
+
+
+@pytest.mark.parametrize("ranged", [True, False])
+def test_slip_in_curves_is_told_apart_from_the_scale(ranged):
+    """The odometry is too long in curves alone. Without a correction, the slip bends the map and makes it larger."""
+    slip, name = {"odometry.turn_slip": 0.06}, "odometry.turn_slip"
+    changes = {"depth": DepthNoise() if ranged else None, "frames": 600, "laps": 4.0}
+    made, errors = drive(slip, overrides=("calibration.turn_slip=0.05",), **changes)
+    found, held = solve(made, errors), solve(*drive(slip, overrides=("calibration.turn_slip=0",), **changes))
+    value, sigma = (dict(zip(errors.names, one, strict=True)) for one in (found.calibration.values, found.calibration.sigma))
+    assert abs(value[name] - slip[name]) < 3 * sigma[name]
+    assert value[name] > 4 * sigma[name]
+    off, bent = (np.median(made.object_errors(one.positions, "sim2")) for one in (found, held))
+    assert off < 0.7 * bent
+    assert abs(made.scale(found.positions) - 1) < 0.5 * abs(made.scale(held.positions) - 1)
 
 
 def test_what_bearings_do_not_tell_stays_at_its_prior_and_widens_the_map():

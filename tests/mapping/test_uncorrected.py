@@ -15,7 +15,7 @@ from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 
-_HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "range_scale"))
+_HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "turn_slip", "range_scale"))
 _ANGLES = ("yaw", "tilt", "roll")
 
 
