@@ -73,17 +73,19 @@ def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> 
     solved = system.normal.solve(select)
     off = off - solved.T @ (system.jacobian.T @ system.residual)
     covariance = select.T @ solved
+    shared = np.zeros_like(covariance)
     if len(theta):
         left = system.left(system.sides)
         told = np.linalg.inv(left.T @ left + np.linalg.inv(errors.prior))
         by_error = solved.T @ (system.jacobian.T @ system.sides)
-        covariance = covariance + by_error @ told @ by_error.T
+        shared = by_error @ told @ by_error.T
     stamps, every = keyframes.stamps, keyframes.localized_every
     usual = errors.settings.model_copy(update={"localization": type(nominal)()}).localization
     use = errors.settings.noise.localization
     return ComparedPoses(
         off=off,
         covariance=(covariance + covariance.T) / 2,
+        shared=(shared + shared.T) / 2,
         times=stamps[poses],
         apart=every * float(np.median(np.diff(stamps))) if every > 1 else 0.0,
         nominal=(nominal.yaw, nominal.xy),

@@ -69,14 +69,16 @@ class PoseErrors:
 class ComparedPoses:
     """n poses of the localisation against their prediction.
 
-    off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction. times:
-    (n,) s. apart: s, the time between two poses that were measured independently, 0 if all were. nominal: of headings, rad,
-    and places, m. free: whether the size of the noise is unknown. prior: the weight of the noise of the prediction, as a
-    number of residuals.
+    off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction by its
+    noise. shared: (3 n, 3 n) the same by the shared errors, which are as large as their priors with any noise. times: (n,)
+    s. apart: s, the time between two poses that were measured independently, 0 if all were. nominal: of headings, rad, and
+    places, m. free: whether the size of the noise is unknown. prior: the weight of the noise of the prediction, as a number
+    of residuals.
     """
 
     off: Floats
     covariance: Floats
+    shared: Floats
     times: Floats
     apart: float
     nominal: tuple[float, float]
@@ -87,7 +89,10 @@ class ComparedPoses:
         """Return the data of some poses."""
         n = len(self.times)
         at = np.concatenate([poses, n + poses, 2 * n + poses])
-        return replace(self, off=self.off[at], covariance=self.covariance[np.ix_(at, at)], times=self.times[poses])
+        some = np.ix_(at, at)
+        return replace(
+            self, off=self.off[at], covariance=self.covariance[some], shared=self.shared[some], times=self.times[poses]
+        )
 
     @cached_property
     def gaps(self) -> Floats:
@@ -106,7 +111,7 @@ class ComparedPoses:
 
     def expected(self, model: PoseErrors) -> Floats:
         """Return the covariance (3 n, 3 n) of `off`."""
-        n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance
+        n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance + self.shared
         for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
             variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
             own = variance * (1 - lasting.share) * self.white
