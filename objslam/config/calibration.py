@@ -42,6 +42,9 @@ class CalibrationSettings(Section):
     0.02 in joint mode with odometry beside it, and 0 in joint mode with odometry alone."""
     range_scale: NotNegative = 0.01
     """share by which all ranges are too long or too short."""
+    range_offset: NotNegative = 0.05
+    """m by which all ranges are too short, along the optical axis. The zero of a depth sensor and the place of its camera,
+    which was measured with a ruler, both err. It is estimated in joint mode only."""
     surface: NotNegative = 0.3
     """share of half their width by which the centres of all things of a log are farther behind their visible surfaces than
     depth.centre says. It is estimated in joint mode only."""

@@ -30,6 +30,7 @@ UNITS = {
     "clock": "s",
     "turn_bias": "rad/s",
     "turn_slip": "m/rad",
+    "range_offset": "m",
     "yaw": "rad",
     "tilt": "rad",
     "roll": "rad",

@@ -37,8 +37,8 @@ _STANDS = 1e-6
 """A shorter way (m) within `_CURVE` counts as this: the robot stands or turns on the spot. It only avoids a division by
 zero."""
 _KEPT = 3
-"""For how many turn scales, biases and slips the corrected path is kept. The derivatives by the other errors need no new path. A
-larger number takes more memory."""
+"""For how many turn scales, biases and slips the corrected path is kept. The derivatives by the other errors need no new
+path. A larger number takes more memory."""
 
 
 def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:
@@ -304,7 +304,7 @@ def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajector
     camera, name = one.camera, one.camera.name
     clock, (focal, cx, cy) = error.get(f"{name}.clock", 0.0), lens_errors(error, name)
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    longer = 1 + error.get("range_scale", 0.0)
+    longer, farther = 1 + error.get("range_scale", 0.0), error.get("range_offset", 0.0)
     corrected = replace(
         camera,
         base_T_camera=corrected_mount(camera.base_T_camera, error, name),
@@ -317,7 +317,7 @@ def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajector
 
     found = one.detections
     if found is not None:
-        found = replace(found, frame_stamps=later(found.frame_stamps, clock, path), depths=found.depths * longer)
+        found = replace(found, frame_stamps=later(found.frame_stamps, clock, path), depths=found.depths * longer + farther)
     mount = None if one.mount is None else Trajectory(one.mount.stamps, corrected_mount(one.mount.poses, error, name))
     return CameraLog(corrected, found, moved(one.rgb), moved(one.depth), mount)
 

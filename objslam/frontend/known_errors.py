@@ -30,6 +30,8 @@ errs less. With a larger value, a log must show more before an error counts as k
 COARSE = 0.3
 """Fixed poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
+OF_LENGTHS = ("range_scale", "range_offset", "surface", "tag_scale")
+"""The errors of measured lengths."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
 
 
@@ -37,7 +39,7 @@ def error_names(log: Log) -> tuple[str, ...]:
     """Return the names of all errors that the measurements of a log can share."""
     odometry = () if log.odometry is None else ODOMETRY
     cameras = tuple(f"{one.camera.name}.{name}" for one in log.cameras for name in _CAMERA)
-    return (*odometry, *cameras, "range_scale", "surface", "tag_scale")
+    return (*odometry, *cameras, *OF_LENGTHS)
 
 
 def usual_place(log: Log, settings: Settings) -> float:
@@ -59,7 +61,7 @@ def prior_sigma(name: str, settings: Settings, place: float) -> float:
     wrong association fit. place: what `usual_place` returns for the log.
     """
     what, fixed = kind(name), settings.mode == "fixed"
-    if fixed and (name in ODOMETRY or what in ("range_scale", "surface", "tag_scale")):
+    if fixed and (name in ODOMETRY or what in OF_LENGTHS):
         return 0.0
     setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
     sigma = getattr(settings.calibration, setting)
@@ -111,8 +113,8 @@ def has_sized_tags(rays: Rays, settings: Settings) -> bool:
 def measured_lengths(rays: Rays, half: Floats, settings: Settings) -> dict[str, bool]:
     """Return by the name of each error of lengths whether any ray has it. half: (R,) as `surface_ranges.half_widths`."""
     ranged = np.isfinite(rays.range)
-    surfaces = bool((ranged & (half > 0)).any())
-    return {"range_scale": bool(ranged.any()), "surface": surfaces, "tag_scale": has_sized_tags(rays, settings)}
+    some, surfaces = bool(ranged.any()), bool((ranged & (half > 0)).any())
+    return dict(zip(OF_LENGTHS, (some, some, surfaces, has_sized_tags(rays, settings)), strict=True))
 
 
 def known_errors(settings: Settings) -> Calibration | None:

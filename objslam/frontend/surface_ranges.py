@@ -47,6 +47,20 @@ def range_factors(errors: Mapping[str, float], half: Floats) -> Floats:
     return (1 + errors.get("range_scale", 0.0)) * to_centres(half, errors.get("surface", 0.0))
 
 
+def corrected_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floats, factors: Floats) -> Floats:
+    """Return ranges (R,), m, corrected for the shared errors.
+
+    direction: (R, 3) unit, in the camera frame. The offset is along the optical axis. factors: as `range_factors`.
+    """
+    offset = errors.get("range_offset", 0.0)
+    return np.maximum(ranges * factors + offset / direction[:, 2], _LEAST * ranges) if offset else ranges * factors
+
+
+def measured_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floats, factors: Floats) -> Floats:
+    """Return ranges (R,), m, as they were before `corrected_ranges`."""
+    return (ranges - errors.get("range_offset", 0.0) / direction[:, 2]) / factors
+
+
 def centre_factors(errors: Mapping[str, float], half: Floats, settings: Settings) -> Floats:
     """Return the ratios (R,) of corrected ranges of centres to those of surfaces. half: as `half_widths`."""
     return to_centres(half, settings.depth.centre) * to_centres(half, errors.get("surface", 0.0))

@@ -48,7 +48,7 @@ _IN_BOTH = 0.4
 halves. The share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean
 simulated logs have 0.63 and more. Logs of two recordings have at most 0.23, even if the solve explains the rays of both."""
 
-_OF_RANGES = ("odometry.scale", "range_scale", "surface")
+_OF_RANGES = ("odometry.scale", "range_scale", "range_offset", "surface")
 """The shared errors that would explain ranges in a wrong scale. A test of this scale must not take them out."""
 
 

@@ -13,9 +13,9 @@ from objslam.core.types import Log, Trajectory
 def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
     """Return the log as it would be with shared errors of these values, named as in `core.calibration.Calibration`.
 
-    Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, odometry.turn_slip, range_scale, and for each CAMERA the names
-    CAMERA.clock, CAMERA.roll, CAMERA.tilt, CAMERA.yaw, CAMERA.focal, CAMERA.cx, CAMERA.cy, CAMERA.x, CAMERA.y and CAMERA.z.
-    The odometry must be planar.
+    Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, odometry.turn_slip, range_scale, range_offset, and
+    for each CAMERA the names CAMERA.clock, CAMERA.roll, CAMERA.tilt, CAMERA.yaw, CAMERA.focal, CAMERA.cx, CAMERA.cy,
+    CAMERA.x, CAMERA.y and CAMERA.z. The odometry must be planar.
     """
     odometry = None if log.odometry is None else _wrong_odometry(log.odometry, errors)
     cameras = []
@@ -33,7 +33,7 @@ def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
             found = replace(
                 found,
                 frame_stamps=found.frame_stamps - errors.get(f"{camera.name}.clock", 0.0),
-                depths=found.depths / (1 + errors.get("range_scale", 0.0)),
+                depths=(found.depths - errors.get("range_offset", 0.0)) / (1 + errors.get("range_scale", 0.0)),
             )
         cameras.append(replace(one, camera=wrong, detections=found))
     return replace(log, odometry=odometry, cameras=tuple(cameras))

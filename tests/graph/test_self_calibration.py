@@ -31,6 +31,7 @@ ERRORS = {
     "odometry.scale": -0.03,
     "odometry.turn_scale": 0.05,
     "odometry.turn_slip": 0.04,
+    "range_offset": -0.06,
     "front.clock": 0.12,
     "front.roll": 0.015,
     "front.tilt": -0.02,

@@ -297,7 +297,13 @@ def test_odometry_that_knows_its_scale_tells_the_error_of_given_sizes(wrong: flo
     settings = load_settings(None, noise)
     drive = make_tag_drive(2, pixel_sigma=0.5, settings=settings)
     given = replace(drive, side={label: wrong * side for label, side in drive.side.items()})
-    overrides = (*noise, "noise.odometry=false", "calibration.scale=0.001", "calibration.tag_scale=0.05")
+    overrides = (
+        *noise,
+        "noise.odometry=false",
+        "calibration.scale=0.001",
+        "calibration.turn_slip=0",
+        "calibration.tag_scale=0.05",
+    )
     result = mapped(drive, settings_for(given, *overrides))
     assert result.calibration is not None
     k = result.calibration.names.index("tag_scale")

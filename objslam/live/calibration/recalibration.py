@@ -9,7 +9,7 @@ from objslam.core.types import Keyframes, Log
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.frontend.surface_ranges import range_factors
+from objslam.frontend.surface_ranges import corrected_ranges, measured_ranges, range_factors
 from objslam.graph.factors.localization import localizations
 from objslam.graph.factors.priors import anchor
 from objslam.live.calibration.collected import as_measured, offline_rays, recorded_log
@@ -79,15 +79,17 @@ def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
     """Correct the rays by the new errors instead of the errors `before`. Return whether any ray may have changed."""
     rays, camera = m.rays, m.keyframes.camera[np.searchsorted(m.keyframes.id, m.rays.keyframe)]
     half = m.half_widths(np.arange(len(rays.number)))
-    longer = range_factors(m.errors, half) / range_factors(before, half)
-    changed = bool((longer != 1).any())
-    rays.range[:] *= longer
-    rays.range_sigma[:] *= longer
+    had_factors, has_factors = range_factors(before, half), range_factors(m.errors, half)
+    measured = measured_ranges(before, rays.range, rays.direction, had_factors)
+    reach = corrected_ranges(m.errors, measured, rays.direction, has_factors)
+    changed = not np.allclose(reach, rays.range, rtol=1e-12, equal_nan=True)
+    rays.range[:] = reach
+    rays.range_sigma[:] *= has_factors / had_factors
     for number, one in enumerate(m.cameras):
         had, has = lens_errors(before, one.name), lens_errors(m.errors, one.name)
         if had != has:
-            measured = refocused(rays.direction, camera == number, inverse_lens(had))
-            rays.direction[:] = refocused(measured, camera == number, has)
+            seen = refocused(rays.direction, camera == number, inverse_lens(had))
+            rays.direction[:] = refocused(seen, camera == number, has)
             changed = True
     return changed
 

@@ -10,7 +10,7 @@ from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, surest
 from objslam.frontend.corrected_log import corrected_camera, corrected_mount, lens_errors, refocused
-from objslam.frontend.surface_ranges import half_widths, range_factors, to_centres
+from objslam.frontend.surface_ranges import corrected_ranges, half_widths, range_factors, to_centres
 from objslam.live.mapper.frame_association import FrameRays
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.records import FrameMessage, HeldMounts, MountMessage
@@ -80,7 +80,7 @@ class BearingExtractor:
         rays = FrameRays(
             direction=refocused(direction, np.ones(len(direction), dtype=bool), lens),
             sigma=sigma,
-            range=reach * longer,
+            range=corrected_ranges(errors, reach, direction, longer),
             range_sigma=range_noise(reach, half, same, [camera], settings)[0] * longer,
             label=label[kept],
             score=frame.scores[kept],

@@ -23,6 +23,7 @@ _CAUSES = {
     "tilt": "is base_T_camera right?",
     "roll": "is base_T_camera right?",
     "range_scale": "is the depth in metres (depth_scale)?",
+    "range_offset": "do the depths start at the camera, and is base_T_camera right?",
     "surface": "do the depths end on the surfaces of the things (depth.centre)?",
     "tag_scale": "is tags.size the side between the corners that the detector reports?",
     "focal": "are the camera matrix and the boxes of the same image size?",

@@ -119,7 +119,9 @@ def shared(
     log: Log, keyframes: Keyframes, rays: Rays, settings: Settings, priors: Mapping[str, float] = _PRIORS
 ) -> SharedErrors:
     """Return the examined errors, as parameters of the measurements. priors: standard deviations (s, rad, share, m)."""
-    fixed = dict.fromkeys(("scale", "turn_scale", "turn_bias", "turn_slip", "range_scale", "tag_scale", "centre"), 0.0)
+    fixed = dict.fromkeys(
+        ("scale", "turn_scale", "turn_bias", "turn_slip", "range_scale", "range_offset", "tag_scale", "centre"), 0.0
+    )
     of = settings.calibration.model_copy(update={**fixed, **priors, "use": True, "file": None})
     wide = settings.model_copy(update={"calibration": of, "mode": "joint"})
     found = shared_errors(log, keyframes, rays, wide)

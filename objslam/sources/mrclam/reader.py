@@ -48,8 +48,8 @@ def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
     """Read one robot of an MRCLAM folder (files .dat or .dat.gz).
 
     Odometry starts at the identity and integrates the velocities. Each stamp with a measurement becomes a frame, even if all
-    its measurements are dropped. Depths are range * cos(bearing), or NaN without `options.with_range`. Labels are
-    landmark_<subject>, or all "landmark" with `options.anonymous`.
+    its measurements are dropped. Depths are the ranges (see `_read_measurements`), or NaN without `options.with_range`.
+    Labels are landmark_<subject>, or all "landmark" with `options.anonymous`.
     The ground truth has the landmark positions (z = 0) and the robot's path.
     Measurements of other robots, of unknown barcodes, and outside the virtual camera's view are dropped and counted.
     Raises LogError if a file is unusable, no robot is chosen, or the folder lacks the robot.
@@ -124,6 +124,13 @@ def _trajectory(stamps: Floats, xy_yaw: Floats) -> Trajectory:
 
 
 def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger: Ledger) -> Detections:
+    """Read the measurements. What the dataset calls a range is a depth along the optical axis.
+
+    The camera measures how high a barcode is in its image, and the height of a thing in an image shows its depth. At the
+    poses of the motion capture, the ranges of five robots of MRCLAM 6 and 7 fall behind the distances of the landmarks as
+    the cosine of the bearing does: by 11 % at 27 degrees. They scatter by 3.4 to 4.5 % as distances, and by 0.8 to 1.6 %
+    as depths.
+    """
     _, barcodes = _read(folder, "Barcodes", 2, ledger, "barcode")
     path, table = _read_forward(folder, f"{prefix}_Measurement", 4, ledger, "measurement")
     subjects = (*ROBOTS, *LANDMARKS)
@@ -141,7 +148,7 @@ def _read_measurements(folder: Path, prefix: str, options: MrclamOptions, ledger
         bad = good & ~fine
         count_drops(reason, int(bad.sum()), (f"{path}:{line}" for line in table.lines[bad]), ledger)
         good &= fine
-    depths = distance * np.cos(bearing) if options.with_range else np.full(len(subject), np.nan)
+    depths = distance if options.with_range else np.full(len(subject), np.nan)
     wrong = good & ~(valid_depths(depths) | np.isnan(depths))
     places = (f"{path}:{line}" for line in table.lines[wrong])
     count_drops("range that is not above zero or too large (taken as unknown)", int(wrong.sum()), places, ledger)
