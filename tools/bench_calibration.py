@@ -33,7 +33,8 @@ from objslam.simulation.shared_errors import add_shared_errors
 
 CHI2_95 = 7.815  # chi-squared, 3 degrees of freedom
 CAMERA = {"front.clock": 0.1, "front.roll": 0.02, "front.tilt": 0.02, "front.yaw": 0.03}
-JOINT = {"odometry.scale": 0.03, "odometry.turn_scale": 0.05, "odometry.turn_bias": 0.003, "range_scale": 0.01, **CAMERA}
+ODOMETRY = {"odometry.scale": 0.03, "odometry.turn_scale": 0.05, "odometry.turn_bias": 0.003, "odometry.turn_slip": 0.02}
+JOINT = {**ODOMETRY, "range_scale": 0.02, "range_offset": 0.05, **CAMERA}
 LENS_AND_PLACE = {"front.focal": 0.02, "front.cx": 0.02, "front.cy": 0.02, "front.x": 0.05, "front.y": 0.05, "front.z": 0.05}
 FIXED = {**CAMERA, **LENS_AND_PLACE}
 UNSEEN = 0.5  # s at the start of a drive without boxes, so that no clock error moves a used frame beyond the odometry

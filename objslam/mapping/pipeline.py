@@ -24,6 +24,7 @@ from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
+from objslam.mapping.checks.depth_axis import check_depth_axis
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
 from objslam.mapping.checks.jumps import taken_out
 from objslam.mapping.checks.misfits import find_misfits, with_misfits
@@ -127,6 +128,10 @@ def run(
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
     used = keyframes, solution.rays, solution.association
+    solved = estimate.map_T_base @ keyframes.base_T_camera
+    if settings.checks.use and (wrong := check_depth_axis(objects, solved, *used)) is not None:
+        diagnosis = diagnosis.with_findings([wrong])
+        say(diagnosis, ledger)
     objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
     objects = widened(objects, *used, estimate.weight, diagnosis)
     where = None
