@@ -113,7 +113,9 @@ def drive(seed: int, frames: int, mode: str, ranged: bool) -> dict[str, Any]:
         "none, calibrated": solved(clean, settings)[1:],
         "none or known, not calibrated": solved(clean, off)[1:],
         "parameters": {
-            name: (abs(one["value"] - errors[name]) / one["sigma"], one["sigma"]) for name, one in parameters.items()
+            name: (abs(one["value"] - errors[name]) / one["sigma"], one["sigma"])
+            for name, one in parameters.items()
+            if name in errors
         },
     }
 
