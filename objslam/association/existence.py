@@ -1,7 +1,7 @@
 """Estimate how likely a landmark is a static object, from detections, misses, stray rays, sizes and motion. A phantom is a
 landmark without an object: rays of different things meet there. A stray ray belongs to no landmark."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,10 +44,10 @@ _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test
 @dataclass(frozen=True)
 class Rates:
     """Beta distributions of the detection rates in each class. mean: (L,) of each class. concentration: the sum of the two
-    parameters of a distribution, the same for all classes."""
+    parameters of a distribution, the same for all classes. With several of them (C, 1), results get a first axis (C,)."""
 
     mean: Floats
-    concentration: float
+    concentration: float | Floats
 
     def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
         """Return -2 ln(p) (N,). p is the probability that an object of a label is detected in `seen` of `expected`
@@ -85,9 +85,9 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rate
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
     boxes = np.bincount(label, seen, labels)
     mean = (boxes * _weighted_median(own, seen, label, labels) + _POOLED_BOXES * overall) / (boxes + _POOLED_BOXES)
-    rates = [Rates(np.clip(mean, *_RATE_LIMITS), concentration) for concentration in _CONCENTRATIONS]
-    likelihood = np.logaddexp(0.0, [rate.log_odds(history, label) for rate in rates]).sum(axis=1)
-    return rates[int(np.argmax(likelihood >= likelihood.max() - _CLEAR_LEAD))]
+    rates = Rates(np.clip(mean, *_RATE_LIMITS), np.array(_CONCENTRATIONS)[:, None])
+    likelihood = np.logaddexp(0.0, rates.log_odds(history, label)).sum(axis=1)
+    return replace(rates, concentration=_CONCENTRATIONS[int(np.argmax(likelihood >= likelihood.max() - _CLEAR_LEAD))])
 
 
 def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: float | Floats) -> Floats:

@@ -25,6 +25,7 @@ def main() -> NoReturn:
 
     atexit.register(gc.freeze)  # At its exit, Python would search all objects once more, which takes 0.08 s after a run.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # Damaged images are counted, and OpenCV need not print them.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # It would search all installed packages for plugins.
     debug = "--debug" in sys.argv
     if sys.argv[1:2] == ["help"]:  # `objslam help run` is what many tools take.
         sys.argv[1:] = [*sys.argv[2:], "--help"]

@@ -197,8 +197,8 @@ def poisson_tail(least: Ints, mean: Floats) -> Floats:
 
 
 def log_beta(a: Floats, b: Floats) -> Floats:
-    """Return the logarithms (N,) of the beta function of positive numbers (N,)."""
-    if len(a) <= _FEW:
+    """Return the logarithms (...) of the beta function of positive numbers (...)."""
+    if a.size <= _FEW:
         return _log_gamma(a) + _log_gamma(b) - _log_gamma(a + b)
     from scipy.special import betaln
 
@@ -206,5 +206,5 @@ def log_beta(a: Floats, b: Floats) -> Floats:
 
 
 def _log_gamma(values: Floats) -> Floats:
-    """Return the logarithms (N,) of the gamma function of few positive numbers (N,)."""
-    return np.array([math.lgamma(value) for value in values.tolist()])
+    """Return the logarithms (...) of the gamma function of few positive numbers (...)."""
+    return np.array([math.lgamma(value) for value in values.ravel().tolist()]).reshape(values.shape)

@@ -120,6 +120,13 @@ def _overlap(log: Log, camera: Ints) -> float:
     return float((shows**2).sum() / shows.sum()) if shows.any() else 1.0
 
 
+def with_mounts(frames: Keyframes, log: Log) -> Keyframes:
+    """Return frames with the camera poses on the robot of another log, which differs from theirs in nothing else. No camera
+    moves on the robot."""
+    mounts = np.array([one.camera.base_T_camera for one in log.cameras])
+    return replace(frames, base_T_camera=mounts[frames.camera], overlap=_overlap(log, frames.camera))
+
+
 def with_given_stamps(frames: Keyframes, log: Log) -> Keyframes:
     """Return frames with their stamps in the log from which they were built. log: before any correction of its clocks."""
     stamps = frames.stamps.copy()

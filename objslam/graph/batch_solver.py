@@ -168,17 +168,18 @@ def solve_joint(
     map_T_camera = keyframes.map_T_camera
     if trace is not None:
         trace.base_T_camera = keyframes.base_T_camera
+    grown = start is None and not keyframes.localized_every
     if start is not None:
         map_T_camera = start[multiframes.first]
         if places is not None and tags is None:  # The corners of fiducials have no known positions.
             positions = places
-    elif not keyframes.localized_every:
+    elif grown:
         map_T_camera, positions = initialize_known(measured, association, progress, trace)
     nothing = np.zeros(len(rays), dtype=bool)
     tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
     rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
     first = measured, association, map_T_camera, positions, nothing, nothing
-    found = reject_outliers(*first, trace, tolerance, rounds, close=places is not None)
+    found = reject_outliers(*first, trace, tolerance, rounds, close=grown or places is not None)
     loose = keyframes.odom_T_base is not None and not keyframes.localized_every and places is None
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():
@@ -186,7 +187,7 @@ def solve_joint(
         before, other, again = misfit(found.map_T_camera, found.positions, measured, association), found, back
         for limit in (1, rounds - 1):  # Returned rays that belong to their objects lower the misfit after the first round.
             begin = measured, association, other.map_T_camera, other.positions, other.used, again
-            tried = reject_outliers(*begin, attempt, tolerance, limit, other.near, close=other is not found)
+            tried = reject_outliers(*begin, attempt, tolerance, limit, other.near, close=True)
             other, again = replace(tried, iterations=other.iterations + tried.iterations), nothing
             if misfit(other.map_T_camera, other.positions, measured, association) >= before:
                 break

@@ -74,8 +74,8 @@ def reject_outliers(
     solve, or all False. back: (R,) rays that are inliers in the first solve, whatever the test says. tolerance: the last
     solve ends if the cost decreases by less than this share. Earlier solves end at `_COARSE`, if that is larger. Inliers of
     an earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations of
-    a solve on arrays that ended near the start. Solves on arrays go on from them. close: whether the start is the solution
-    of nearly the same measurements, so that not even the first solve needs GTSAM.
+    a solve on arrays that ended near the start. Solves on arrays go on from them. close: whether the start is near the
+    optimum, as the solution of nearly the same measurements is, so that not even the first solve needs GTSAM.
     """
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)
@@ -104,7 +104,7 @@ def reject_outliers(
 class _Solver:
     """Solves the graph of the same measurements for different inliers.
 
-    The first solve starts far from the optimum, so GTSAM solves it, by Levenberg-Marquardt. Later solves are on arrays. To
+    If the first solve starts far from the optimum, GTSAM solves it, by Levenberg-Marquardt. Other solves are on arrays. To
     make a graph of GTSAM anew takes longer than such a solve. near: as in `JointSolution`. close: whether the next solve
     starts near its optimum. graph: the last graph of GTSAM.
     """

@@ -11,6 +11,10 @@ from objslam.triangulation.line_block import LineBlock, apply, dot, full, norm, 
 _MAX_ITERATIONS = 80  # The most Newton steps. A solved object leaves the block earlier.
 _LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which an object gets only a few more Newton steps.
 _LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances). It is above the rounding errors.
+_ROUNDING = 1e-14
+"""The residual of the duals is zero up to rounding if it is below this (in mean distances) divided by the smoothing: an
+offset is exact to about 1e-15, and a dual is an offset divided by the smoothing. With a smaller value, rounding keeps some
+objects from less smoothing until the last step."""
 _ON_LINE = (1e-7, 1e-5)  # The values of `on_line` (in mean distances) that are tried where 0 does not give the optimum.
 _TINY = 1e-300  # The least divisor, so that 0 / 0 gives 0.
 
@@ -65,6 +69,7 @@ def _smoothed_optimum(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
         if iteration:
             gap = ((distance - dot(y, q)) * lines.weight).sum(axis=0) / number
             residual = norm((y * lines.weight).sum(axis=1)) / number
+            residual = xp.where(residual * epsilon <= _ROUNDING, 0.0, residual)
             epsilon = xp.minimum(epsilon, xp.maximum(0.1 * xp.maximum(gap, residual), 0.01 * epsilon))
             epsilon = epsilon.clip(min=_LEAST_SMOOTHING)
             late = late + (epsilon <= _LATE_SMOOTHING)

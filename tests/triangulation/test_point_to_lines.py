@@ -152,6 +152,28 @@ def test_rays_in_one_plane_give_an_optimum_of_the_plane():
         assert cost(points[j], *mine) <= best * (1 + 1e-12) + 1e-12
 
 
+def test_in_a_plane_the_optimum_is_the_best_crossing_and_takes_few_steps():
+    """The sum of distances to lines of a plane is linear between them, so it is least at a crossing. There, offsets are
+    rounding errors, and must not keep the solver busy to its last step."""
+    rng = np.random.default_rng(1)
+    count, number = 100, 20
+    angle = rng.uniform(-0.1, 0.1, (count, number)) + rng.uniform(-np.pi, np.pi, (count, 1))  # as from a short path
+    m, n = np.zeros((count, number, 3)), np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=2)
+    m[..., :2] = rng.normal(0, 0.02, (count, number, 2))
+    m -= 3 * n
+    found, iterations, rest = solve_eq1(m.reshape(-1, 3), n.reshape(-1, 3), np.repeat(np.arange(count), number), count)
+    pairs = np.column_stack(np.triu_indices(number, 1))
+    for i in range(count):
+        across = np.column_stack([-n[i, :, 1], n[i, :, 0]])
+        there = (across * m[i, :, :2]).sum(axis=1)
+        crossings = np.linalg.solve(across[pairs], there[pairs][..., None])
+        costs = [cost(np.append(crossing, 0.0), m[i], n[i]) for crossing in crossings[..., 0]]
+        best = np.append(crossings[int(np.argmin(costs)), :, 0], 0.0)
+        np.testing.assert_allclose(found[i], best, atol=1e-9)
+    assert rest.max() < 1e-10
+    assert iterations < 100
+
+
 def test_repeated_rays_do_not_disturb():
     """A robot that stands still sees the same ray again and again."""
     rng = np.random.default_rng(5)

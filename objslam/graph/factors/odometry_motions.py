@@ -52,7 +52,7 @@ class OdometryMotions:
         """Return the motions of keyframes with odometry. ties: (T, 2) from `find_ties`."""
         chain = np.flatnonzero(keyframes.measured)
         before, after = np.concatenate([chain, ties[:, 0]]), np.concatenate([chain + 1, ties[:, 1]])
-        motion, _ = motions(keyframes, settings, pairs=(before, after))
+        motion, noise = motions(replace(keyframes, wander=None), settings, pairs=(before, after))
         below = below_ties(ties, len(keyframes))
         bridge = wander(keyframes, before, after)
         here = np.flatnonzero(below[chain])
@@ -61,8 +61,7 @@ class OdometryMotions:
         total = np.cumsum(walk, axis=0)
         bridge = _in_camera(keyframes, after, bridge)
         loose = _in_camera(keyframes, ties[:, 1], total[ties[:, 1]] - total[ties[:, 0]])
-        found = cls(before, after, motion, bridge, bridge, loose)
-        return found.with_noise(found.noise_of(keyframes, settings))
+        return cls(before, after, motion, noise, bridge, loose)
 
     def __len__(self) -> int:
         return len(self.before)

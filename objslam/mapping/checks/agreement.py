@@ -5,19 +5,21 @@ points.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
 from objslam.core.ground.flattening import LEVEL, flat_scale, flattened_lines, noise_of_ground, raised_points
 from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays
 from objslam.errors import LogError
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.keyframes import build_keyframes
+from objslam.frontend.keyframes import build_keyframes, with_mounts
 from objslam.mapping.checks.meeting_points import fit_points
 
 FRAMES = 600
@@ -74,7 +76,7 @@ class Part:
         """The number of boxes."""
         return sum(len(c.detections) for c in self.log.cameras if c.detections is not None)
 
-    @property
+    @cached_property
     def crowd(self) -> float:
         """The number of boxes of one label in one frame, as the mean over all boxes. In a crowd, rays meet by chance."""
         counts = [np.zeros(0)]
@@ -142,21 +144,44 @@ def agreements(
 ) -> Iterator[Agreement | None]:
     """Yield the `agreement` of each of several logs. One log does not affect another, but together they take less time."""
     waiting: list[_Measured | None] = []
+    built: tuple[Log, Keyframes, Rays] | None = None
     for log in logs:
-        waiting.append(_measure(part, log, settings, window))
+        built = _built(log, settings, built)
+        waiting.append(None if built is None else _measure(part, *built[1:], settings, window))
         if sum(len(one.rays) for one in waiting if one is not None) > _AT_ONCE:
             yield from _fitted(part, waiting, settings)
             waiting = []
     yield from _fitted(part, waiting, settings)
 
 
-def _measure(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] | None) -> _Measured | None:
+def _built(log: Log, settings: Settings, before: tuple[Log, Keyframes, Rays] | None) -> tuple[Log, Keyframes, Rays] | None:
+    """Return a log with its keyframes and rays, None if no frame has a pose. before: the same of the log before, whose rays
+    are taken if only the cameras' poses on the robot differ."""
+    if before is not None and _differ_in_mounts(before[0], log):
+        return log, with_mounts(before[1], log), before[2]
     free = settings.model_copy(update={"mode": "fixed"})
     try:
         keyframes = build_keyframes(log, free, Ledger())
-        rays = build_rays(log, keyframes, free, Ledger())
+        return log, keyframes, build_rays(log, keyframes, free, Ledger())
     except LogError:
         return None
+
+
+def _differ_in_mounts(one: Log, other: Log) -> bool:
+    """Return whether two logs share all their data but base_T_camera. No camera moves on the robot."""
+    if one.localization is not other.localization or one.odometry is not other.odometry:
+        return False
+    parts = [f.name for f in fields(Camera) if f.name != "base_T_camera"]
+    return all(
+        a.mount is None
+        and b.mount is None
+        and a.detections is b.detections
+        and all(getattr(a.camera, name) is getattr(b.camera, name) for name in parts)
+        for a, b in zip(one.cameras, other.cameras, strict=True)
+    )
+
+
+def _measure(part: Part, keyframes: Keyframes, rays: Rays, settings: Settings, window: tuple[Ints, ...] | None) -> _Measured:
     windows = part.window if window is None else window
     of_keyframe = np.zeros(len(keyframes), dtype=np.int64)
     for index, mine in enumerate(windows):

@@ -34,7 +34,8 @@ def mounts(log: Log) -> Iterator[Hypothesis]:
     for one in (*_usual(log), *_turns()):
         rotations = _rotations(one.put_right(log))
         # The usual mistakes may have the same effect. Then all their causes are named.
-        if not any(np.allclose(rotations, other, atol=_SAME) for other in (tried[:1] if one.usual else tried)):
+        others = np.array(tried[:1] if one.usual else tried)
+        if not np.isclose(rotations, others, atol=_SAME).all(axis=(1, 2, 3)).any():
             tried.append(rotations)
             yield one
 
