@@ -32,6 +32,8 @@ _CERTAIN = float(np.sqrt(27.6))
 """The least size of a jump, in standard deviations of the noise in the settings, which is that of two poses and of the
 odometry between them. Noise is larger with a chance of 1e-6 (chi-squared with 2 degrees of freedom): in one of a thousand
 logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
+_OF_MEDIAN = float(np.sqrt(np.log(10) / np.log(2)))
+"""The length that a tenth of the steps exceeds, as a multiple of their median length, for normal noise in a plane."""
 _FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps do not show what is usual."""
 _MOST_JUMPS = 10
@@ -152,7 +154,8 @@ def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     # Each pair is a distance and an angle.
     drift = 0.0 if log.odometry is None else _drift(_lengths(_steps(path.poses)), settings)
     poses = 2 * np.array([settings.localization.xy, settings.localization.yaw]) ** 2
-    least = np.maximum(_TIMES_ODD * np.quantile(off[judged], 0.9, axis=0), _CERTAIN * np.sqrt(poses + drift))
+    usual = _TIMES_ODD * np.quantile(off[judged], 0.9, axis=0)
+    least = np.maximum(np.maximum(usual, _usual_corrections(off[judged], usual)), _CERTAIN * np.sqrt(poses + drift))
     # A turn alone is no jump: a hand turns a camera as fast, and wheels that slip do not show a turn.
     most = _ACCELERATION if is_planar(path.poses) else _FREE_ACCELERATION
     possible = 0.0 if log.odometry is not None else most * np.diff(path.stamps) ** 2
@@ -164,6 +167,22 @@ def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     stamps = path.stamps[found + 1]
     ends = np.concatenate([path.stamps[:1], stamps, path.stamps[-1:]])
     return Jumps(stamps, odd[found, 0], odd[found, 1], noise, np.diff(ends) / (ends[-1] - ends[0]))
+
+
+def _usual_corrections(off: Floats, usual: Floats) -> Floats:
+    """Return the distance, m, and the turn, rad, up to which corrections of a localisation are usual.
+
+    A particle filter follows the odometry, and corrects itself every few seconds. Most steps are then no corrections, so
+    their oddness does not tell how large corrections are. The largest of many corrections are not wrong, and without them
+    the path drifts as the odometry does. So a jump has to stand out from the corrections, too. A few corrections may all be
+    jumps.
+
+    off: (N, 2) the oddness of steps, m and rad. usual: (2,) up to which oddness a step is no correction.
+    """
+    corrections = off[off[:, 0] > usual[0]]
+    if len(corrections) <= _MOST_JUMPS:
+        return np.zeros(2)
+    return _TIMES_ODD * _OF_MEDIAN * np.median(corrections, axis=0)
 
 
 def _by_neighbours(path: Trajectory) -> tuple[Floats, Floats, Bools]:

@@ -24,7 +24,7 @@ from objslam.mapping.doubted_labels import (
 )
 from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
 from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
-from objslam.mapping.fixed.camera_calibration import associate_rows
+from objslam.mapping.fixed.camera_calibration import associate_at_poses
 from objslam.mapping.fixed.fixed_poses import FixedPoses
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.labels import (
@@ -51,12 +51,13 @@ def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
         return _associated(state, start)
     named, agree = _by_label(state)
-    if state.settings.association.method == "by_label" or not doubted_names(named):
-        return named if agree else _associated(replace(named, association=None, estimate=None), None)
+    sure = state.settings.association.method == "by_label" or not doubted_names(named)
+    if agree:
+        return named if sure else _with_several_a_label(state, named)
     # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
-    if not agree:
-        return _associated(state, None)
-    return _with_several_a_label(state, named)
+    # With a localisation, such a path shows as noise of the localisation, and no label is doubted.
+    bent = not sure or state.keyframes.localized_every
+    return _associated(state if bent else replace(named, association=None, estimate=None), None)
 
 
 def _with_several_a_label(state: JointState, named: JointState) -> JointState:
@@ -82,7 +83,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve from a known start, or from an exploration of the log."""
     if start is not None or state.keyframes.localized_every:
         found = _improved(_from_start(state, start), JointState.relocalized)
-        state = _without_confused_rows(state, found) if start is None else found
+        state = _or_as_in_fixed_mode(state, found) if start is None else found
     else:
         begin = _with_turns(state)
         start, sure = explored(begin)
@@ -91,7 +92,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         noisier = with_loose_odometry(first, begin.theta, sure)
         if noisier is not None:
             other, sure = explored(noisier)
-            if not finds_same_objects(state, other):
+            if not finds_same_objects(state, other.association):
                 attempt = _from_start(*solved_if_sure(noisier, other, sure))
                 state = state.better(_improved(attempt, JointState.relocalized))
         state = _improved(state, JointState.split)
@@ -170,18 +171,20 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
     return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
 
 
-def _without_confused_rows(begin: JointState, state: JointState) -> JointState:
-    """Return the state, or one from the association of the fixed mode if the log shows rows of equal things.
+def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
+    """Return the state, or one from the association of the fixed mode if this explains the log better.
 
-    The first association at localised poses has wide gates, because the poses have noise. In such rows, these gates hold the
-    rays of neighbours. The later rounds keep these rays, because the poses were bent to fit them. begin: before the first
-    association. state: after the rounds that began there.
+    The first association at localised poses allows for the noise of the localisation, but not for the errors of cameras. Its
+    gates may be too wide for rows of equal things, and too narrow for a camera that is mounted askew, or for a localisation
+    that errs for seconds. Then an object has rays of two things. The later rounds keep these rays, because the poses were
+    bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in the boxes of each frame.
+    begin: before the first association. state: after the rounds that began there.
     """
     if begin.errors is None:
         return state
     measured = begin.frames, begin.all_rays, *seen_something(begin.frames, begin.all_rays)
-    found = associate_rows(FixedPoses(*measured, begin.cameras, begin.settings), begin.errors.log, begin.progress)
-    if found is None:
+    found = associate_at_poses(FixedPoses(*measured, begin.cameras, begin.settings), begin.errors.log, begin.progress)
+    if found is None or finds_same_objects(state, found):
         return state
     attempt = begin.attempt().counted(found).solve("association", found)
     assert attempt.estimate is not None

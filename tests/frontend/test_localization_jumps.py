@@ -84,6 +84,27 @@ def test_a_jump_there_and_back_is_measured_and_taken_out(wheels: bool) -> None:
     np.testing.assert_allclose(after.poses[:, :3, 3].mean(axis=0), path.poses[:, :3, 3].mean(axis=0), atol=1e-3)
 
 
+def corrected_often(path: Trajectory, seed: int, every: float = 4.0, size: float = 0.07) -> Trajectory:
+    """The path with the error of a particle filter: a new place error (m) about every 4 s, and the odometry between."""
+    rng = np.random.default_rng(seed)
+    number = np.searchsorted(np.cumsum(rng.uniform(0.5, 1.5, 60) * every), path.stamps)
+    poses = path.poses.copy()
+    poses[:, :2, 3] += rng.normal(0, size, (61, 2))[number]
+    return replace(path, poses=poses)
+
+
+@pytest.mark.parametrize("wheels", [False, True])
+def test_the_largest_of_many_corrections_is_no_jump(wheels: bool) -> None:
+    """The corrections have 0.07 m on each axis before and after, so some of the 15 are longer than 0.15 m."""
+    odometry = drive(0.05) if wheels else None
+    for seed in range(10):
+        path = drive(0.1, 0.003, seed)
+        assert found(corrected_often(path, seed), odometry) is None
+        jumps = found(jumped(corrected_often(path, seed, size=0.03), 30.0, (0.5, -0.4)), odometry)
+        assert jumps is not None
+        np.testing.assert_allclose(jumps.stamps, [30.1], atol=0.11)
+
+
 def test_only_the_odometry_shows_jumps_between_rare_poses() -> None:
     path = jumped(drive(0.5, 0.01), 30.2, (0.3, 0.2))
     assert found(path) is None

@@ -12,8 +12,8 @@ from objslam.mapping.solution import rays_moved
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
+    from objslam.core.types import Association
     from objslam.frontend.shared_errors import SharedErrors
-    from objslam.graph.init_unknown_correspondences import InitialEstimate
     from objslam.mapping.joint_alternation import JointState
 
 _NOISIER = 1.5
@@ -99,12 +99,12 @@ def _drives_otherwise(state: JointState, assumed: Floats | None) -> bool:
     return bool((off & of_odometry).any())
 
 
-def finds_same_objects(state: JointState, start: InitialEstimate) -> bool:
+def finds_same_objects(state: JointState, start: Association) -> bool:
     """Return whether a start has the same objects as the map of a state, so that its rounds would lead to the same map.
 
     Rays without an object in one of them do not count, because the rounds assign them again.
     """
     assert state.association is not None
-    before, after = state.association.object, start.association.object
+    before, after = state.association.object, start.object
     both = (before >= 0) & (after >= 0)
     return rays_moved(before[both], after[both]) <= _SAME * len(before)

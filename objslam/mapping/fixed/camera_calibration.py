@@ -43,15 +43,13 @@ def calibrate_fixed(
     ledger: Ledger,
     progress: Progress,
     trace: Trace | None,
-    first: tuple[Association, bool] | None = None,
 ) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
     """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
 
     The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit,
     and in rows of equal things only what moves rays off their objects. The covariance of the errors is added to the
     covariance of the objects. Returns the input without the errors, the association, the estimate, and the number of objects
-    in each round. If the errors cannot be estimated, they stay as they were, and the ledger gets a warning. first: the first
-    association, if it is known, as of `_first_association`.
+    in each round. If the errors cannot be estimated, they stay as they were, and the ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import (
         calibrate_at_poses,
@@ -73,7 +71,7 @@ def calibrate_fixed(
         if number:
             association = now.associate(told)
         else:
-            association, in_rows = first or _first_association(at, errors)
+            association, in_rows = _first_association(at, errors)
         rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
@@ -146,19 +144,14 @@ def _calibrated_by_centres(
         return None
 
 
-def associate_rows(at: FixedPoses, log: Log, progress: Progress) -> Association | None:
-    """Return the association at known poses and calibrated cameras if the log shows rows of equal things, else None.
+def associate_at_poses(at: FixedPoses, log: Log, progress: Progress) -> Association | None:
+    """Return the association of the fixed mode, at known poses and calibrated cameras. None if nothing is to be calibrated.
 
-    at: as measured. Its mode does not matter. Wide gates confuse neighbours in such rows. A solve that moves the poses can
-    then fit the rays of neighbours to one object, and the gates of its next rounds keep them.
+    at: as measured. Its mode does not matter.
     """
     at = replace(at, settings=at.settings.model_copy(update={"mode": "fixed"}))
     errors = shared_errors(log, at.seen, at.rays_seen, at.settings)
-    if errors is None:
-        return None
-    first = _first_association(at, errors)
-    in_rows = first[1]
-    return calibrate_fixed(at, errors, Ledger(), progress, None, first)[1] if in_rows else None
+    return None if errors is None else calibrate_fixed(at, errors, Ledger(), progress, None)[1]
 
 
 def _expected(errors: SharedErrors) -> Calibration:
