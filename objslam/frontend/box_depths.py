@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
+from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.core.types import Detections, Images
 from objslam.errors import LogError
 from objslam.io.images import decode_depth
@@ -19,6 +20,13 @@ _CENTRE_SHARE = 0.5
 """The share of a box's width, and of its height, in which depth is read. A larger share includes background at the edge."""
 _MIN_VALID_SHARE = 0.1
 """The least share of valid pixels for a depth to be read. A larger share leaves more boxes without a depth."""
+_LEAST_SHOWN = 0.1
+"""The least share of the valid pixels that show the thing, if the others show what is behind it. A larger share takes thin
+things, such as a tripod, for the wall behind them. A smaller share takes a thing for what hides a strip of it."""
+_APART = 4.0
+"""Two surfaces are different if their depths differ by at least this number of standard deviations of the nearer depths. The
+halves of one Gaussian differ by 2.3, those of a plane that recedes by 2.7. With a larger number, fewer backgrounds are
+found."""
 MAX_IMAGE_LAG = 0.02
 """The longest time (s) between the stamps of the colour image and the depth image of one frame. Some cameras give the two
 images different stamps. A longer time pairs images of different moments."""
@@ -40,16 +48,17 @@ def depths_at_boxes(detections: Detections, images: Images, camera: Camera, ledg
     for index, first, boxes in zip(closest[near].tolist(), start[near].tolist(), count[near].tolist(), strict=True):
         image = read_depth(images.paths[index], camera, ledger)
         if image is not None:
-            mine = slice(first, first + boxes)
-            depths[mine] = [box_depth(image, box) / camera.depth_scale for box in detections.boxes[mine]]
+            mine, focal = slice(first, first + boxes), float(camera.matrix[0, 0])
+            depths[mine] = [box_depth(image, box, focal) / camera.depth_scale for box in detections.boxes[mine]]
     return replace(detections, depths=depths)
 
 
-def box_depth(image: NDArray[Any], box: Floats) -> float:
-    """Return the median depth in the central half of a box (x1, y1, x2, y2) px, in the image's units.
+def box_depth(image: NDArray[Any], box: Floats, focal: float) -> float:
+    """Return the median depth of the thing in the central half of a box (x1, y1, x2, y2) px, in the image's units.
 
     The central half has half the width and half the height. Only finite depths above zero are valid. If fewer than a tenth
-    of the pixels are valid, the result is NaN.
+    of the pixels are valid, the result is NaN. Pixels that show what is behind a thin or hollow thing do not count. focal:
+    px, the focal length of the image.
     """
     height, width = image.shape
     middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) * _CENTRE_SHARE / 2
@@ -57,7 +66,27 @@ def box_depth(image: NDArray[Any], box: Floats) -> float:
     high = np.clip(np.ceil(middle + half), low + 1, [width, height]).astype(int)
     part = image[low[1] : high[1], low[0] : high[0]]
     valid = part[np.isfinite(part) & (part > 0)]
-    return float(np.median(valid)) if valid.size and valid.size >= _MIN_VALID_SHARE * part.size else np.nan
+    if not valid.size or valid.size < _MIN_VALID_SHARE * part.size:
+        return np.nan
+    return float(np.median(_of_thing(valid.astype(np.float64), 2 * float(half.max()) / _CENTRE_SHARE / focal)))
+
+
+def _of_thing(depths: Floats, size: float) -> Floats:
+    """Return those of the depths (n,) that are of the nearest surface.
+
+    A thing may be as deep as it is wide or high. What is farther behind is the background, if a gap parts it from the thing.
+    size: the larger side of the thing, per unit of its depth.
+    """
+    least = _LEAST_SHOWN * len(depths)
+    while True:
+        near = depths <= np.quantile(depths, [0.1, 0.9]).mean()
+        if near.all() or near.sum() < least:
+            return depths
+        here, behind = np.median(depths[near]), np.median(depths[~near])
+        spread = np.median(np.abs(depths[near] - here)) / NORMAL_MEDIAN
+        if behind - here <= max(size * here, _APART * spread):
+            return depths
+        depths = depths[near]
 
 
 def nearest_stamps(stamps: Floats, query: Floats) -> NDArray[np.int64]:

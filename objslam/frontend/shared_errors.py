@@ -34,7 +34,13 @@ from objslam.frontend.known_errors import (
 )
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
-from objslam.frontend.surface_ranges import corrected_ranges, half_widths_of_rays, range_factors, with_known_surfaces
+from objslam.frontend.surface_ranges import (
+    corrected_ranges,
+    half_widths_of_rays,
+    range_factors,
+    weights_of,
+    with_known_surfaces,
+)
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -126,7 +132,8 @@ class SharedErrors:
 
     @cached_property
     def _half(self) -> Floats:
-        return half_widths_of_rays(self.rays, self.keyframes, [one.camera for one in self.log.cameras])
+        half = half_widths_of_rays(self.rays, self.keyframes, [one.camera for one in self.log.cameras])
+        return half * weights_of(self.rays)
 
     @property
     def steps(self) -> Floats:

@@ -33,7 +33,7 @@ def half_widths_of_rays(rays: Rays, keyframes: Keyframes, cameras: Sequence[Came
     return half_widths(rays.box, rays.direction, cameras, keyframes.camera[rays.keyframe], flat)
 
 
-def to_centres(half: Floats, share: float) -> Floats:
+def to_centres(half: Floats, share: Floats | float) -> Floats:
     """Return the ratio (R,) of the distance of the centre of a thing to the range of its surface.
 
     half: (R,) as `half_widths`. share: how far the centre is behind the surface, as a share of half the width.
@@ -61,9 +61,20 @@ def measured_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floa
     return (ranges - errors.get("range_offset", 0.0) / direction[:, 2]) / factors
 
 
-def centre_factors(errors: Mapping[str, float], half: Floats, settings: Settings) -> Floats:
-    """Return the ratios (R,) of corrected ranges of centres to those of surfaces. half: as `half_widths`."""
-    return to_centres(half, settings.depth.centre) * to_centres(half, errors.get("surface", 0.0))
+def centre_factors(rays: Rays, errors: Mapping[str, float], half: Floats, settings: Settings) -> Floats:
+    """Return the ratios (R,) of corrected ranges of centres to those of surfaces. half: (R,) as `half_widths`."""
+    common = to_centres(half * weights_of(rays), errors.get("surface", 0.0))
+    return to_centres(half, shares_of(rays, settings)) * common
+
+
+def shares_of(rays: Rays, settings: Settings) -> Floats | float:
+    """Return how far (R,) ranges were lengthened from surfaces to centres, as shares of half the width."""
+    return settings.depth.centre if rays.surface is None else rays.surface[:, 0]
+
+
+def weights_of(rays: Rays) -> Floats | float:
+    """Return the weights (R,) with which the shared error `surface` is added to the shares of `shares_of`."""
+    return 1.0 if rays.surface is None else rays.surface[:, 1]
 
 
 def with_known_surfaces(rays: Rays, half: Floats, sigma: float) -> Rays:

@@ -69,6 +69,9 @@ def solve(
         association, estimate, rounds = state.association, state.estimate, state.rounds
         doubted, unsettled = state.doubted, state.unsettled
         estimate, added = solve_to_centres(begin, association, estimate)
+        if added is not None and added.ranges is not None:
+            rays_of_keyframes = added.ranges.apply(rays_of_keyframes, settings)
+            errors = None if errors is None else replace(errors, rays=added.ranges.apply(errors.rays, settings))
         if errors is not None:
             keyframes, rays_of_keyframes = without_errors(errors, estimate)
         if added is not None:

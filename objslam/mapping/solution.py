@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import PlacedBody
 from objslam.core.trace import Round
@@ -19,22 +20,65 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class RangeShift:
+    """What takes R ranges from the surfaces of bodies to their centres, where bodies tell more than the widths of boxes.
+
+    factor: (R,) on the range. bias: (R,) on `Rays.range_bias`. Both are 1 where nothing is told. surface: (R, 2) the new
+    `Rays.surface`, NaN where nothing is told.
+    """
+
+    factor: Floats
+    bias: Floats
+    surface: Floats
+
+    @classmethod
+    def none(cls, count: int) -> RangeShift:
+        """Return the shift of `count` ranges that stay."""
+        return cls(np.ones(count), np.ones(count), np.full((count, 2), np.nan))
+
+    @property
+    def told(self) -> Bools:
+        """(R,) whether a body tells how far the centre is behind the surface."""
+        return np.isfinite(self.surface[:, 0])
+
+    def only(self, rays: Bools) -> RangeShift:
+        """Return the shift of some ranges (R,). The others stay."""
+        factor, bias = np.where(rays, self.factor, 1.0), np.where(rays, self.bias, 1.0)
+        return RangeShift(factor, bias, np.where(rays[:, None], self.surface, np.nan))
+
+    def apply(self, rays: Rays, settings: Settings) -> Rays:
+        """Return the rays with ranges to the centres of bodies."""
+        if not self.told.any():
+            return rays
+        before = np.tile([settings.depth.centre, 1.0], (len(rays), 1)) if rays.surface is None else rays.surface
+        return replace(
+            rays,
+            range=rays.range * self.factor,
+            range_bias=rays.range_bias * self.bias,
+            surface=np.where(self.told[:, None], self.surface, before),
+        )
+
+
+@dataclass(frozen=True)
 class CentreShift:
     """What turns R rays to the centres of bodies.
 
     direction: (R, 3), added to the direction of each ray, in the camera frame. sigma: (R,) rad, the noise that this adds. It
-    is 0 unless something hides a part of the object in the image.
+    is 0 unless something hides a part of the object in the image. ranges: what takes the ranges to these centres, None if
+    they stay.
     """
 
     direction: Floats
     sigma: Floats
+    ranges: RangeShift | None = None
 
     def only(self, rays: Bools) -> CentreShift:
         """Return the shift of some rays (R,). The others stay."""
-        return CentreShift(np.where(rays[:, None], self.direction, 0.0), np.where(rays, self.sigma, 0.0))
+        ranges = None if self.ranges is None else self.ranges.only(rays)
+        return CentreShift(np.where(rays[:, None], self.direction, 0.0), np.where(rays, self.sigma, 0.0), ranges)
 
     def apply(self, rays: Rays) -> Rays:
-        """Return the rays to the centres of bodies."""
+        """Return the rays to the centres of bodies. Their ranges stay."""
         direction = rays.direction + self.direction
         direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         return replace(rays, direction=direction, sigma=np.hypot(rays.sigma, self.sigma))

@@ -133,15 +133,36 @@ def test_the_depth_of_a_box_is_robust():
     image = np.full((100, 100), 9000, dtype=np.uint16)  # a wall behind
     image[30:70, 30:70] = 2000 + rng.integers(-20, 20, (40, 40))
     image[45:55, 45:55] = 0  # a hole where the sensor saw nothing
-    assert box_depth(image, np.array([25.0, 25, 75, 75])) == pytest.approx(2000, abs=5)
-    assert box_depth(image.astype(np.float32), np.array([25.0, 25, 75, 75])) == pytest.approx(2000, abs=5)
-    assert np.isnan(box_depth(np.zeros((100, 100), dtype=np.uint16), np.array([25.0, 25, 75, 75])))
+    assert box_depth(image, np.array([25.0, 25, 75, 75]), 100.0) == pytest.approx(2000, abs=5)
+    assert box_depth(image.astype(np.float32), np.array([25.0, 25, 75, 75]), 100.0) == pytest.approx(2000, abs=5)
+    assert np.isnan(box_depth(np.zeros((100, 100), dtype=np.uint16), np.array([25.0, 25, 75, 75]), 100.0))
     mostly_empty = np.zeros((100, 100), dtype=np.uint16)
     mostly_empty[50, 50] = 2000
-    assert np.isnan(box_depth(mostly_empty, np.array([25.0, 25, 75, 75])))
-    assert box_depth(image, np.array([50.2, 60.2, 50.4, 60.4])) > 0  # smaller than a pixel
+    assert np.isnan(box_depth(mostly_empty, np.array([25.0, 25, 75, 75]), 100.0))
+    assert box_depth(image, np.array([50.2, 60.2, 50.4, 60.4]), 100.0) > 0  # smaller than a pixel
     for outside in ([-50.0, -50, -10, -10], [200.0, 200, 300, 300], [-1e9, -1e9, 1e9, 1e9]):
-        assert box_depth(image, np.array(outside)) > 0 or outside[0] < -1e8
+        assert box_depth(image, np.array(outside), 100.0) > 0 or outside[0] < -1e8
+
+
+@pytest.mark.parametrize("share", [0.15, 0.3, 0.45])
+@pytest.mark.parametrize("noise", [0, 30])
+def test_the_depth_of_a_thin_thing_is_not_that_of_the_wall_behind_it(share, noise):
+    """Its box is 0.5 m wide and high at 2 m. A wall at 3 m shows in most of it, and one at 5 m in a corner."""
+    rng = np.random.default_rng(0)
+    image = np.full((100, 100), 3000.0)
+    image[:45, :45] = 5000
+    image[:, 50 : 50 + round(25 * share)] = 2000
+    image = image + noise * rng.normal(size=image.shape)
+    assert box_depth(image, np.array([25.0, 25, 75, 75]), 200.0) == pytest.approx(2000, abs=20)
+
+
+@pytest.mark.parametrize("noise", [0.0, 40.0, 400.0])
+@pytest.mark.parametrize("slope", [0.0, 8.0])
+def test_depths_without_a_gap_keep_their_median(noise, slope):
+    """Of a noisy wall, and of one that recedes by 0.8 m over the image: far more than a small box is wide."""
+    columns = slope * np.arange(100.0)
+    image = 4000 + columns + noise * np.random.default_rng(1).normal(size=(100, 100))
+    assert box_depth(image, np.array([20.0, 20, 80, 80]), 5000.0) == pytest.approx(4000 + 50 * slope, abs=10 + noise / 10)
 
 
 def _archive(folder, files, name="yolo.tar.gz"):

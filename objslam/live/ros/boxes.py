@@ -88,6 +88,7 @@ class DepthImages:
         if image.shape != (camera.height, camera.width):
             self._drop("depth image that does not have the camera's size", place)
             return depths
+        focal = float(camera.matrix[0, 0])
         for index in np.flatnonzero(np.isfinite(boxes.boxes).all(axis=1)).tolist():
-            depths[index] = box_depth(image, boxes.boxes[index]) / DEPTH_SCALE
+            depths[index] = box_depth(image, boxes.boxes[index], focal) / DEPTH_SCALE
         return depths

@@ -19,6 +19,7 @@ from objslam.graph.robust_cost import ray_information
 from objslam.mapping.bodies.box_views import BoxViews
 from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes
 from objslam.mapping.bodies.cut_boxes import cut_edges_of
+from objslam.mapping.bodies.surfaces import range_shift
 from objslam.mapping.solution import CentreShift, Solution
 from objslam.triangulation.bodies.prior import apparent_half_axes
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
@@ -82,6 +83,10 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     hidden = views.hidden.copy()
     hidden[views.ray] |= found.hidden.any(axis=1)
     share = float(found.share[0])
+    calibration = solution.estimate.calibration
+    common = 0.0 if calibration is not None and "surface" in calibration.names else settings.calibration.surface
+    ranges = range_shift(found, boxes, views.ray, len(solution.rays), settings, common)
+    to_centre = replace(to_centre, ranges=ranges)
     return replace(solution, bodies=tuple(bodies), body_share=share, to_centre=to_centre, hidden=hidden)
 
 
@@ -128,7 +133,8 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     at_border = np.concatenate([used.box[:, :2] <= border, used.box[:, 2:] >= size - 1 - border], axis=1)
     calibration = estimate.calibration
     errors = {} if calibration is None else dict(zip(calibration.names, calibration.values.tolist(), strict=True))
-    used = replace(used, range=used.range / centre_factors(errors, half_widths_of_rays(used, keyframes, cameras), settings))
+    half_width = half_widths_of_rays(used, keyframes, cameras)
+    used = replace(used, range=used.range / centre_factors(used, errors, half_width, settings))
     boxes = BoxViews(keyframes, used, cameras, settings, map_T_camera, body, points, half, at_border | behind[ray])
     return _Views(objects, ray, boxes, at_border, np.asarray(behind.any(axis=1)))
 
