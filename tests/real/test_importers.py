@@ -56,7 +56,7 @@ def test_mrclam_bearings_and_ranges_survive_the_camera(mrclam, data_dir):
     assert np.array_equal(detections.stamps, rows[:, 0])
     bearing = _bearings(camera, detections.boxes)
     np.testing.assert_allclose(bearing, rows[:, 3], atol=1e-12)
-    np.testing.assert_allclose(detections.depths / np.cos(bearing), rows[:, 2], rtol=1e-12)
+    np.testing.assert_allclose(detections.depths, rows[:, 2], rtol=1e-12)
     labels = [f"landmark_{subject[int(code)]}" for code in rows[:, 1]]
     assert [detections.label_names[i] for i in detections.label] == labels
 
