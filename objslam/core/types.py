@@ -271,11 +271,9 @@ class Rays:
     origin. corners: (R, 4, 3) unit, in the camera frame, the directions to the corners of a square fiducial, NaN for another
     object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
     the cut off boxes of the same images, None if they were not collected. feature: (R,) the row of each ray's appearance
-    vector in feature_table, -1 without a vector. feature and feature_table are None if no ray has a vector. range_spread:
-    (R,) m, the standard deviation of each range with its bias, if range_sigma allows for a bias that other ranges share
-    (`batch_solver.share_bias`). None means range_sigma. surface: (R, 2) how far each range was lengthened from a surface to
-    the centre, as a share of half the width, and the weight of the shared error `surface` that is added to this share. None
-    means `depth.centre` and 1.
+    vector in feature_table, -1 without a vector. feature and feature_table are None if no ray has a vector. surface: (R, 2)
+    how far each range was lengthened from a surface to the centre, as a share of half the width, and the weight of the
+    shared error `surface` that is added to this share. None means `depth.centre` and 1.
     """
 
     keyframe: Ints
@@ -295,7 +293,6 @@ class Rays:
     cut: CutBoxes | None = None
     feature: Ints | None = None
     feature_table: FeatureTable | None = None
-    range_spread: Floats | None = None
     surface: Floats | None = None
 
     def __len__(self) -> int:

@@ -278,14 +278,12 @@ def _distances(origins: Floats, points: Floats) -> Floats:
 def share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
     """Increase the noise of ranges to account for the bias that all ranges of an object share."""
     # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. The mean of n independent
-    # ranges with the variance s^2 + n b^2 has the same variance. But no wrong range would stand out from so much noise. It
-    # stands out from its own noise and bias, even if all ranges of an object are wrong: those that end behind a thin thing.
+    # ranges with the variance s^2 + n b^2 has the same variance.
     ranged = np.isfinite(rays.range) & (association.object >= 0)
     number = np.bincount(association.object[ranged], minlength=association.count)
-    sigma, spread = rays.range_sigma.copy(), rays.range_sigma.copy()
+    sigma = rays.range_sigma.copy()
     sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * rays.range_bias[ranged] ** 2)
-    spread[ranged] = np.hypot(spread[ranged], rays.range_bias[ranged])
-    return replace(rays, range_sigma=sigma, range_spread=spread)
+    return replace(rays, range_sigma=sigma)
 
 
 def _weights(loss: Loss, residual: Floats, optimum: Optimum) -> Floats:

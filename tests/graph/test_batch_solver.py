@@ -229,17 +229,6 @@ def test_wrong_ranges_do_not_move_an_object():
     assert drive.object_errors(drive.joint().positions).max() < 0.12
 
 
-@pytest.mark.parametrize("behind", [1.0, 1.5])
-def test_a_thing_behind_which_all_depths_end_does_not_stretch_the_map(behind):
-    """Many more ranges than one would need to be sure of the wrong distance, as those of a tripod before a wall."""
-    drive = make_drive(0, "mode=joint", "calibration.surface=0", depth=DepthNoise(), stretch=1.04, **ODOMETRY_ALONE)
-    wrong = np.argsort(np.bincount(drive.association.object[drive.association.object >= 0]))[-2:]
-    reach = drive.rays.range + behind * np.isin(drive.association.object, wrong)
-    other = replace(drive, rays=replace(drive.rays, range=reach))
-    right, found = (one.scale(one.joint().positions) for one in (drive, other))
-    assert found == pytest.approx(right, abs=0.015)
-
-
 @pytest.mark.parametrize("loss", LOSSES)
 def test_ranges_place_an_object_that_has_no_parallax(loss):
     keyframes, _, _, _ = around(1, 20)

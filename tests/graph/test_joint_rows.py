@@ -12,7 +12,6 @@ from objslam.config import Odometry, load_settings
 from objslam.core.geometry import adjoint, exp_se3
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
-from objslam.graph.batch_solver import share_bias
 from objslam.graph.factors.residual_algebra import whitening
 from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
@@ -34,7 +33,7 @@ def by_gtsam(graph, values, rows, columns):
 @pytest.mark.parametrize("aside", [False, True])
 @pytest.mark.parametrize("loss", ["huber", "gnc"])
 def test_the_rows_are_those_of_gtsam(factor, localization, aside, loss):
-    """Far from the optimum, where robust weights count, and rays that begin beside the camera or share a bias."""
+    """Far from the optimum, where robust weights count, with and without rays that begin beside the camera."""
     settings = load_settings(None, ("mode=joint", f"joint.factor={factor}"))
     changes = {
         "frames": 200,
@@ -49,7 +48,7 @@ def test_the_rows_are_those_of_gtsam(factor, localization, aside, loss):
     rays = made.rays
     if aside:
         offset = np.where(rng.random(len(rays))[:, None] < 0.5, rng.normal(scale=0.3, size=(len(rays), 3)), 0.0)
-        rays = share_bias(replace(rays, offset=offset), made.association, settings)
+        rays = replace(rays, offset=offset)
     measured = Measurements.of(made.keyframes, rays, settings)
     poses = made.map_T_base @ made.keyframes.base_T_camera
     poses = poses @ exp_se3(rng.normal(scale=0.02, size=(len(poses), 6)))

@@ -15,14 +15,13 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import MOST_NOISE, NoiseFactors
-from objslam.core.statistics import CAUCHY_K, HUBER_K, NORMAL_MEDIAN, grouped_median
+from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
 from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry_motions import OdometryMotions
-from objslam.graph.factors.rays import spread_of_ranges
 from objslam.graph.factors.residual_algebra import whitening
 from objslam.graph.least_squares.normal_equations import NormalEquations
 
@@ -54,8 +53,6 @@ _PRIOR_OBJECTS = 4
 less."""
 _KINDS = ("rays", "ranges", "range_bias", "along", "across", "turning")
 """The factors that this iteration estimates, as fields of `NoiseFactors`."""
-_KEPT = 0.697
-"""The mean square of Gaussian numbers with Cauchy's weights. A larger number finds less bias."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
 """The factor from the mean absolute value of Gaussian numbers to their standard deviation."""
 
@@ -65,16 +62,15 @@ class _Rows:
     """A description of the rows of a linear system: n bearings, q ranges and s motions, with their nominal noise.
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
-    owner: (q,) the landmark of each range. range_weight: (q,) robust weights. range_sigma: (q,) m. bias: (q,) m, the
-    standard deviation of the bias. motions: those in the graph. parts: (3, s, 6, 6) their covariances by the noise along,
-    across and in turning. rest: (s, 6, 6) by the noise of `planar`. motion_axes: (3, s, 6) twists along, across and in
-    turning, in the camera frame after the motion. motion_window: (s,), ray_window: (n,) the window of correlated errors.
+    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m, the standard deviation of the bias. motions:
+    those in the graph. parts: (3, s, 6, 6) their covariances by the noise along, across and in turning. rest: (s, 6, 6) by
+    the noise of `planar`. motion_axes: (3, s, 6) twists along, across and in turning, in the camera frame after the motion.
+    motion_window: (s,), ray_window: (n,) the window of each motion and ray. The errors in a window may be correlated.
     """
 
     bearing_axes: Floats
     bearing_weight: Floats
     owner: Ints
-    range_weight: Floats
     range_sigma: Floats
     bias: Floats
     motions: OdometryMotions | None
@@ -163,20 +159,18 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
         parts = [motions.noise_of(of.measured.multiframes.keyframes(one), settings) for one, settings in kinds]
     origins, directions = rays.in_map(of.map_T_camera)
     to_landmark = of.positions[of.association.object[of.which]] - origins
-    distance = np.linalg.norm(to_landmark, axis=1)
-    off = np.linalg.norm(np.cross(directions, to_landmark), axis=1) / distance
-    wrong = (distance - rays.range)[ranged] / spread_of_ranges(rays)[ranged] / CAUCHY_K
+    off = np.linalg.norm(np.cross(directions, to_landmark), axis=1) / np.linalg.norm(to_landmark, axis=1)
     stamps = np.maximum.accumulate(keyframes.stamps)
     second = np.floor(stamps / correlation_time(stamps)).astype(np.int64)
-    owner, tags = of.association.object[of.which], of.measured.tags
-    thing = owner if tags is None else tags.object_of_landmark()[owner]  # The corners of a fiducial may err together.
-    pair = np.column_stack([thing, second[rays.keyframe]])
+    owner = of.association.object[of.which]
+    if of.measured.tags is not None:  # The corners of a fiducial may err together.
+        owner = of.measured.tags.object_of_landmark()[owner]
+    pair = np.column_stack([owner, second[rays.keyframe]])
     to_camera = adjoint(inverse(keyframes.base_T_camera[after]))
     return _Rows(
         bearing_axes=_azimuth_elevation(rays.direction, keyframes.base_T_camera[rays.keyframe]),
         bearing_weight=np.minimum(1.0, HUBER_K * rays.sigma / np.maximum(off, 1e-12)),
-        owner=owner[ranged],
-        range_weight=1 / (1 + wrong**2),
+        owner=of.association.object[of.which][ranged],
         range_sigma=errors.rays.range_sigma[of.which][ranged],
         bias=errors.rays.range_bias[of.which][ranged],
         motions=motions,
@@ -306,10 +300,10 @@ def _sums_in(window: Ints) -> sparse.csr_matrix:
 def _range_noise(
     system: LinearSystem, rows: _Rows, noise: NoiseFactors, residual: Floats, prior: float
 ) -> tuple[float, float]:
-    """Return the factors on the noise of single ranges and on the bias that ranges of an object share. Both are robust."""
-    number, first = np.bincount(rows.owner), system.first_range
-    count, off = len(number), residual[first : first + len(rows.owner)] / np.sqrt(rows.range_weight)
-    off = off * _range_sigma(rows, noise)
+    """Return the factors on the noise of single ranges, and on the bias that all ranges of an object share."""
+    count = int(rows.owner.max()) + 1
+    number = np.bincount(rows.owner, minlength=count)
+    off = residual[system.first_range : system.first_range + len(rows.owner)] * _range_sigma(rows, noise)
     middle = np.nan_to_num(grouped_median(off, rows.owner, count))
     within = np.median(np.abs(off - middle[rows.owner]) / rows.range_sigma) / NORMAL_MEDIAN
     free = max(len(off) - int((number > 0).sum()), 0)
@@ -318,10 +312,8 @@ def _range_noise(
     has = (number > 1) & (bias > 0)
     if not has.any():
         return ranges, 1.0
-    bias, square, number = bias[has], middle[has] ** 2, number[has]
-    typical = grouped_median(rows.range_sigma**2, rows.owner, count)[has] * ranges**2 / number
-    square = square / (1 + square / (typical + (bias * noise.range_bias) ** 2) / CAUCHY_K**2) / _KEPT
-    squares = max(((square - typical) / bias**2).sum(), 0.0)
+    typical = np.sqrt(grouped_median(rows.range_sigma**2, rows.owner, count)[has]) * ranges
+    squares = max(((middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2).sum(), 0.0)
     weight = min(prior, float(_PRIOR_OBJECTS))
     return ranges, float(np.sqrt((weight + squares) / (weight + has.sum())))
 

@@ -16,36 +16,19 @@ L1_METRES = 1e-6
 and less like a norm. This distance is far below the resolution of a map."""
 
 
-def robust(
-    loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRES, spread: Floats | None = None
-) -> list[gtsam.noiseModel.Base]:
+def robust(loss: Loss, sigmas: Floats, dimension: int, l1_kink: float = L1_METRES) -> list[gtsam.noiseModel.Base]:
     """Return one noise model for each of the sigmas (R,). Sigmas are rounded to three digits, so that many share one model.
 
     The loss acts on the norm of the whitened residual. The loss `l1` is a Huber loss of slope 1 / sigma that is quadratic
-    below `l1_kink` (unit of the residual). The loss `gnc` gives a Gaussian model: its optimiser applies the loss. spread:
-    (R,) the standard deviations of residuals by which the loss `cauchy` finds outliers, None if they are the sigmas.
+    below `l1_kink` (unit of the residual). The loss `gnc` gives a Gaussian model: its optimiser applies the loss.
     """
-    rounded = _three_digits(sigmas).tolist()
-    if spread is None or loss != "cauchy":
-        return [_model(loss, sigma, dimension, l1_kink) for sigma in rounded]
-    constants = _three_digits(CAUCHY_K * spread / sigmas).tolist()
-    return [_cauchy(sigma, dimension, constant) for sigma, constant in zip(rounded, constants, strict=True)]
+    digits = 10.0 ** (np.floor(np.log10(sigmas)) - 2)
+    return [_model(loss, sigma, dimension, l1_kink) for sigma in (np.round(sigmas / digits) * digits).tolist()]
 
 
 def huber(model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
     """Wrap a noise model in Huber's loss."""
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(HUBER_K), model)
-
-
-def _three_digits(values: Floats) -> Floats:
-    digits = 10.0 ** (np.floor(np.log10(values)) - 2)
-    return np.asarray(np.round(values / digits) * digits)
-
-
-@lru_cache(maxsize=4096)
-def _cauchy(sigma: float, dimension: int, constant: float) -> gtsam.noiseModel.Base:
-    model = gtsam.noiseModel.Isotropic.Sigma(dimension, sigma)
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(constant), model)
 
 
 @lru_cache(maxsize=4096)
@@ -58,5 +41,5 @@ def _model(loss: Loss, sigma: float, dimension: int, l1_kink: float) -> gtsam.no
     if loss == "huber":
         return huber(model)
     if loss == "cauchy":
-        return _cauchy(sigma, dimension, CAUCHY_K)
+        return wrap(estimators.Cauchy.Create(CAUCHY_K), model)
     return model

@@ -18,8 +18,8 @@ class Bearings:
     """Rays that a live session adds to its graph.
 
     number: (n,) the number of each ray. keyframe: (n,) the k of X(k). landmark: (n,) the j of L(j). direction: (n, 3) in the
-    camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m. range_spread: as
-    of `Rays`. offset: (n, 3) m, the origins of the rays in the camera frame, None if all begin at the camera.
+    camera frame. sigma: (n,) rad. range: (n,) m along the ray, NaN where unknown. range_sigma: (n,) m. offset: (n, 3) m, the
+    origins of the rays in the camera frame, None if all begin at the camera.
     """
 
     number: Ints
@@ -29,7 +29,6 @@ class Bearings:
     sigma: Floats
     range: Floats
     range_sigma: Floats
-    range_spread: Floats | None = None
     offset: Floats | None = None
 
 
@@ -41,7 +40,7 @@ def ray_factors(
     The first group has the bearings of all rays, or their distances of Eq. 1 if joint.factor is `point_to_line`. The second
     group has the ranges of the rays with a measured range.
 
-    landmark: (n,) the landmark of each ray. loss: the loss of the first group. Ranges have Cauchy's loss, by their spread.
+    landmark: (n,) the landmark of each ray. loss: the loss of the first group. Ranges have Cauchy's loss.
     """
     if settings.joint.factor == "bearing":
         noise = robust(loss, rays.sigma, 2, L1_RADIANS)
@@ -50,14 +49,9 @@ def ray_factors(
         noise = robust(loss, np.full(len(landmark), EQ1_SIGMA), 2)
         made = point_to_line(rays.keyframe, rays.direction, landmark, noise, rays.offset)
     ranged = np.flatnonzero(np.isfinite(rays.range))
-    noise = robust("cauchy", rays.range_sigma[ranged], 1, spread=spread_of_ranges(rays)[ranged])
+    noise = robust("cauchy", rays.range_sigma[ranged], 1)
     at = None if rays.offset is None else rays.offset[ranged]
     return [
         (np.arange(len(landmark)), made),
         (ranged, ranges(rays.keyframe[ranged], rays.range[ranged], landmark[ranged], noise, at)),
     ]
-
-
-def spread_of_ranges(rays: Rays | Bearings) -> Floats:
-    """Return the standard deviations (n,), m, of ranges by which Cauchy's loss finds outliers."""
-    return rays.range_sigma if rays.range_spread is None else rays.range_spread

@@ -21,7 +21,6 @@ from objslam.graph.factors.bearing import EQ1_SIGMA, ray_jacobians, ray_residual
 from objslam.graph.factors.localization import localization_covariance
 from objslam.graph.factors.odometry import JUMP
 from objslam.graph.factors.priors import ANCHOR
-from objslam.graph.factors.rays import spread_of_ranges
 from objslam.graph.factors.residual_algebra import by_end, huber_roots, whitening
 from objslam.graph.tags.square_rows import SquareRows
 
@@ -156,9 +155,9 @@ class JointGraph:
 
     def range_roots(self, distances: Floats) -> tuple[Floats, Floats]:
         """Return the factors (q,) that whiten distances (q,), m, with the weights of Cauchy's loss, and their costs (q,)."""
-        sigma, limit = self.rays.range_sigma[self.ranged], CAUCHY_K * spread_of_ranges(self.rays)[self.ranged]
-        square = ((distances - self.rays.range[self.ranged]) / limit) ** 2
-        return 1 / sigma / np.sqrt(1 + square), (limit / sigma) ** 2 / 2 * np.log1p(square)
+        sigma = self.rays.range_sigma[self.ranged]
+        square = ((distances - self.rays.range[self.ranged]) / sigma / CAUCHY_K) ** 2
+        return 1 / sigma / np.sqrt(1 + square), CAUCHY_K**2 / 2 * np.log1p(square)
 
     def absolute_roots(self, map_T_camera: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the residuals (a, 6) of absolute poses, the matrices (a, 6, 6) that whiten them, and their costs (a,).

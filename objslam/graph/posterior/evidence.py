@@ -13,7 +13,6 @@ from objslam.core.statistics import CAUCHY_K
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
 from objslam.graph.factors.bearing import EQ1_SIGMA
-from objslam.graph.factors.rays import spread_of_ranges
 from objslam.graph.posterior.marginals import Solved
 
 _VIEW = 1.0
@@ -66,8 +65,7 @@ def _of_ranges(measured: Measurements, association: Association, used: Bools, di
     owner = association.object[used & ranged]
     variance = some.range_sigma**2 - number[owner] * some.range_bias**2  # Without the noise for the bias.
     density = shared_bias_density(off, variance, some.range_bias**2, owner, association.count)
-    limit = CAUCHY_K * spread_of_ranges(some)
-    in_graph = float(((limit / some.range_sigma) ** 2 * np.log1p((off / limit) ** 2)).sum()) / 2
+    in_graph = CAUCHY_K**2 / 2 * float(np.log1p((off / some.range_sigma / CAUCHY_K) ** 2).sum())
     return density + in_graph - spread * (int(ranged.sum()) - len(off))
 
 

@@ -178,17 +178,14 @@ class MapState:
         of ranges.
         """
         rays = self.rays
-        sigma = spread = rays.range_sigma[at]
+        sigma = rays.range_sigma[at]
         if np.isfinite(sigma).any():
             camera = self.camera_of_rays(at)
             _, bias = range_noise(rays.range[at], self.half_widths(at), camera, self.sent_cameras, self.settings)
-            spread = np.hypot(sigma, bias)
             sigma = np.sqrt(sigma**2 + (self.landmarks.seen[self.rows_of(rays.owner[at])] + 1) * bias**2)
         direction, noise = self.to_landmarks(at)
         columns = {name: getattr(rays, name)[at] for name in ("number", "keyframe", "range")}
-        return Bearings(
-            **columns, direction=direction, sigma=noise, landmark=rays.owner[at], range_sigma=sigma, range_spread=spread
-        )
+        return Bearings(**columns, direction=direction, sigma=noise, landmark=rays.owner[at], range_sigma=sigma)
 
     def to_landmarks(self, at: Ints) -> tuple[Floats, Floats]:
         """Return the directions (n, 3) of the rays in rows (n,) to their landmarks, in the camera frame, and their noise
