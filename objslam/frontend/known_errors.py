@@ -95,13 +95,14 @@ def possible(log: Log, settings: Settings) -> list[str]:
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
     position have no errors, unless settings.calibration.use is true. In fixed mode its lens has no errors either, because
     such poses come from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves: that in
-    space comes from a camera or a scanner, not from wheels.
+    space comes from a camera or a scanner, not from wheels. With a localisation, odometry only leads from pose to pose, and
+    a slip, which these short ways hardly tell, would give wrong associations more freedom.
     """
     asked, place = settings.calibration.use is True, usual_place(log, settings)
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
     mounted = (*AXES, "x", "y", "z", *(LENS if settings.mode == "fixed" else ()))
     names = [n for n in error_names(log) if prior_sigma(n, settings, place) > 0]
-    if log.odometry is not None and not is_planar(log.odometry.poses):
+    if log.localization is not None or (log.odometry is not None and not is_planar(log.odometry.poses)):
         names = [n for n in names if kind(n) != "turn_slip"]
     return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
 

@@ -34,13 +34,7 @@ from objslam.frontend.known_errors import (
 )
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
-from objslam.frontend.surface_ranges import (
-    corrected_ranges,
-    half_widths_of_rays,
-    range_factors,
-    weights_of,
-    with_known_surfaces,
-)
+from objslam.frontend.surface_ranges import corrected_lengths, half_widths_of_rays, weights_of, with_known_surfaces
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -190,9 +184,8 @@ class SharedErrors:
             keyframes, stamps=stamps, map_T_base=map_T_base, odom_T_base=odom_T_base, base_T_camera=base_T_camera
         )
         moved = replace(moved, drift=gathered, step=step, wander=wander)
-        longer = range_factors(error, self._half) * (1 + self.noise.shrinkage)
-        reach = corrected_ranges(error, rays.range, rays.direction, longer)
-        ranged = replace(rays, direction=direction, sigma=sigma, range=reach, range_sigma=rays.range_sigma * longer)
+        reach, spread = corrected_lengths(error, rays, self._half, 1 + self.noise.shrinkage)
+        ranged = replace(rays, direction=direction, sigma=sigma, range=reach, range_sigma=spread)
         tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))
         if self.settings.mode == "joint":
             noise = self.noise

@@ -56,6 +56,15 @@ def corrected_ranges(errors: Mapping[str, float], ranges: Floats, direction: Flo
     return np.maximum(ranges * factors + offset / direction[:, 2], _LEAST * ranges) if offset else ranges * factors
 
 
+def corrected_lengths(errors: Mapping[str, float], rays: Rays, half: Floats, larger: float) -> tuple[Floats, Floats]:
+    """Return the ranges (R,) of rays and their standard deviations (R,), m, corrected for the shared errors.
+
+    half: as `half_widths`. larger: the factor by which the map is larger, and its noise with it.
+    """
+    factors = range_factors(errors, half) * larger
+    return corrected_ranges(errors, rays.range, rays.direction, factors), rays.range_sigma * factors
+
+
 def measured_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floats, factors: Floats) -> Floats:
     """Return ranges (R,), m, as they were before `corrected_ranges`."""
     return (ranges - errors.get("range_offset", 0.0) / direction[:, 2]) / factors

@@ -124,5 +124,5 @@ def test_an_exploration_that_finds_the_objects_of_the_map_is_not_solved(other, s
     rays[:500], rays[500:1000] = 0, 1
     found = np.full(1030, -1)
     found[: len(other)] = other
-    state, start = (SimpleNamespace(association=Association(one, np.zeros(3, dtype=np.int64))) for one in (rays, found))
-    assert finds_same_objects(state, start) == same
+    of_map, start = (Association(one, np.zeros(3, dtype=np.int64)) for one in (rays, found))
+    assert finds_same_objects(SimpleNamespace(association=of_map), start) == same
