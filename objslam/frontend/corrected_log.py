@@ -15,6 +15,7 @@ from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.frontend.odometry_bridge import OdometryBridge
 from objslam.frontend.odometry_drift import DriftPath, PlanarSteps
 from objslam.frontend.recent_values import RecentValues
+from objslam.frontend.surface_ranges import corrected_ranges
 
 ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias", "odometry.turn_slip")
 """The errors of odometry."""
@@ -36,6 +37,7 @@ time, the jitter of the headings of fast odometry looks like curves."""
 _STANDS = 1e-6
 """A shorter way (m) within `_CURVE` counts as this: the robot stands or turns on the spot. It only avoids a division by
 zero."""
+_AHEAD = np.array([[0.0, 0.0, 1.0]])  # The direction along which depths are measured, in the camera frame.
 _KEPT = 3
 """For how many turn scales, biases and slips the corrected path is kept. The derivatives by the other errors need no new
 path. A larger number takes more memory."""
@@ -304,7 +306,7 @@ def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajector
     camera, name = one.camera, one.camera.name
     clock, (focal, cx, cy) = error.get(f"{name}.clock", 0.0), lens_errors(error, name)
     fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    longer, farther = 1 + error.get("range_scale", 0.0), error.get("range_offset", 0.0)
+    longer = 1 + error.get("range_scale", 0.0)
     corrected = replace(
         camera,
         base_T_camera=corrected_mount(camera.base_T_camera, error, name),
@@ -317,7 +319,8 @@ def corrected_camera(one: CameraLog, error: Mapping[str, float], path: Trajector
 
     found = one.detections
     if found is not None:
-        found = replace(found, frame_stamps=later(found.frame_stamps, clock, path), depths=found.depths * longer + farther)
+        depths = corrected_ranges(error, found.depths, _AHEAD, np.array(longer))
+        found = replace(found, frame_stamps=later(found.frame_stamps, clock, path), depths=depths)
     mount = None if one.mount is None else Trajectory(one.mount.stamps, corrected_mount(one.mount.poses, error, name))
     return CameraLog(corrected, found, moved(one.rgb), moved(one.depth), mount)
 

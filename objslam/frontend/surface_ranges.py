@@ -66,8 +66,9 @@ def corrected_lengths(errors: Mapping[str, float], rays: Rays, half: Floats, lar
 
 
 def measured_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floats, factors: Floats) -> Floats:
-    """Return ranges (R,), m, as they were before `corrected_ranges`."""
-    return (ranges - errors.get("range_offset", 0.0) / direction[:, 2]) / factors
+    """Return ranges (R,), m, as they were before `corrected_ranges`, unless it limited them."""
+    offset = errors.get("range_offset", 0.0)
+    return (ranges - offset / direction[:, 2]) / factors if offset else ranges / factors
 
 
 def centre_factors(rays: Rays, errors: Mapping[str, float], half: Floats, settings: Settings) -> Floats:

@@ -15,10 +15,12 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Images, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
+from objslam.frontend.corrected_log import take_out
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_known
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.surface_ranges import measured_ranges
 from objslam.graph.factors.odometry import motions
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.simulation import DepthNoise, make_camera, preset, simulate
@@ -271,3 +273,15 @@ def test_names_that_the_log_does_not_have_are_said(clean, tmp_path):
     settings = load_settings(None, ("mode=joint", write_known(tmp_path, {"rear.yaw": 0.2})))
     with pytest.raises(ConfigError, match=r"robot\.yaml.*rear\.yaw.*cameras: front"):
         take_out_known(clean, settings, Ledger())
+
+
+def test_an_offset_never_turns_a_short_depth_round(clean):
+    """A depth of 5 cm with an offset of -10 cm stays in front of the camera, and nothing is divided by zero."""
+    one = clean.cameras[0]
+    depths = np.where(np.isfinite(one.detections.depths), 0.05, np.nan)
+    log = replace(clean, cameras=(replace(one, detections=replace(one.detections, depths=depths)),))
+    corrected = take_out(log, {"range_offset": -0.1}).cameras[0].detections.depths
+    assert (corrected[np.isfinite(depths)] > 0).all()
+    assert np.isnan(corrected[np.isnan(depths)]).all()
+    with np.errstate(all="raise"):  # A fisheye sees things beside it, where a ray has no depth.
+        assert_allclose(measured_ranges({}, np.array([2.0]), np.array([[1.0, 0.0, 0.0]]), np.ones(1)), 2.0)

@@ -59,7 +59,7 @@ def _power(
     objects: ObjectMap, map_T_camera: Floats, keyframes: Keyframes, rays: Rays, association: Association
 ) -> tuple[float, float]:
     """Return the power of the cosine in the depths, and its standard deviation. (0, inf) if there are too few depths."""
-    held = np.flatnonzero(held_rays(objects, association) & np.isfinite(rays.range) & (rays.direction[:, 2] > 0))
+    held = np.flatnonzero(held_rays(objects, association) & (rays.range > 0) & (rays.direction[:, 2] > 0))
     if len(held) < _FEWEST:
         return 0.0, np.inf
     owner, frame = association.object[held], rays.keyframe[held]
