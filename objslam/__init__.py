@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.object_map import MapObject
     from objslam.errors import ObjslamError
-    from objslam.results.object_map import ObjectMap
+    from objslam.io.results.object_map import ObjectMap
 
 __all__ = [
     "Camera",
@@ -45,7 +45,7 @@ _HOMES = {
     **dict.fromkeys(("diff", "merge", "register"), "objslam.api.sites"),
     **{"Result": "objslam.api.result", "Session": "objslam.api.session", "Settings": "objslam.config"},
     **{"Camera": "objslam.api.camera", "MapObject": "objslam.core.object_map"},
-    **{"ObjslamError": "objslam.errors", "ObjectMap": "objslam.results.object_map"},
+    **{"ObjslamError": "objslam.errors", "ObjectMap": "objslam.io.results.object_map"},
 }
 """The module of each name that is imported at its first use, so that the command line starts fast."""
 

@@ -22,8 +22,8 @@ from small_log import small_log
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import quaternion
 from objslam.core.types import Log
+from objslam.io.results.files import SUMMARY
 from objslam.output.export.formats import FORMATS
-from objslam.results.files import SUMMARY
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import encode
 from objslam.sources.journal.segments import NAME, is_journal

@@ -28,7 +28,7 @@ from objslam.detection.detector import load_detector  # noqa: E402
 from objslam.simulation.shapes import LABELS  # noqa: E402
 
 SMALL = (96, 64)
-MODEL = PROJECT / "objslam" / "models" / "ssd7.onnx"
+MODEL = PROJECT / "objslam" / "detection" / "models" / "ssd7.onnx"
 
 
 @pytest.fixture(autouse=True, scope="module")

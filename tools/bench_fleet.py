@@ -49,8 +49,8 @@ from objslam.fleet.tasks import map_task
 from objslam.fleet.tasks.map_task import MapTask
 from objslam.fleet.tasks.merge_task import MergeTask
 from objslam.fleet.tasks.site_task import SiteResult, SiteTask
+from objslam.io.results.files import SUMMARY, dump_json
 from objslam.mapping.localization import moved_log
-from objslam.results.files import SUMMARY, dump_json
 from objslam.simulation import preset, simulate
 from objslam.sources import SourceOptions
 from objslam.sources.log_folder import write_log_folder

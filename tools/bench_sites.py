@@ -35,9 +35,9 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import align, inverse
 from objslam.core.maps.shared_covariance import jacobian
 from objslam.core.object_map import MapObject, ObjectMap
+from objslam.io.results.read import load_truth
 from objslam.mapping.sites.merge import Island, merge_sessions
 from objslam.mapping.sites.session import Session
-from objslam.results.read import load_truth
 
 SHARED = np.diag([0.1, 0.1, 0.02, 0.003, 0.003, 0.02, 0.01]) ** 2
 """The covariance of the error that all objects of a session share: shift (m), turn (rad) and size. Larger values make the

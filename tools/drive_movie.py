@@ -33,11 +33,11 @@ from objslam.core.trajectory import correct_path
 from objslam.core.types import Log, Trajectory
 from objslam.errors import OutputError
 from objslam.io.detections_jsonl import read_detections
+from objslam.io.results.files import CONFIG, DETECTIONS, SURFACE
 from objslam.live.adapters.replay import events
 from objslam.live.session.session import Session
 from objslam.output.plot.label_layout import place_labels
 from objslam.output.plot.style import colours_of, ellipsoid
-from objslam.results.files import CONFIG, DETECTIONS, SURFACE
 from objslam.sources import SourceOptions, read
 
 Colours = dict[str, tuple[float, float, float]]

@@ -19,8 +19,8 @@ from pathlib import Path
 from fault_cases import Case, make_cases, said_well
 from small_log import small_log
 
-from objslam.results.files import SUMMARY
-from objslam.results.read import load_map
+from objslam.io.results.files import SUMMARY
+from objslam.io.results.read import load_map
 from objslam.sources.log_folder import write_log_folder
 
 _NOBODY = 65534

@@ -27,8 +27,8 @@ from objslam.core.object_map import MapObject
 from objslam.core.result import Surface
 from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
-from objslam.results.files import SURFACE
-from objslam.results.read import load_map, load_rays
+from objslam.io.results.files import SURFACE
+from objslam.io.results.read import load_map, load_rays
 from objslam.triangulation.proximity_field import FieldSlice, ProximityField, proximity_field, supporting_rays
 
 BLUE, BLACK, INK = (38, 110, 205), (12, 12, 14), "#282c34"

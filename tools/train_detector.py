@@ -1,8 +1,8 @@
-"""Train the SSD that comes with the package on rendered images, and export it to objslam/models/ssd7.onnx.
+"""Train the SSD that comes with the package on rendered images, and export it to objslam/detection/models/ssd7.onnx.
 
 python tools/train_detector.py render --out DATA            # write images (resumable)
 python tools/train_detector.py train --data DATA --out RUN  # write checkpoints and a log with mAP (resumable)
-python tools/train_detector.py export --run RUN --data DATA --onnx objslam/models/ssd7.onnx
+python tools/train_detector.py export --run RUN --data DATA --onnx objslam/detection/models/ssd7.onnx
 python tools/train_detector.py measure --data DATA          # measure a model on the held-out images of `render`
 """
 
@@ -38,10 +38,10 @@ def main() -> None:
     exporting = commands.add_parser("export", help="write the ONNX model, check it against torch, and measure it")
     exporting.add_argument("--data", type=Path, required=True)
     exporting.add_argument("--run", type=Path, required=True)
-    exporting.add_argument("--onnx", type=Path, default=Path("objslam/models/ssd7.onnx"))
+    exporting.add_argument("--onnx", type=Path, default=Path("objslam/detection/models/ssd7.onnx"))
     measuring = commands.add_parser("measure", help="measure an ONNX model on the held-out images")
     measuring.add_argument("--data", type=Path, required=True)
-    measuring.add_argument("--onnx", type=Path, default=Path("objslam/models/ssd7.onnx"))
+    measuring.add_argument("--onnx", type=Path, default=Path("objslam/detection/models/ssd7.onnx"))
     arguments = parser.parse_args()
     if arguments.command == "render":
         render_samples(arguments.out, "held_out", arguments.held_out, arguments.seed)

@@ -18,9 +18,9 @@ from objslam.core import object_map, types
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
 from objslam.errors import ConfigError
+from objslam.io.results.object_map import ObjectMap
+from objslam.io.results.read import load_up
 from objslam.mapping.progress import Progress
-from objslam.results.object_map import ObjectMap
-from objslam.results.read import load_up
 from objslam.sources import SourceOptions
 from objslam.sources import read as read_recording
 

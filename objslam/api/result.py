@@ -14,9 +14,9 @@ from objslam.core import types
 from objslam.core.result import Doubt, RunResult
 from objslam.errors import OutputError
 from objslam.io.rays_parquet import RaysTable
+from objslam.io.results.object_map import ObjectMap
 from objslam.io.views_parquet import Views
 from objslam.mapping.checks.assessment import Assessment
-from objslam.results.object_map import ObjectMap
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Result:
     @classmethod
     def load(cls, folder: str | PathLike[str]) -> Self:
         """Load a result folder. OutputError names what is missing or damaged."""
-        from objslam.results import read
+        from objslam.io.results import read
 
         at = Path(folder)
         poses, path = read.load_trajectory(at), read.load_path(at)
@@ -103,7 +103,7 @@ class Result:
     @property
     def views(self) -> Views | None:
         """Where each image was taken. None for a live session, or a result of an older version."""
-        from objslam.results import read
+        from objslam.io.results import read
 
         if self._run is None:
             return None if self.folder is None else read.load_views(self.folder)
@@ -114,7 +114,7 @@ class Result:
     @property
     def doubts(self) -> tuple[Doubt, ...]:
         """What is doubtful in the map, in words and numbers. Empty for a result of an older version."""
-        from objslam.results import read
+        from objslam.io.results import read
 
         if self._run is not None:
             return self._run.result.doubts

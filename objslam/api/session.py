@@ -15,8 +15,8 @@ from objslam.api.mapping import Given, prior_map, settings_of
 from objslam.api.result import Result
 from objslam.core.arrays import Floats
 from objslam.core.snapshot import LATE_FRAME, Snapshot
+from objslam.io.results.object_map import ObjectMap
 from objslam.live.session.session import Session as LiveSession
-from objslam.results.object_map import ObjectMap
 
 
 class Session(LiveSession):

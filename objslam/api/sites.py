@@ -12,12 +12,12 @@ from objslam.association.registration import object_maps
 from objslam.association.registration.map_registration import Registration
 from objslam.core import object_map
 from objslam.frontend.up import on_its_side
+from objslam.io.results.files import SUMMARY
+from objslam.io.results.object_map import ObjectMap
+from objslam.io.results.read import load_summary
 from objslam.mapping.sites.compare import Comparison, compare
 from objslam.mapping.sites.merge import Island, merge_sessions
 from objslam.mapping.sites.session import Session
-from objslam.results.files import SUMMARY
-from objslam.results.object_map import ObjectMap
-from objslam.results.read import load_summary
 
 Given = Result | object_map.ObjectMap | str | PathLike[str]
 """A session as a user gives it: a result, a map alone, or the path of a result folder, a site or an objects.json."""

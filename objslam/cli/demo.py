@@ -46,7 +46,7 @@ def demo(
     else:
         from objslam.simulation.render import RenderSettings, render_drive
 
-        model = Path(objslam.__file__).parent / "models" / "ssd7.onnx"
+        model = Path(objslam.__file__).parent / "detection" / "models" / "ssd7.onnx"
         with progress_bar() as show:
             render_drive(RenderSettings(), seed, log, overwrite=True, progress=partial(show, "rendering"))
     say(f"wrote the simulated drive: {log}")

@@ -26,9 +26,9 @@ def detect(
     from objslam.errors import ConfigError, LogError
     from objslam.io.atomic_files import write_file
     from objslam.io.images import decode_colour
+    from objslam.io.results.files import dump_json
     from objslam.io.text import read_bytes
     from objslam.output.plot.boxes_plot import PICTURES, draw_boxes
-    from objslam.results.files import dump_json
 
     if out is not None and out.suffix.lower() not in PICTURES:
         raise ConfigError(

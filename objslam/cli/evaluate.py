@@ -38,7 +38,7 @@ def print_evaluation(
     """
     from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
     from objslam.evaluation.table import evaluation_table
-    from objslam.results.files import dump_json
+    from objslam.io.results.files import dump_json
 
     found = evaluate_folder(out, truth, align=align, radius=radius)
     write_evaluation(found, out)

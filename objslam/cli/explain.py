@@ -35,8 +35,8 @@ def explain(
 ) -> None:
     """Say what is doubtful in a result, and why: objects that may be one or two, and boxes that became no object."""
     from objslam.errors import ConfigError, OutputError
-    from objslam.results.files import DOUBTS
-    from objslam.results.read import load_doubts, load_summary
+    from objslam.io.results.files import DOUBTS
+    from objslam.io.results.read import load_doubts, load_summary
 
     doubts = load_doubts(out)
     if doubts is None:
@@ -69,7 +69,7 @@ def _labels(out: Path, doubts: Sequence[Doubt], cut: Iterable[str]) -> list[str]
 
     cut: the labels of the boxes that are cut off.
     """
-    from objslam.results.read import load_map, load_rays
+    from objslam.io.results.read import load_map, load_rays
 
     boxes = load_rays(out).label.tolist()
     return sorted({*(o.label for o in load_map(out)), *boxes, *cut, *(one.label for one in doubts)})

@@ -118,7 +118,7 @@ def fleet(
     open_store(job.store).write(PAGE, fleet_page(found, price=cost))
     summary = _summary(found, job.store, time.monotonic() - begin)
     if json:
-        from objslam.results.files import dump_json
+        from objslam.io.results.files import dump_json
 
         put(dump_json(summary))
     elif not quiet:

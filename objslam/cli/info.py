@@ -34,9 +34,9 @@ def info(
 ) -> None:
     """Describe a recording: streams, rates, gaps, times, the role of each topic, and what is missing for a run."""
     from objslam.core.diagnostics import Ledger
+    from objslam.io.results.files import dump_json
     from objslam.mapping.checks.boxes import check_boxes
     from objslam.mapping.checks.stamps import check_stamps
-    from objslam.results.files import dump_json
     from objslam.sources.ros_bag.info import describe
     from objslam.sources.summary import contents
 

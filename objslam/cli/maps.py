@@ -29,8 +29,8 @@ def register_results(
 
     from objslam.association.registration.object_maps import reason, register
     from objslam.frontend.up import on_its_side
-    from objslam.results.object_map import ObjectMap
-    from objslam.results.read import load_up
+    from objslam.io.results.object_map import ObjectMap
+    from objslam.io.results.read import load_up
 
     one, other = ObjectMap.load(a), ObjectMap.load(b)
     found = register(one, other)
@@ -139,7 +139,7 @@ def diff_results(
 
 def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
     """Return a warning for each map that does not say what was in view: what the comparison then cannot tell, and why."""
-    from objslam.results.files import VIEWS
+    from objslam.io.results.files import VIEWS
     from objslam.sources.journal.segments import NAME
 
     if not found.registration.accepted:
@@ -174,7 +174,7 @@ def _changes_table(found: Comparison) -> Table:
 
 
 def _say_json(found: Comparison, warnings: list[str]) -> None:
-    from objslam.results.files import dump_json
+    from objslam.io.results.files import dump_json
 
     changes = [
         {

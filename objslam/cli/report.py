@@ -22,8 +22,8 @@ def report_result(
 
     The page of a site has its sessions, and what became of each object.
     """
+    from objslam.io.results.files import dump_json
     from objslam.output.report import write_report
-    from objslam.results.files import dump_json
 
     with progress_bar(quiet=quiet) as show:
         file = write_report(out, log=log, crops=crops, progress=show)

@@ -148,7 +148,7 @@ def _say_json(result: RunResult, more: str, out: Path, removed: tuple[str, ...])
     import json
 
     from objslam.io.objects_json import dump_objects
-    from objslam.results.files import dump_json
+    from objslam.io.results.files import dump_json
 
     objects = json.loads(dump_objects(result.map))["objects"]
     put(dump_json({"out": str(out), "removed": removed, "objects": objects, "summary": result.summary}))

@@ -6,7 +6,7 @@ from pathlib import Path
 from objslam.config.settings import is_file
 from objslam.errors import ConfigError
 
-_FOLDER = Path(__file__).parent.parent / "configs"  # In the sources it is a link to configs/.
+_FOLDER = Path(__file__).parent / "preset_files"  # In the sources it is a link to configs/ at the top.
 
 
 def presets() -> dict[str, Path]:

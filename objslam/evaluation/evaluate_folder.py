@@ -8,8 +8,8 @@ from objslam.errors import LogError
 from objslam.evaluation.alignment import Alignment
 from objslam.evaluation.evaluate import Evaluation, check_radius, evaluate
 from objslam.io.atomic_files import write_file
-from objslam.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, SITE_FRAME, TRAJECTORY, dump_json
-from objslam.results.read import load_map, load_summary, load_trajectory, load_truth
+from objslam.io.results.files import EVALUATION, GROUNDTRUTH, OBJECTS, SITE_FRAME, TRAJECTORY, dump_json
+from objslam.io.results.read import load_map, load_summary, load_trajectory, load_truth
 
 AlignmentChoice = Literal["auto", "none", "se2", "sim2", "se3", "sim3"]
 """An alignment, or `auto`: the alignment that the frame of the map needs (see `choose_alignment`)."""

@@ -16,7 +16,7 @@ from objslam.fleet.drift import drifts
 from objslam.fleet.driver import FleetResult, Mapped
 from objslam.fleet.record import result_name
 from objslam.fleet.tasks.site_task import SITES, folder_of
-from objslam.results.files import OBJECTS, PICTURE, REPORT, SUMMARY
+from objslam.io.results.files import OBJECTS, PICTURE, REPORT, SUMMARY
 
 PAGE = "fleet.html"
 """The name of the page in the store."""

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 from objslam.fleet.stores.store import StoreError
-from objslam.results.files import dump_json
+from objslam.io.results.files import dump_json
 
 RESULTS, RECORDS, SEEN = "results", "records", "seen"
 """The three folders of a fleet. They hold the results by key, their records, and the empty files that `seen_name` names."""

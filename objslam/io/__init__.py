@@ -1,1 +1,4 @@
-"""Read and write files, with one module per format. Folders are defined in `sources`, `results` and `output`."""
+"""Read and write files, with one module per format.
+
+`results` reads result folders back. Folders of logs are in `sources`, and `output` writes results.
+"""

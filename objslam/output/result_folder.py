@@ -23,13 +23,13 @@ from objslam.io.objects_json import dump_objects, dump_truth_objects
 from objslam.io.odometry_parquet import dump_motions
 from objslam.io.ply import write_cloud, write_mesh
 from objslam.io.rays_parquet import RayFeatures, RaysTable, dump_features, dump_rays
+from objslam.io.results import files
+from objslam.io.results.files import dump_doubts, dump_json
+from objslam.io.results.read import load_map
 from objslam.io.tum_trajectory import write_trajectory
 from objslam.io.views_parquet import Views, dump_views
 from objslam.mapping.measured_motions import motions_of
 from objslam.output.export.formats import FORMATS
-from objslam.results import files
-from objslam.results.files import dump_doubts, dump_json
-from objslam.results.read import load_map
 from objslam.sources.log_folder import resembles_log
 
 RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")

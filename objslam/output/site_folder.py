@@ -12,11 +12,11 @@ import numpy as np
 from objslam.core.geometry import split_se2
 from objslam.io.atomic_files import encode, replace_files
 from objslam.io.objects_json import dump_objects
+from objslam.io.results import files
+from objslam.io.results.files import dump_json
 from objslam.mapping.sites.merge import Island
 from objslam.output.plot.changes_plot import draw_site
 from objslam.output.result_folder import RESULT_FILES, prepare_output
-from objslam.results import files
-from objslam.results.files import dump_json
 
 _MOST_ISLANDS = 100
 """Folders of an earlier merge are found up to island_100. With a larger number, more folders of a large merge are found."""

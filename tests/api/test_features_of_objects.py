@@ -12,7 +12,7 @@ import pytest
 
 import objslam
 from objslam.core.object_map import MapObject, ObjectMap
-from objslam.results.read import load_features
+from objslam.io.results.read import load_features
 from objslam.simulation import AppearanceNoise, DriveSettings, simulate
 
 QUIET = {"output": {"picture": False, "recording": False}}

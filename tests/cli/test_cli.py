@@ -27,7 +27,7 @@ from objslam import __version__
 from objslam.config import Odometry, Settings
 from objslam.core.calibration import Calibration
 from objslam.io.calibration_yaml import dump_calibration, load_calibration
-from objslam.results.read import load_map, load_trajectory
+from objslam.io.results.read import load_map, load_trajectory
 from objslam.simulation import preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.trajectory import START

@@ -17,8 +17,8 @@ from objslam.cli import main
 from objslam.cli.explain import doubts_table
 from objslam.config import Output, Settings
 from objslam.core.result import Doubt
+from objslam.io.results.read import load_doubts
 from objslam.output.result_folder import write_result
-from objslam.results.read import load_doubts
 
 TEXT = "191 cup boxes near (0.24, -0.07, 1.94): their rays pass 6 cm apart, 3 sigma are 2 cm."
 CUPS = Doubt("boxes", "apart", "cup", TEXT, (), np.array([0.24, -0.07, 1.94]), np.arange(191), {"miss_m": 0.0612345678})

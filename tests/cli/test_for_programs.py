@@ -86,7 +86,7 @@ def test_images_behind_a_link_are_told_to_who_runs_a_detector(objslam: Objslam, 
     (tmp_path / "photos" / "1.png").write_bytes(b"an image")
     (tmp_path / "log" / "rgb").symlink_to(tmp_path / "photos")
     (tmp_path / "log" / "rgb.txt").write_text("1700000000.5 rgb/1.png\n")
-    model = Path(__file__).parents[2] / "objslam" / "models" / "ssd7.onnx"
+    model = Path(__file__).parents[2] / "objslam" / "detection" / "models" / "ssd7.onnx"
     done = objslam("run", tmp_path / "log", "-o", tmp_path / "out", "--detector", model)
     assert done.code == 1
     done.says_somewhere("no camera has rgb images", "behind a link", "copy them into the log")

@@ -14,7 +14,7 @@ from waiting import LIMIT
 from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.types import CameraLog, Images, Log, Trajectory
-from objslam.results.read import load_map
+from objslam.io.results.read import load_map
 from objslam.sources.log_folder import write_log_folder
 
 WIDTH, HEIGHT, FOCAL, FRAMES = 320, 240, 200.0, 25

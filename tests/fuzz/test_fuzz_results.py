@@ -23,12 +23,12 @@ from objslam.core.result import Doubt
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
 from objslam.io.odometry_parquet import Motions, dump_motions
 from objslam.io.rays_parquet import RayFeatures, dump_features
+from objslam.io.results import files
+from objslam.io.results.read import load_features, load_trajectory
 from objslam.output.export import write_export
 from objslam.output.export.formats import FORMATS
 from objslam.output.report import write_report
 from objslam.output.result_folder import write_result
-from objslam.results import files
-from objslam.results.read import load_features, load_trajectory
 
 READERS = 3 + len(FORMATS)
 """How many commands `read_everything` gives a folder to."""

@@ -15,13 +15,13 @@ from waiting import LIMIT
 from objslam.cli import main
 from objslam.config import Odometry, load_settings
 from objslam.errors import LogError, SolveError
+from objslam.io.results.read import load_map
 from objslam.live.adapters.replay import ReplayAdapter
 from objslam.live.mapper.mapper import Mapper
 from objslam.live.session import session as sessions
 from objslam.live.session.session import Session
 from objslam.live.session.snapshots import Describer
 from objslam.live.worker import Worker
-from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
 from objslam.sources.journal import journal as journals
 from objslam.sources.log_folder import write_log_folder

@@ -20,8 +20,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.io.objects_json import dump_objects, read_objects
+from objslam.io.results.read import load_map
 from objslam.live.session.session import Session
-from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
 from objslam.sources import read
 from objslam.sources.journal.reader import messages

@@ -15,8 +15,8 @@ from waiting import LIMIT
 from objslam.config import load_settings
 from objslam.core.geometry import lift_se2
 from objslam.core.types import Trajectory
+from objslam.io.results.read import load_map
 from objslam.live.session.session import Session
-from objslam.results.read import load_map
 from objslam.simulation import PoseNoise
 
 SETTINGS = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", *HELD))

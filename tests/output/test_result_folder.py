@@ -29,9 +29,9 @@ from objslam.core.result import RunResult
 from objslam.core.types import Association, Truth
 from objslam.errors import LogError, OutputError
 from objslam.io.objects_json import dump_objects, dump_truth_objects, read_objects, read_truth_objects
+from objslam.io.results.read import load_map, load_rays, load_trajectory, load_truth
 from objslam.io.tum_trajectory import write_trajectory
 from objslam.output.result_folder import prepare_output, write_result
-from objslam.results.read import load_map, load_rays, load_trajectory, load_truth
 from objslam.simulation import make_camera
 from objslam.sources.log_folder import write_log_folder
 

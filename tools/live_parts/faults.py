@@ -16,9 +16,9 @@ from live_parts.common import ONLY_ODOMETRY, QUIET, against_truth, compare, repl
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.core.types import Log
+from objslam.io.results.read import load_map
 from objslam.live.adapters.replay import events
 from objslam.live.session.session import Session
-from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
 from objslam.sources.journal.reader import messages
 from objslam.sources.log_folder import write_log_folder

@@ -70,11 +70,11 @@ def live(
     from objslam.api.mapping import prior_map
     from objslam.cli.run import NOT_LOCALISED
     from objslam.errors import ConfigError, OutputError
+    from objslam.io.results.files import RECORDING
     from objslam.live.adapters.replay import ReplayAdapter
     from objslam.live.class_names import NamedSink
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
-    from objslam.results.files import RECORDING
     from objslam.sources.journal.segments import NAME
 
     if view is not None and Path(view).resolve() == (out / RECORDING).resolve():

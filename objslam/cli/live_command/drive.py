@@ -52,8 +52,8 @@ class LatestObjects:
         """Write the objects of a snapshot, unless the session has no keyframe yet."""
         from objslam.io.atomic_files import write_file
         from objslam.io.objects_json import dump_objects
+        from objslam.io.results.files import OBJECTS
         from objslam.output.result_folder import clear_result
-        from objslam.results.files import OBJECTS
 
         if snapshot.keyframes and not self._begun:
             self._begun = True

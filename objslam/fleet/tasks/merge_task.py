@@ -22,7 +22,7 @@ from objslam.fleet.stores.local_store import LocalStore
 from objslam.fleet.stores.open_store import open_store
 from objslam.fleet.stores.store import Store, StoreError
 from objslam.fleet.tree import Node, node_name
-from objslam.results import files
+from objslam.io.results import files
 
 if TYPE_CHECKING:
     from objslam.core.object_map import ObjectMap
@@ -182,7 +182,7 @@ def _compound(site_T_part: Floats, covariance: Floats, one: Placed) -> Floats:
 
 def _dump(islands: Sequence[SiteMap]) -> bytes:
     from objslam.io.objects_json import dump_objects
-    from objslam.results.files import dump_json
+    from objslam.io.results.files import dump_json
 
     said = [
         {

@@ -18,7 +18,7 @@ from objslam.fleet.record import Record, record_name, result_name
 from objslam.fleet.stores.open_store import open_store
 from objslam.fleet.stores.store import Store, StoreError
 from objslam.fleet.tasks.merge_task import Placed, SiteMap, load_node
-from objslam.results.files import OBJECTS, SUMMARY, dump_json
+from objslam.io.results.files import OBJECTS, SUMMARY, dump_json
 
 if TYPE_CHECKING:
     from objslam.mapping.sites.merge import Island

@@ -17,8 +17,8 @@ from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Up
 from objslam.io.objects_json import read_objects
 from objslam.io.rays_parquet import RaysTable
+from objslam.io.results.read import load_map, load_rays, load_up, load_views
 from objslam.io.views_parquet import Views
-from objslam.results.read import load_map, load_rays, load_up, load_views
 
 _SAME_FRAME = 0.005
 """The longest time (s) between the stamps of a ray and of its camera frame. A larger value also matches inexact stamps, and

@@ -11,7 +11,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 from objslam.errors import ConfigError
 from objslam.io.odometry_parquet import Motions
-from objslam.results.read import is_site, load_map, load_motions, load_trajectory
+from objslam.io.results.read import is_site, load_map, load_motions, load_trajectory
 
 _SEMI_MAJOR = 6_378_137.0  # The semi-major axis of the WGS 84 ellipsoid, m.
 _FLATTENING = 1 / 298.257223563  # The flattening of the WGS 84 ellipsoid.

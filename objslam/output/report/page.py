@@ -18,16 +18,8 @@ from objslam.evaluation.alignment import lay_truth
 from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
 from objslam.io.rays_parquet import RaysTable
-from objslam.mapping.checks.assessment import HEADLINES
-from objslam.output.report.cards import make_cards
-from objslam.output.report.charts import histogram
-from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of, spread_over_time
-from objslam.output.report.render import render
-from objslam.output.report.scene import scene_data
-from objslam.output.report.site_page import write_site_report
-from objslam.output.report.trends import trends
-from objslam.results.files import CONFIG, PICTURE, REPORT
-from objslam.results.read import (
+from objslam.io.results.files import CONFIG, PICTURE, REPORT
+from objslam.io.results.read import (
     is_site,
     load_doubts,
     load_evaluation,
@@ -37,6 +29,14 @@ from objslam.results.read import (
     load_summary,
     load_truth,
 )
+from objslam.mapping.checks.assessment import HEADLINES
+from objslam.output.report.cards import make_cards
+from objslam.output.report.charts import histogram
+from objslam.output.report.crops import Kind, choose_rays, choose_unexplained, cut_crops, images_of, spread_over_time
+from objslam.output.report.render import render
+from objslam.output.report.scene import scene_data
+from objslam.output.report.site_page import write_site_report
+from objslam.output.report.trends import trends
 
 _BINS = 32  # The number of bars in the histogram of all rays. More bars show more detail, and each has fewer rays.
 _LABELS = 12  # The most labels for which the page shows boxes of no object. More make a list that nobody reads.

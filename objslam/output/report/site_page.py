@@ -7,12 +7,12 @@ from pathlib import Path
 from objslam.core.object_map import FATES, Life, ObjectMap
 from objslam.core.validity import is_date
 from objslam.io.atomic_files import write_file
+from objslam.io.results.files import PICTURE, REPORT
+from objslam.io.results.read import load_map, load_summary
 from objslam.output.plot.changes_plot import outcome_colour, outcome_of
 from objslam.output.plot.style import captions
 from objslam.output.report.render import render
 from objslam.output.report.scene import hexadecimal, scene_data
-from objslam.results.files import PICTURE, REPORT
-from objslam.results.read import load_map, load_summary
 
 
 def write_site_report(out: Path) -> Path:

@@ -18,10 +18,10 @@ import numpy as np
 from objslam.errors import ConfigError, OutputError
 from objslam.io.atomic_files import disk_errors
 from objslam.io.folders import remove_leftovers, temporary_name
+from objslam.io.results.files import OBJECTS, RECORDING, hint_below
+from objslam.io.results.read import refuse_site
 from objslam.io.threads import start_thread
 from objslam.output.viewer.times import STAMP
-from objslam.results.files import OBJECTS, RECORDING, hint_below
-from objslam.results.read import refuse_site
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

@@ -14,13 +14,13 @@ from rerun.chunk import RrdReader
 from objslam.core.arrays import Bools, Floats
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import ConfigError, OutputError
+from objslam.io.results.files import RECORDING
+from objslam.io.results.read import load_map, load_rays, load_trajectory
 from objslam.output.plot.style import RayKind, captions, evenly
 from objslam.output.viewer.event_log import markdown, table
 from objslam.output.viewer.objects import log_objects
 from objslam.output.viewer.rays import RAY_COLOURS
 from objslam.output.viewer.view_point import ViewPoint, first_view_point, look_at
-from objslam.results.files import RECORDING
-from objslam.results.read import load_map, load_rays, load_trajectory
 from objslam.triangulation.proximity_field import ProximityField, main_heading, proximity_field, supporting_rays
 
 if TYPE_CHECKING:

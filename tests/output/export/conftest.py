@@ -8,9 +8,9 @@ import pytest
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
+from objslam.io.results.read import load_map
 from objslam.mapping.pipeline import run
 from objslam.output.result_folder import write_result
-from objslam.results.read import load_map
 from objslam.simulation import preset, simulate
 
 LEAN = ("output.recording=false", "output.picture=false", "checks.use=false", "bodies.use=false")

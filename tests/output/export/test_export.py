@@ -19,11 +19,11 @@ from objslam.config import Output, Settings
 from objslam.core.diagnostics import Ledger
 from objslam.errors import ConfigError, OutputError
 from objslam.graph.factors.odometry import motions
+from objslam.io.results.read import load_map, load_trajectory
 from objslam.mapping import pipeline
 from objslam.output.export import FORMATS, write_export
 from objslam.output.export.content import Datum
 from objslam.output.result_folder import write_result
-from objslam.results.read import load_map, load_trajectory
 
 SCHEMA = json.loads((Path(__file__).parent / "rfc7946.json").read_text())
 

@@ -11,10 +11,10 @@ from rosbags.highlevel import AnyReader
 from objslam.core.geometry import quaternion
 from objslam.core.types import Trajectory
 from objslam.errors import OutputError
+from objslam.io.results.read import load_map, load_trajectory
 from objslam.output.export import write_export
 from objslam.output.export.content import load_content
 from objslam.output.export.formats.mcap_file import EXPORT
-from objslam.results.read import load_map, load_trajectory
 
 
 @pytest.fixture(scope="module")

@@ -28,13 +28,13 @@ from objslam.core.result import DOUBT_KINDS, Doubt
 from objslam.errors import OutputError
 from objslam.evaluation.evaluate import evaluate
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
+from objslam.io.results.files import dump_doubts
+from objslam.io.results.read import load_map, load_rays, load_trajectory, load_truth
 from objslam.mapping import pipeline
 from objslam.output.report import write_report
 from objslam.output.report.charts import HEIGHT, axis_end, histogram
 from objslam.output.report.crops import best_rays
 from objslam.output.result_folder import write_result
-from objslam.results.files import dump_doubts
-from objslam.results.read import load_map, load_rays, load_trajectory, load_truth
 from objslam.simulation import make_camera
 from objslam.sources import SourceOptions, read
 

@@ -14,12 +14,12 @@ from objslam.config import Output, Settings
 from objslam.core.calibration import Calibration
 from objslam.core.types import Images
 from objslam.io.rays_parquet import RaysTable
+from objslam.io.results.read import load_rays
 from objslam.output.report import write_report
 from objslam.output.report.charts import HEIGHT, WIDTH
 from objslam.output.report.crops import cut_crops
 from objslam.output.report.trends import trends
 from objslam.output.result_folder import write_result
-from objslam.results.read import load_rays
 
 QUICK = Settings(mode="joint", output=Output(recording=False, picture=False))
 

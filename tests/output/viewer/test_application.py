@@ -19,9 +19,9 @@ from waiting import LIMIT, wait_for
 
 from objslam.cli.commands import build_app
 from objslam.errors import OutputError
+from objslam.io.results.read import load_map
 from objslam.output.viewer import application
 from objslam.output.viewer.recording import write_recording
-from objslam.results.read import load_map
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from objslam.cli import main
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.io.camera_yaml import write_camera
-from objslam.results.read import load_map
+from objslam.io.results.read import load_map
 from objslam.sources.log_folder import read_log_folder
 
 

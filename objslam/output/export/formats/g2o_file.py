@@ -21,7 +21,7 @@ def _dump(content: Content) -> bytes:
     """
     import numpy as np
 
-    from objslam.results.read import refuse_site
+    from objslam.io.results.read import refuse_site
 
     refuse_site(content.out, "path")
     motions, path = content.motions, content.path

@@ -22,7 +22,7 @@ class ObjectMap(object_map.ObjectMap):
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
         """Load the map of a result folder, or from a file that `save` wrote. OutputError names the place of an error."""
-        from objslam.results.read import load_map  # deferred, because it imports scipy
+        from objslam.io.results.read import load_map  # deferred, because it imports scipy
 
         found = read_objects(Path(path)) if Path(path).is_file() else load_map(Path(path))
         return cls.of(found)

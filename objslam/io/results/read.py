@@ -15,10 +15,10 @@ from objslam.io.atomic_files import has_staging
 from objslam.io.objects_json import read_objects, read_truth_objects
 from objslam.io.odometry_parquet import Motions, read_motions
 from objslam.io.rays_parquet import RayFeatures, RaysTable, read_features, read_rays
+from objslam.io.results import files
+from objslam.io.results.shapes import DoubtsFile, EvaluationFile, Summary, fault_of
 from objslam.io.tum_trajectory import read_trajectory
 from objslam.io.views_parquet import Views, read_views
-from objslam.results import files
-from objslam.results.shapes import DoubtsFile, EvaluationFile, Summary, fault_of
 
 
 def load_map(out: Path) -> ObjectMap:
