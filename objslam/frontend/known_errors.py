@@ -24,10 +24,6 @@ _PLACE_BESIDE_ODOMETRY = 0.02
 """The same for joint mode with localisation and odometry. Poses that may move explain what a wrong place does. In a short
 live drive, the map was off by 4 cm with this value, and by 11 cm with `_PLACE`. Logs with places that were 1.5 cm off were
 as good with both."""
-_LENS = 0.02
-"""The prior standard deviation of the focal length, as a share, and of the image centre, as a share of the focal length, in
-fixed mode: a field of view from a data sheet, and a centre that is assumed in the middle of the image. A calibrated camera
-errs less. With a larger value, a log must show more before an error counts as known."""
 COARSE = 0.3
 """Fixed poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
@@ -57,9 +53,8 @@ def usual_place(log: Log, settings: Settings) -> float:
 def prior_sigma(name: str, settings: Settings, place: float) -> float:
     """Return the prior standard deviation of an error in the settings, in the unit of the error, 0 if the error is fixed.
 
-    In fixed mode, the errors are estimated from bearings and given poses. So errors of lengths and of odometry are fixed. In
-    joint mode, "auto" fixes the lens: poses that may move also explain what a lens does, and a lens that may err makes a
-    wrong association fit. place: what `usual_place` returns for the log.
+    In fixed mode, the errors are estimated from bearings and given poses. So errors of lengths and of odometry are fixed.
+    place: what `usual_place` returns for the log.
     """
     what, fixed = kind(name), settings.mode == "fixed"
     if fixed and (name in ODOMETRY or what in OF_LENGTHS):
@@ -67,7 +62,7 @@ def prior_sigma(name: str, settings: Settings, place: float) -> float:
     setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
     sigma = getattr(settings.calibration, setting)
     if sigma == "auto":
-        return place if setting == "translation" else _LENS * fixed
+        return place
     return float(sigma)
 
 
@@ -93,14 +88,14 @@ def possible(log: Log, settings: Settings) -> list[str]:
     """Return the names of the errors of a log that the settings do not fix.
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
-    position have no errors, unless settings.calibration.use is true. In fixed mode its lens has no errors either, because
-    such poses come from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves: that in
+    position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
+    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves: that in
     space comes from a camera or a scanner, not from wheels. With a localisation, odometry only leads from pose to pose, and
     a slip, which these short ways hardly tell, would give wrong associations more freedom.
     """
     asked, place = settings.calibration.use is True, usual_place(log, settings)
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
-    mounted = (*AXES, "x", "y", "z", *(LENS if settings.mode == "fixed" else ()))
+    mounted = (*AXES, *LENS, "x", "y", "z")
     names = [n for n in error_names(log) if prior_sigma(n, settings, place) > 0]
     if log.localization is not None or (log.odometry is not None and not is_planar(log.odometry.poses)):
         names = [n for n in names if kind(n) != "turn_slip"]

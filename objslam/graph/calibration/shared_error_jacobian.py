@@ -172,7 +172,7 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
         return joined.keyframes(images), joined.rays(images, rays.take(of.which)), settings
 
     here = measured(theta)
-    parts = _parts(of, here[1].sigma)
+    parts = _parts(of, here[0].base_T_camera, here[1].sigma)
     values = [part.measured(*here) for part in parts]
     residuals = [part.residuals(*value) if value else np.zeros(0) for part, value in zip(parts, values, strict=True)]
     for k, name in enumerate(errors.names):
@@ -203,8 +203,11 @@ class _Part:
     residuals: Callable[..., Floats]
 
 
-def _parts(of: Linearised, usual: Floats) -> tuple[_Part, ...]:
-    """Return the kinds of measurements that shared errors may change. usual: (n,) rad, the present sigmas of the rays."""
+def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
+    """Return the kinds of measurements that shared errors may change.
+
+    mounts: (P, 4, 4) the present base_T_camera. usual: (n,) rad, the present sigmas of the rays.
+    """
     graph, map_T_camera = of.graph, of.map_T_camera
     (before, after), ranged = graph.moves, graph.ranged
     seen = graph.seen(map_T_camera, of.positions[of.landmarks])
@@ -227,18 +230,28 @@ def _parts(of: Linearised, usual: Floats) -> tuple[_Part, ...]:
     def distances(measured: Floats, to_landmark: Floats) -> Floats:
         return np.asarray(range_root * (np.linalg.norm(to_landmark, axis=1) - measured) / (measured / range_))
 
+    def turned(keyframes: Keyframes) -> Floats:
+        """Return the poses (P, 4, 4) of the cameras on another mount in the frames of these cameras on the present one."""
+        return inverse(mounts) @ keyframes.base_T_camera
+
+    def off(measured: Floats, moved: Floats, turned: Floats) -> Floats:
+        # The noise belongs to base. It turns with the camera, or a residual of the heading would make the tilt of the camera
+        # look known: turned by this tilt, it would become a roll of the robot, whose noise is far smaller.
+        return log_se3(turned @ inverse(measured) @ moved @ inverse(turned))
+
     def said(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
         if not len(before) or keyframes.odom_T_base is None:
             return ()
         odom_T_camera = keyframes.odom_T_base @ keyframes.base_T_camera
-        return inverse(odom_T_camera[before]) @ odom_T_camera[after], np.array(settings.odometry.floor_xy / floor)
+        way = np.array(settings.odometry.floor_xy / floor)
+        return inverse(odom_T_camera[before]) @ odom_T_camera[after], way, turned(keyframes)[after]
 
-    def motions(motion: Floats, way: Floats) -> Floats:
-        off = log_se3(inverse(motion) @ moved) / np.repeat([1.0, float(way)], 3)
-        return motion_weight[:, None] * np.einsum("kij,kj->ki", graph.motion_roots, off)
+    def motions(motion: Floats, way: Floats, turned: Floats) -> Floats:
+        twist = off(motion, moved, turned) / np.repeat([1.0, float(way)], 3)
+        return motion_weight[:, None] * np.einsum("kij,kj->ki", graph.motion_roots, twist)
 
-    def poses(measured: Floats) -> Floats:
-        return np.einsum("kij,kj->ki", absolute_root, log_se3(inverse(measured) @ absolute))
+    def poses(measured: Floats, turned: Floats) -> Floats:
+        return np.einsum("kij,kj->ki", absolute_root, off(measured, absolute, turned))
 
     (squares, *others), landmarks = graph.further, of.positions[of.landmarks]
 
@@ -252,12 +265,13 @@ def _parts(of: Linearised, usual: Floats) -> tuple[_Part, ...]:
         if localized is None:
             return ()
         poses = keyframes.map_T_camera
-        return (inverse(poses[localized.of.before]) @ poses[localized.of.after],)
+        motion = inverse(poses[localized.of.before]) @ poses[localized.of.after]
+        return motion, turned(keyframes)[localized.of.after]
 
-    def localized_motions(motion: Floats) -> Floats:
+    def localized_motions(motion: Floats, turned: Floats) -> Floats:
         assert localized is not None
-        off = log_se3(inverse(motion) @ localized.moved(map_T_camera))
-        return np.einsum("kij,kj->ki", localized.weighted_roots(map_T_camera), off)
+        twist = off(motion, localized.moved(map_T_camera), turned)
+        return np.einsum("kij,kj->ki", localized.weighted_roots(map_T_camera), twist)
 
     return (
         _Part(0, lambda _, rays, settings: (rays.direction, rays.sigma, from_origins(rays, seen)), bearings),
@@ -269,7 +283,10 @@ def _parts(of: Linearised, usual: Floats) -> tuple[_Part, ...]:
         _Part(graph.first_motion, said, motions),
         _Part(
             graph.first_motion + 6 * len(before),
-            lambda keyframes, rays, settings: (keyframes.map_T_camera[: len(absolute)],),
+            lambda keyframes, rays, settings: (
+                keyframes.map_T_camera[: len(absolute)],
+                turned(keyframes)[: len(absolute)],
+            ),
             poses,
         ),
         _Part(graph.first_further, sides, lambda side: squares.by_sides(landmarks, side)),
