@@ -52,9 +52,9 @@ class CalibrationSettings(Section):
     tag_scale: NotNegative = 0.01
     """share by which all fiducials of a given size are smaller or larger than the settings say. A printer, a ruler, the lens
     and the detector of the corners each add to it. It is estimated in joint mode only."""
-    focal: NotNegative = 0.02
-    """share by which the focal length of each camera is too long or too short. A field of view from a data sheet errs by as
-    much, a calibrated camera by less."""
+    focal: Literal["auto"] | NotNegative = "auto"
+    """share by which the focal length of each camera is too long or too short. auto: 0.02 in fixed mode and with a
+    localisation, 0 in joint mode with odometry alone."""
     centre: NotNegative = 0.02
     """share of the focal length by which the image centre of each camera is off, along each axis. A centre that is assumed
     in the middle of the image errs by as much, a calibrated camera by less."""

@@ -115,7 +115,7 @@ def test_noise_is_scaled_with_what_it_belongs_to(clean):
 @pytest.mark.parametrize(
     ("overrides", "there", "missing"),
     [
-        ((), ("odometry.scale", "front.clock", "front.yaw", "front.focal", "range_offset"), ("front.x",)),
+        ((), ("odometry.scale", "front.clock", "front.yaw", "front.cx", "range_offset"), ("front.focal", "front.x")),
         (("depth.use=false",), ("odometry.scale",), ("range_scale", "range_offset")),
         (("calibration.yaw=0", "calibration.scale=0"), ("front.roll",), ("front.yaw", "odometry.scale")),
     ],
