@@ -1,6 +1,7 @@
 """Joint mode with a localisation and no odometry: the errors of cameras are found, and the covariances have the rest."""
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from objslam.config import load_settings
@@ -35,6 +36,7 @@ def mapped(log: Log, *changes: str) -> tuple[RunResult, Floats, Floats]:
     return result, np.array([one.position - true[one.label] for one in found]), np.array([one.covariance for one in found])
 
 
+@pytest.mark.long
 def test_errors_drawn_from_their_priors_are_found_and_the_map_is_honest() -> None:
     squared = []
     for seed in range(4):
