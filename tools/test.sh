@@ -16,6 +16,7 @@ mypy=$!
 trap 'kill "$mypy" 2>/dev/null || true; rm -f "$found"' EXIT
 failed=0
 .venv/bin/pytest -q -n 2 --dist worksteal "$@" || failed=$?
+[ "$failed" != 2 ] || exit 2 # Somebody interrupted the tests, and need not wait for mypy.
 wait "$mypy" || failed=1
 cat "$found"
 exit "$failed"
