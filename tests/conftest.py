@@ -5,6 +5,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from commands import Call
@@ -40,6 +41,18 @@ def few_gigabytes() -> None:
 def no_progress() -> None:
     """How long a command takes, and so what it says while it works, is no part of a test. Tests of it set another time."""
     console._EVERY = threading.TIMEOUT_MAX
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_the_disk() -> None:
+    """No test cuts the power: they kill processes, and a killed process leaves what it wrote to the kernel. So nothing waits
+    until it is on the disk, which takes some milliseconds each time. A descriptor that is no file is still an error. Tests
+    that count such calls, or let them fail, replace these functions in turn."""
+
+    def sync(file: Any) -> None:
+        os.fstat(file if isinstance(file, int) else file.fileno())
+
+    os.fsync = os.fdatasync = sync  # type: ignore[assignment]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -57,18 +57,23 @@ class Solid:
         )  # fmt: skip
 
 
-def apart(first, second, gap=0.0):
-    """The line (normal (2,), offset) that separates two footprints by the largest gap, m, None if the gap is smaller."""
-    best = None
-    for sign, polygon in ((1, first), (-1, second)):
+def separations(first, second, gap=0.0):
+    """The lines (normal (2,), offset, gap) along edges of two footprints that separate them by more than a gap, m."""
+    for sign, polygon, other in ((1, first, second), (-1, second, first)):
         along = np.roll(polygon, -1, axis=0) - polygon
+        centred = polygon - polygon.mean(axis=0)
         for normal in np.column_stack([along[:, 1], -along[:, 0]]) / np.linalg.norm(along, axis=1)[:, None]:
-            if ((polygon - polygon.mean(axis=0)) @ normal).max() < ((polygon.mean(axis=0) - polygon) @ normal).max():
+            side = centred @ normal
+            if side.max() < -side.min():
                 normal = -normal
-            here, there = (polygon @ normal).max(), ((second if sign > 0 else first) @ normal).min()
-            if there - here > (gap if best is None else best[2]):
-                best = sign * normal, sign * (here + there) / 2, there - here
-    return best
+            here, there = (polygon @ normal).max(), (other @ normal).min()
+            if there - here > gap:
+                yield sign * normal, sign * (here + there) / 2, there - here
+
+
+def apart(first, second):
+    """The line of `separations` with the largest gap, None if there is none."""
+    return max(separations(first, second), key=lambda line: line[2], default=None)
 
 
 def lines_between(solids):
@@ -115,13 +120,17 @@ def boxes_at(solids, lines, pose, *, hiding=True):
         outline = image_of(solids[i].points, pose)
         if outline is None:
             continue
-        own = np.zeros_like(covered)
-        cv2.fillConvexPoly(own, np.round(_FINE * (outline - 0.5)).astype(np.int32), 1, shift=4)
-        shown = own & ~covered & 1 if hiding else own
+        part = np.maximum(outline.min(axis=0).astype(int) - 2, 0), outline.max(axis=0).astype(int) + 3
+        left, top = part[0].tolist()
+        covers = covered[top : max(part[1][1], 0), left : max(part[1][0], 0)]  # The rest of the image stays as it is.
+        own = np.zeros_like(covers)
+        if own.size:
+            cv2.fillConvexPoly(own, np.round(_FINE * (outline - 0.5 - part[0])).astype(np.int32), 1, shift=4)
+        shown = own & ~covers & 1 if hiding else own
         if solids[i].label is not None and own.sum() > 50 and shown.sum() >= LEAST_SHOWN * own.sum():
-            x, y = np.flatnonzero(shown.any(axis=0)), np.flatnonzero(shown.any(axis=1))
+            x, y = left + np.flatnonzero(shown.any(axis=0)), top + np.flatnonzero(shown.any(axis=1))
             found.append((i, [x[0], y[0], x[-1] + 1, y[-1] + 1]))
-        covered |= own
+        covers |= own
     return [i for i, _ in found], np.array([box for _, box in found], dtype=float).reshape(-1, 4)
 
 
@@ -130,7 +139,7 @@ def scene(rng, *, groups=7, pillars=False):
 
     pillars: whether posts and ends of walls without a box stand in place of the front things.
     """
-    solids = []
+    solids, footprints = [], []
 
     def place(label, at, size, shape):
         for _ in range(60):
@@ -139,9 +148,11 @@ def scene(rng, *, groups=7, pillars=False):
                 half = np.array([*rng.uniform([0.05, 0.05], [0.1, 0.25]), 1.2])
             where = at + rng.normal(0, 0.25, 2)
             one = Solid(shape, label, np.array([*where, half[2]]), half, float(rng.uniform(-1.5, 1.5)))
-            near = np.linalg.norm(one.footprint / [2.2, 1.8], axis=1).min() < 1.15
-            if not near and all(apart(one.footprint, other.footprint, 0.08) for other in solids):
+            here = one.footprint
+            near = np.linalg.norm(here / [2.2, 1.8], axis=1).min() < 1.15
+            if not near and all(any(map(bool, separations(here, other, 0.08))) for other in footprints):
                 solids.append(one)
+                footprints.append(here)
                 return
 
     for turn in np.linspace(0, 2 * np.pi, groups, endpoint=False) + rng.uniform(0, 1):

@@ -303,15 +303,16 @@ def test_a_mirrored_world_is_the_path_that_goes_wrong():
 
 
 def run(log: Log, mode: str, *more: str):
+    """A run without bodies, which say nothing about wrong input."""
     ledger = Ledger()
-    settings = load_settings(None, (f"mode={mode}", "output.recording=false", *more))
+    settings = load_settings(None, (f"mode={mode}", "output.recording=false", "bodies.use=false", *more))
     return pipeline.run(log, settings, ledger), ledger
 
 
 @pytest.mark.parametrize("name", ["base_T_camera inverted", "y of poses negated", "boxes yxyx", "clock +1 s"])
 def test_a_map_of_wrong_input_has_no_object_that_is_ok(name):
     wrong = MISTAKES[name](drive("fixed"))
-    result, ledger = run(wrong, "fixed", "bodies.use=false", "calibration.use=false")
+    result, ledger = run(wrong, "fixed", "calibration.use=false")
     assert result.map.resolved() == ()
     assert any("no object is called ok" in warning for warning in ledger.warnings)
     (first, *_) = result.summary["wrong_input"]
@@ -438,8 +439,8 @@ def test_the_checks_can_be_switched_off():
 
 
 def test_a_clean_map_is_as_it_is_without_the_checks():
-    with_checks, _ = run(drive("fixed"), "fixed")
-    without, _ = run(drive("fixed"), "fixed", "checks.use=false")
+    with_checks, _ = run(drive("fixed"), "fixed", "bodies.use=true")
+    without, _ = run(drive("fixed"), "fixed", "bodies.use=true", "checks.use=false")
     assert with_checks.summary["wrong_input"] == []
     for one, other in zip(with_checks.map.objects, without.map.objects, strict=True):
         np.testing.assert_array_equal(one.position, other.position)

@@ -29,7 +29,7 @@ def with_power(log, power):
 
 def found_in(log, mode):
     ledger = Ledger()
-    result = pipeline.run(log, load_settings(None, (f"mode={mode}", "output.recording=false")), ledger)
+    result = pipeline.run(log, load_settings(None, (f"mode={mode}", "output.recording=false", "bodies.use=false")), ledger)
     return [one for one in result.summary["wrong_input"] if one["name"] == "depth axis"], ledger.warnings
 
 

@@ -33,7 +33,9 @@ def drive(seed: int, wrong: bool) -> tuple[Log, dict[str, float]]:
 
 
 def run(log: Log, *overrides: str, ledger: Ledger | None = None) -> RunResult:
-    settings = load_settings(None, ("mode=fixed", "output.recording=false", "checks.use=false", *overrides))
+    settings = load_settings(
+        None, ("mode=fixed", "output.recording=false", "checks.use=false", "bodies.use=false", *overrides)
+    )
     return pipeline.run(log, settings, ledger or Ledger())
 
 

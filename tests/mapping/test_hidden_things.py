@@ -41,6 +41,7 @@ def no_hidden_edges(monkeypatch):
     return turn_off
 
 
+@pytest.mark.long
 def test_things_in_front_move_and_shrink_no_objects(no_hidden_edges):
     logs = [hiding_drive(seed) for seed in (0, 2)]
     errors, squared, sizes = (np.concatenate(part) for part in zip(*map(mapped, logs), strict=True))
@@ -80,19 +81,30 @@ def test_edges_of_visible_parts_are_found_behind_boxes(monkeypatch):
     assert hidden[~true].mean() < 0.15
 
 
-def test_hidden_boxes_make_a_position_by_rays_less_sure():
-    log = hiding_drive(0, frames=200)
-    solution, found = None, []
-    given = fitting.with_bodies
+@pytest.fixture(scope="module")
+def stages():
+    """What two stages of one run made, by their names: (what went in, what came out) of the last call of each."""
+    log, made = hiding_drive(0, frames=200), {}
 
-    def noted(*arguments):
-        found.append(given(*arguments))
-        return found[-1]
+    def noted(name):
+        given = getattr(pipeline, name)
+
+        def stage(solution, *arguments):
+            made[name] = solution, given(solution, *arguments)
+            return made[name][1]
+
+        return stage
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "with_bodies", noted)
+        for name in ("with_bodies", "with_box_offsets"):
+            patch.setattr(pipeline, name, noted(name))
         pipeline.run(log, SETTINGS, Ledger())
-    solution, cameras = found[-1], tuple(c.camera for c in log.cameras)
+    return log, made
+
+
+def test_hidden_boxes_make_a_position_by_rays_less_sure(stages):
+    log, made = stages
+    solution, cameras = made["with_bodies"][1], tuple(c.camera for c in log.cameras)
     assert solution.hidden.any()
     assert not solution.hidden.all()
     more = with_hidden_parts(solution, cameras).estimate.covariance - solution.estimate.covariance
@@ -104,18 +116,8 @@ def test_hidden_boxes_make_a_position_by_rays_less_sure():
     assert with_hidden_parts(clear, cameras) is clear
 
 
-def test_a_body_behind_things_has_the_errors_that_its_boxes_share():
-    log, found = hiding_drive(0, frames=200), []
-    given = pipeline.with_box_offsets
-
-    def noted(solution, cameras, settings):
-        found.append((solution, given(solution, cameras, settings)))
-        return found[-1][1]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "with_box_offsets", noted)
-        pipeline.run(log, SETTINGS, Ledger())
-    before, after = found[-1]
+def test_a_body_behind_things_has_the_errors_that_its_boxes_share(stages):
+    before, after = stages[1]["with_box_offsets"]
     wider = {
         j: np.trace((after.bodies[j].covariance - body.covariance)[:3, :3])
         for j, body in enumerate(before.bodies)

@@ -31,7 +31,7 @@ def jumping(seed: int, early: bool) -> Log:
 
 
 def mapped(log: Log, jumps: str) -> pipeline.RunResult:
-    settings = load_settings(None, ("mode=fixed", "output.recording=false", f"poses.jumps={jumps}"))
+    settings = load_settings(None, ("mode=fixed", "output.recording=false", "bodies.use=false", f"poses.jumps={jumps}"))
     return pipeline.run(log, settings, Ledger())
 
 

@@ -1,6 +1,7 @@
 """Joint mode with a localisation and no odometry: the errors of cameras are found, and the covariances have the rest."""
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from objslam.config import load_settings
@@ -25,7 +26,9 @@ def drive(seed: int, errors: dict[str, float]) -> Log:
 
 def mapped(log: Log, *changes: str) -> tuple[RunResult, Floats, Floats]:
     """The result in joint mode, and the errors (n, 3) m and covariances (n, 3, 3) of its objects."""
-    result = pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false", *changes)), Ledger())
+    result = pipeline.run(
+        log, load_settings(None, ("mode=joint", "output.recording=false", "checks.use=false", *changes)), Ledger()
+    )
     assert log.truth is not None
     true = {one.label: one.position for one in log.truth.objects}
     found = result.map.resolved()
@@ -33,6 +36,7 @@ def mapped(log: Log, *changes: str) -> tuple[RunResult, Floats, Floats]:
     return result, np.array([one.position - true[one.label] for one in found]), np.array([one.covariance for one in found])
 
 
+@pytest.mark.long
 def test_errors_drawn_from_their_priors_are_found_and_the_map_is_honest() -> None:
     squared = []
     for seed in range(4):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from objslam.mapping.checks import meeting_points
 from objslam.mapping.checks.meeting_points import fit_points, nearest_point
 
 
@@ -84,3 +85,26 @@ def test_the_nearest_point_is_that_of_least_squares():
         truth = least_squares(lambda x, o=o, d=d, s=distance: (np.cross(x - o, d) / s).ravel(), start[one]).x
         np.testing.assert_allclose(found[one], truth, atol=1e-6)
         np.testing.assert_allclose(nearest_point(o, d, start[one]), truth, atol=1e-6)
+
+
+def test_a_ray_fits_a_point_as_its_offset_says():
+    """Point by point and ray by ray: 1 on the ray, 0 from the tolerance on, behind the camera, near it, and for no ray."""
+    rng, place = np.random.default_rng(1), 0.1
+    origins, points = rng.uniform(-1, 1, (2, 30, 3)), rng.uniform(-3, 3, (2, 40, 3))
+    directions = points[:, :30] - origins + rng.normal(0, 0.2, (2, 30, 3))
+    directions /= np.linalg.norm(directions, axis=2, keepdims=True)
+    points[:, 30:] = origins[:, :10] + rng.uniform(-0.4, 0.4, (2, 10, 1)) * directions[:, :10]
+    tolerance, real = rng.uniform(0.02, 0.2, (2, 30)), rng.random((2, 30)) < 0.9
+    middle = np.zeros((2, 3))
+    rows = meeting_points._Rows(np.zeros((2, 30), dtype=int), real, origins, directions, tolerance, place, middle)
+    told, seen = rows.fit(points), set()
+    for label, p, r in np.ndindex(told.shape):
+        to = points[label, p] - origins[label, r]
+        along = to @ directions[label, r]
+        off = np.linalg.norm(to - along * directions[label, r])
+        ratio = off / np.hypot(tolerance[label, r] * np.linalg.norm(to), place)
+        near = along <= 0.25
+        fits = 0.0 if near or not real[label, r] else max(1 - ratio**2, 0.0)
+        assert told[label, p, r] == pytest.approx(fits, abs=1e-9)
+        seen.add((near and ratio < 1 and along > 0, fits > 0.5, bool(real[label, r])))
+    assert {(True, False, True), (False, True, True), (False, False, True), (False, False, False)} <= seen

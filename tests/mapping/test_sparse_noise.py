@@ -123,6 +123,7 @@ def test_boxes_without_a_ray_are_no_street():
     assert with_sparse_noise(log, FIXED, accused(), Ledger(), silent) == (FIXED, accused())
 
 
+@pytest.mark.usefixtures("few_tried")
 def test_noise_that_the_settings_say_is_not_changed():
     log = simulate_street(3).log
     said = FIXED.model_copy(update={"localization": FIXED.localization.model_copy(update={"xy": 0.03})})

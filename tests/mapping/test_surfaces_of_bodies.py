@@ -16,10 +16,12 @@ from objslam.mapping import pipeline
 from objslam.mapping.bodies import fitting
 from objslam.mapping.solution import RangeShift
 
+JOINT = ("mode=joint", "poses.use=odometry", "output.recording=false", "checks.use=false")
+
 
 def mapped(log, *changes):
     """The scores, after an alignment with a scale, and the solution, of a run from odometry alone."""
-    settings, found = load_settings(None, ("mode=joint", "poses.use=odometry", "output.recording=false", *changes)), []
+    settings, found = load_settings(None, (*JOINT, *changes)), []
     given = pipeline.solve
 
     def noted(*args, **more):
@@ -81,6 +83,7 @@ def test_bodies_tell_how_far_centres_are_behind_surfaces():
         assert np.median(told[known]) == pytest.approx(np.median(np.array(behind)[known]), abs=allowed)
 
 
+@pytest.mark.long
 def test_large_things_tell_the_scale_of_the_map():
     """Things of up to 2.5 m, whose centres are farther behind than `depth.centre` says.
 

@@ -84,18 +84,22 @@ class _Rows:
         points: (L, P, 3) m from the middle.
         """
         o, d = self.origins, self.directions
-        along = points @ d.swapaxes(1, 2) - np.einsum("lni,lni->ln", o, d)[:, None]
-        squared = points @ (-2 * o.swapaxes(1, 2))
-        squared += np.einsum("lni,lni->ln", o, o)[:, None]
-        squared += np.einsum("lpi,lpi->lp", points, points)[:, :, None]
+        # Both are sums of products, so a product of matrices makes each in one pass over the table, which is slow to pass.
+        squares = np.einsum("lpi,lpi->lp", points, points)[:, :, None]
+        of_points = np.concatenate([points, np.ones_like(squares), squares], axis=2)
+        along = of_points[:, :, :4] @ np.concatenate([d, -np.einsum("lni,lni->ln", o, d)[:, :, None]], axis=2).swapaxes(1, 2)
+        own = np.einsum("lni,lni->ln", o, o)[:, :, None]
+        squared = of_points @ np.concatenate([-2 * o, own, np.ones_like(own)], axis=2).swapaxes(1, 2)
         np.maximum(squared, 0.0, out=squared)
-        allowed = (self.tolerance**2)[:, None] * squared
-        allowed += self.place**2
-        ahead = along > _NEAREST
-        across = squared - np.square(along, out=along)
-        fit = 1 - np.maximum(across, 0.0, out=across) / np.maximum(allowed, 1e-12, out=allowed)
-        fit *= ahead & self.real[:, None]
-        return np.asarray(np.maximum(fit, 0.0, out=fit))
+        counts = (along > _NEAREST) & self.real[:, None]
+        across = np.subtract(squared, np.square(along, out=along), out=along)
+        np.maximum(across, 0.0, out=across)
+        squared *= (self.tolerance**2)[:, None]
+        squared += max(self.place**2, 1e-12)
+        fit = np.subtract(1.0, np.divide(across, squared, out=across), out=across)
+        np.maximum(fit, 0.0, out=fit)
+        fit *= counts
+        return np.asarray(fit)
 
 
 def fit_points(origins: Floats, directions: Floats, tolerance: Floats, place: float, label: Ints, seed: int) -> Meeting:
