@@ -169,8 +169,8 @@ def exp_se3(twist: Floats) -> Floats:
 
 
 def _squares(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return for rotation vectors (..., 3) three arrays (...): the squares of the angles, whether each angle is so small that
-    a series is needed, and the squares as divisors, in which 1 replaces those of small angles."""
+    """Return for rotation vectors (..., 3) three arrays (...): the squares of the angles, whether each angle is so small
+    that a series is needed, and the squares as divisors, in which 1 replaces those of small angles."""
     squared = np.einsum("...i,...i->...", omega, omega)
     small = squared < _SMALL**2
     return squared, small, np.where(small, 1.0, squared)

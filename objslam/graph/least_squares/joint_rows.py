@@ -40,8 +40,9 @@ class JointRows:
 
     @cached_property
     def jacobian(self) -> sparse.csr_matrix:
-        """(M, D) by the landmarks, three columns each, then by the poses, six columns each. A step that is not taken, and the
-        last one of a solve, need no derivatives."""
+        """(M, D) by the landmarks, three columns each, then by the poses, six columns each.
+
+        The rows after the last step of a solve, or after a step that is not taken, need no derivatives."""
         return self.derive()
 
 
