@@ -197,9 +197,8 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     neighbours. Returns the poses (Q, 4, 4), and whether each is valid (Q,). A query outside the path or inside a longer gap
     gives the identity and is not valid.
     """
-    result = np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy()
     if len(stamps) == 0:
-        return result, np.zeros(len(query), dtype=bool)
+        return np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy(), np.zeros(len(query), dtype=bool)
     after = np.clip(np.searchsorted(stamps, query, side="right"), 1, max(len(stamps) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(stamps) - 1)
@@ -208,12 +207,18 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     inside = (query >= stamps[0]) & (query <= stamps[-1])
     valid = inside & ((span <= max_gap) | exact)
     fraction = np.divide(query - stamps[before], span, out=np.zeros(len(query)), where=span > 0)
-    first = poses[before[valid]]
+    if not valid.all():
+        before, after, fraction = before[valid], after[valid], fraction[valid]
+    first = poses[before]
     if len(first) >= len(stamps) > 1:  # Many queries share a twist, so each twist is computed once.
-        twist = log_se3(inverse(poses[:-1]) @ poses[1:])[before[valid]]
+        twist = log_se3(inverse(poses[:-1]) @ poses[1:])[before]
     else:
-        twist = log_se3(inverse(first) @ poses[after[valid]])
-    result[valid] = first @ exp_se3(twist * fraction[valid, None])
+        twist = log_se3(inverse(first) @ poses[after])
+    between = first @ exp_se3(twist * fraction[:, None])
+    if len(between) == len(query):
+        return between, valid
+    result = np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy()
+    result[valid] = between
     return result, valid
 
 
