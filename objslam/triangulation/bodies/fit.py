@@ -177,13 +177,13 @@ def _weight(now: Residuals, weights: Weights) -> Floats:
 def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the information (N, 7, 7), the gradient (N, 7) and the cost (N,) of the bodies."""
     weighted = now.by * (weight * now.use)[..., None]
-    sums = _sums_of_products(body, weighted, np.concatenate([now.by, now.value[..., None]], axis=2), len(values))
+    sums = sums_of_products(body, weighted, np.concatenate([now.by, now.value[..., None]], axis=2), len(values))
     information = sums[:, :, :PARAMETERS] + prior.information
     gradient = sums[:, :, PARAMETERS] + np.einsum("nij,nj->ni", prior.information, values - prior.mean)
     return information, gradient, _cost(body, now, weight, prior, values)
 
 
-def _sums_of_products(body: Ints, one: Floats, other: Floats, count: int) -> Floats:
+def sums_of_products(body: Ints, one: Floats, other: Floats, count: int) -> Floats:
     """Return the sums (N, D, E) over the boxes of each body of one^T other, for one (B, R, D) and other (B, R, E)."""
     if len(body) < _MANY * count or (np.diff(body) < 0).any():
         return grouped(body, np.swapaxes(one, 1, 2) @ other, count)
