@@ -10,6 +10,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import lengths
 
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 
@@ -147,7 +148,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
         finite: Bools = np.asarray(np.isfinite(pixels).all(axis=1))
         pixels = pixels if finite.all() else np.where(finite[:, None], pixels, 0.0)
         straight = pixels @ camera.inverse_matrix[:, :2].T + camera.inverse_matrix[:, 2]
-        return straight / np.linalg.norm(straight, axis=1, keepdims=True), finite
+        return straight / lengths(straight)[:, None], finite
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     flat: Floats = np.asarray(cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0], float)
@@ -158,7 +159,7 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
         valid[missed] = _misses(camera, flat[missed], pixels[missed]) < 0.1
     directions = np.column_stack([np.where(valid[:, None], flat, 0.0), np.ones(len(flat))])
     valid &= in_field(camera, directions)
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True), valid
+    return directions / lengths(directions)[:, None], valid
 
 
 def _misses(camera: Camera, flat: Floats, pixels: Floats) -> Floats:

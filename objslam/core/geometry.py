@@ -42,9 +42,9 @@ def make_pose(rotation: Floats, translation: Floats) -> Floats:
 
 def inverse(pose: Floats) -> Floats:
     """Return the inverse of rigid poses (..., 4, 4)."""
-    back = np.zeros(pose.shape)
-    back[..., :3, :3] = np.swapaxes(pose[..., :3, :3], -1, -2)
-    back[..., :3, 3:] = -(back[..., :3, :3] @ pose[..., :3, 3:])
+    back, rotation = np.zeros(pose.shape), pose[..., :3, :3]
+    back[..., :3, :3] = np.swapaxes(rotation, -1, -2)
+    back[..., :3, 3] = -np.einsum("...ji,...j->...i", rotation, pose[..., :3, 3])
     back[..., 3, 3] = 1.0
     return back
 
@@ -87,19 +87,27 @@ def is_planar(poses: Floats, tolerance: float = 1e-6) -> bool:
 
     tolerance: the largest difference between two poses, in m or rad.
     """
-    _, remainder = split_se2(poses)
-    return bool(len(poses) == 0 or np.abs(remainder - remainder[:1]).max() <= tolerance)
+    if len(poses) == 0:
+        return True
+    x_axis, y_axis = poses[:, 0, :3], poses[:, 1, :3]  # The axes of the map, in the frame of each pose.
+    yaw = np.arctan2(poses[:, 1, :1], poses[:, 0, :1])
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    remainder = poses[:, 2], cos * x_axis + sin * y_axis, cos * y_axis - sin * x_axis
+    return all(bool(np.abs(part - part[:1]).max() <= tolerance) for part in remainder)
 
 
 def log_se3(pose: Floats) -> Floats:
     """Return the logarithm (N, 6) of poses (N, 4, 4), the twist whose exponential is the pose."""
     omega = rotation_vector(pose[..., :3, :3])
-    angle, small, safe = _angles(omega)
-    half = safe / 2
-    share = np.where(small, 1 / 12 + angle**2 / 720, (1 - half / np.tan(half)) / safe**2)
+    squared, small, divisor = _squares(omega)
+    half = np.sqrt(divisor) / 2
+    share = np.where(small, 1 / 12 + squared / 720, (1 - half / np.tan(half)) / divisor)
     place = pose[..., :3, 3]
     once = cross(omega, place)  # The inverse of the left Jacobian, times the place (Barfoot, eq. 8.35).
-    return np.concatenate([omega, place - once / 2 + share * cross(omega, once)], axis=-1)
+    twist = np.empty((*omega.shape[:-1], 6))
+    twist[..., :3] = omega
+    twist[..., 3:] = place - once / 2 + share[..., None] * cross(omega, once)
+    return twist
 
 
 def twist_lengths(pose: Floats) -> tuple[Floats, Floats]:
@@ -152,19 +160,25 @@ def twist_length(before: Floats, after: Floats) -> tuple[float, float]:
 def exp_se3(twist: Floats) -> Floats:
     """Return the exponential (N, 4, 4) of twists (N, 6) (Barfoot, State Estimation for Robotics, eq. 8.31-8.35)."""
     omega, place = twist[..., :3], twist[..., 3:]
-    angle, small, safe = _angles(omega)
-    a = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    squared, small, divisor = _squares(omega)
+    angle = np.sqrt(divisor)
+    a = np.where(small, 0.5 - squared / 24, (1 - np.cos(angle)) / divisor)[..., None]
+    b = np.where(small, 1 / 6 - squared / 120, (angle - np.sin(angle)) / (divisor * angle))[..., None]
     once = cross(omega, place)
     return make_pose(rotation_from_vector(omega), place + a * once + b * cross(omega, once))
 
 
-def _angles(omega: Floats) -> tuple[Floats, Bools, Floats]:
-    """Return for rotation vectors (..., 3) three arrays (..., 1): the angles, whether each is so small that a series is
-    needed, and the angles as divisors, in which 1 replaces small angles."""
-    angle = np.sqrt(np.einsum("...i,...i->...", omega, omega))[..., None]
-    small = angle < _SMALL
-    return angle, small, np.where(small, 1.0, angle)
+def _squares(omega: Floats) -> tuple[Floats, Bools, Floats]:
+    """Return for rotation vectors (..., 3) three arrays (...): the squares of the angles, whether each angle is so small
+    that a series is needed, and the squares as divisors, in which 1 replaces those of small angles."""
+    squared = np.einsum("...i,...i->...", omega, omega)
+    small = squared < _SMALL**2
+    return squared, small, np.where(small, 1.0, squared)
+
+
+def lengths(vectors: Floats) -> Floats:
+    """Return the lengths (...) of vectors (..., D), in a fifth of the time that `np.linalg.norm` takes along an axis."""
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
 
 
 def adjoint(pose: Floats) -> Floats:
@@ -183,9 +197,8 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     neighbours. Returns the poses (Q, 4, 4), and whether each is valid (Q,). A query outside the path or inside a longer gap
     gives the identity and is not valid.
     """
-    result = np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy()
     if len(stamps) == 0:
-        return result, np.zeros(len(query), dtype=bool)
+        return np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy(), np.zeros(len(query), dtype=bool)
     after = np.clip(np.searchsorted(stamps, query, side="right"), 1, max(len(stamps) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(stamps) - 1)
@@ -194,12 +207,18 @@ def interpolate(stamps: Floats, poses: Floats, query: Floats, max_gap: float) ->
     inside = (query >= stamps[0]) & (query <= stamps[-1])
     valid = inside & ((span <= max_gap) | exact)
     fraction = np.divide(query - stamps[before], span, out=np.zeros(len(query)), where=span > 0)
-    first = poses[before[valid]]
+    if not valid.all():
+        before, after, fraction = before[valid], after[valid], fraction[valid]
+    first = poses[before]
     if len(first) >= len(stamps) > 1:  # Many queries share a twist, so each twist is computed once.
-        twist = log_se3(inverse(poses[:-1]) @ poses[1:])[before[valid]]
+        twist = log_se3(inverse(poses[:-1]) @ poses[1:])[before]
     else:
-        twist = log_se3(inverse(first) @ poses[after[valid]])
-    result[valid] = first @ exp_se3(twist * fraction[valid, None])
+        twist = log_se3(inverse(first) @ poses[after])
+    between = first @ exp_se3(twist * fraction[:, None])
+    if len(between) == len(query):
+        return between, valid
+    result = np.broadcast_to(np.eye(4), (len(query), 4, 4)).copy()
+    result[valid] = between
     return result, valid
 
 
@@ -303,7 +322,7 @@ def widest_angle(directions: Floats) -> float:
 def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
     """Return the angles (R,), rad in [0, pi], between unit directions (R, 3) and points (R, 3), seen from origins (R, 3)."""
     to = points - origins
-    return np.arctan2(np.linalg.norm(np.cross(to, directions), axis=1), np.einsum("ri,ri->r", to, directions))
+    return np.arctan2(lengths(cross(to, directions)), np.einsum("ri,ri->r", to, directions))
 
 
 def evenly_spread(number: int) -> Floats:

@@ -42,14 +42,18 @@ def cross(a: Floats, b: Floats) -> Floats:
 def rotation_from_vector(omega: Floats) -> Floats:
     """Return the rotations (..., 3, 3) about vectors (..., 3) by their lengths, rad (Rodrigues' formula)."""
     squared = np.einsum("...i,...i->...", omega, omega)
-    turns = np.sqrt(squared) / np.pi
-    twice = np.sinc(turns / 2) ** 2 / 2
-    across = np.sinc(turns)[..., None] * omega
-    rotation = (twice[..., None] * omega)[..., :, None] * omega[..., None, :]
+    small = squared < _SMALL**2
+    divisor = np.where(small, 1.0, squared)
+    angle = np.sqrt(divisor)
+    cosine = np.where(small, 1 - squared / 2 + squared**2 / 24, np.cos(angle))
+    sine = np.where(small, 1 - squared / 6, np.sin(angle) / angle)
+    twice = np.where(small, 0.5 - squared / 24, (1 - np.cos(angle)) / divisor)
+    rotation = np.empty((*omega.shape, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        rotation[..., i, i] += 1 - twice * squared
-        rotation[..., k, j] += across[..., i]
-        rotation[..., j, k] -= across[..., i]
+        both, across = twice * omega[..., j] * omega[..., k], sine * omega[..., i]
+        rotation[..., i, i] = cosine + twice * omega[..., i] ** 2
+        rotation[..., k, j] = both + across
+        rotation[..., j, k] = both - across
     return rotation
 
 
@@ -59,11 +63,14 @@ def rotation_vector(rotation: Floats) -> Floats:
     cosine = (r[..., 0, 0] + r[..., 1, 1] + r[..., 2, 2] - 1) / 2
     if not (cosine > 0).all():  # The sine of an angle near pi is small, so that the axis would be inexact.
         return _vector_of_quaternion(quaternion_from_rotation(rotation))
-    axis = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], axis=-1) / 2
-    sine = np.sqrt((axis * axis).sum(axis=-1))
+    axis = np.empty(r.shape[:-1])
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.subtract(r[..., k, j], r[..., j, k], out=axis[..., i])
+    axis /= 2
+    sine = np.sqrt(np.einsum("...i,...i->...", axis, axis))
     small = sine < _SMALL
-    ratio = np.where(small, 1 + sine**2 / 6, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))
-    return np.asarray(axis * ratio[..., None])
+    axis *= np.where(small, 1 + sine**2 / 6, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))[..., None]
+    return axis
 
 
 def _vector_of_quaternion(xyzw: Floats) -> Floats:

@@ -4,6 +4,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.calibration import kind
+from objslam.core.geometry import angles_off
 from objslam.core.types import Trajectory
 from objslam.frontend.shared_errors import SharedErrors
 
@@ -77,23 +78,21 @@ def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Flo
 
     stamps: (n, 2) s and bearings: (n, 2, 3), of `_pairs`. offsets: (m,) s, of the clock.
     """
-    found = np.zeros(len(offsets))
+    found, rotations = np.zeros(len(offsets)), np.ascontiguousarray(odometry.poses[:, :3, :3])
     for i, offset in enumerate(offsets.tolist()):
-        before, after = (_turned(odometry, stamps[:, k] + offset) for k in (0, 1))
+        before, after = (_turned(odometry.stamps, rotations, stamps[:, k] + offset) for k in (0, 1))
         fixed = np.einsum("nij,nj->ni", before, bearings[:, 0])
         told = np.einsum("nji,nj->ni", after, fixed)
-        cross = np.linalg.norm(np.cross(told, bearings[:, 1]), axis=1)
-        found[i] = np.arctan2(cross, np.einsum("ni,ni->n", told, bearings[:, 1])).mean()
+        found[i] = angles_off(np.zeros(3), bearings[:, 1], told).mean()
     return found
 
 
-def _turned(odometry: Trajectory, stamps: Floats) -> Floats:
-    """Return the rotations (n, 3, 3) of the odometry at stamps (n,), s, interpolated linearly between its poses.
+def _turned(known: Floats, rotations: Floats, stamps: Floats) -> Floats:
+    """Return rotations (N, 3, 3), known at stamps (N,), s, at other stamps (n,), s, interpolated linearly: (n, 3, 3).
 
     The result shortens vectors a little, which does not change their angles. This takes a tenth of the time of a rotation.
     """
-    after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, len(odometry) - 1)
-    begin, end = odometry.stamps[after - 1], odometry.stamps[after]
+    after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
+    begin, end = known[after - 1], known[after]
     share = np.clip((stamps - begin) / (end - begin), 0.0, 1.0)[:, None, None]
-    rotations = odometry.poses[:, :3, :3]
     return np.asarray((1 - share) * rotations[after - 1] + share * rotations[after])

@@ -13,6 +13,8 @@ from objslam.frontend.keyframes import build_keyframes
 
 def solved_views(log: Log, settings: Settings, path: Trajectory) -> Keyframes:
     """Return all camera frames of a log, at the poses of the solved path. log: without its shared errors."""
+    if log.localization is None:  # The path is the odometry in either mode, and views need no drift.
+        settings = settings.model_copy(update={"mode": "fixed"})
     frames = build_keyframes(log, settings, Ledger())
     at = np.clip(frames.stamps, path.stamps[0], path.stamps[-1])
     return replace(frames, map_T_base=interpolate(path.stamps, path.poses, at, np.inf)[0])

@@ -21,7 +21,7 @@ from objslam.mapping.bodies.fitting import repeated_error
 from objslam.triangulation.bodies.choice import shapes_disagree, with_shares_of_shapes
 from objslam.triangulation.bodies.edges import BoxEdges, contacts
 from objslam.triangulation.bodies.ellipsoid import from_axes
-from objslam.triangulation.bodies.fit import Prior, Weights, fit
+from objslam.triangulation.bodies.fit import Prior, Weights, fit, sums_of_products
 from objslam.triangulation.bodies.prior import weak_prior
 from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals, touched_points
 from objslam.triangulation.bodies.shapes import CUBOID, CYLINDER, ELLIPSOID
@@ -32,6 +32,16 @@ from objslam.triangulation.bodies.solve import solve_bodies
 def plain(count):
     """Weights of one, without robustness."""
     return Weights(np.ones((count, 5)), np.ones((count, 5)), robust=False)
+
+
+@pytest.mark.parametrize(("each", "shuffled"), [(3, False), (40, False), (40, True)])
+def test_products_are_summed_over_the_boxes_of_each_body(each, shuffled):
+    rng = np.random.default_rng(3)
+    body = np.repeat([0, 1, 3], [each, 2 * each, each])  # Body 2 has no box.
+    body = rng.permutation(body) if shuffled else body
+    one, other = rng.normal(size=(len(body), 5, 7)), rng.normal(size=(len(body), 5, 8))
+    expected = [np.einsum("bri,brj->ij", one[body == j], other[body == j]) for j in range(4)]
+    np.testing.assert_allclose(sums_of_products(body, one, other, 4), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("lens", CAMERAS)

@@ -43,7 +43,7 @@ class Motions:
         """Return the motions of a graph with odometry."""
         keyframes, (before, after), odometry = of.measured.keyframes, of.graph.moves, of.measured.motions
         assert odometry is not None
-        robust, _ = of.graph.motion_weights(of.map_T_camera)
+        robust = of.graph.motion_weights(of.map_T_camera)
         to_base = adjoint(keyframes.base_T_camera[after])
         seconds = np.maximum(keyframes.stamps[after] - keyframes.stamps[before], 0.0)
         covariance = to_base @ odometry.covariance @ np.swapaxes(to_base, 1, 2)

@@ -27,7 +27,7 @@ from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.calibration.variance_components import estimate_noise
-from objslam.graph.outlier_rejection import JointSolution, reject_outliers
+from objslam.graph.outlier_rejection import JointSolution, known_landmarks, reject_outliers
 
 _ROUNDS = 8
 """The most outer steps of a search. The MRCLAM robots, whose clocks are 0.2 s off, take 1 or 2 steps before the noise is
@@ -125,9 +125,15 @@ def calibrate(
     )
     covariance, sensitivity = np.zeros((0, 0)), np.full((association.count, 3, len(theta)), np.nan)
     if len(theta):
-        state = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used).ordered(final.near)
-        system = linearise(state, fit.errors, theta, at.noise)
-        reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
+        state, system, reduced = at.state, at.system, at.reduced
+        # The last solve of the same rays ends so close that the derivatives are the same.
+        if reduced is None or not (
+            np.array_equal(final.used, state.used) and np.array_equal(known_landmarks(final.positions), state.landmarks)
+        ):
+            inliers = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used)
+            state = inliers.ordered(final.near)
+            system = linearise(state, fit.errors, theta, at.noise)
+            reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
         covariance = _covariance(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
         by_landmark = (len(state.landmarks), 3, len(theta))
         sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
@@ -140,12 +146,14 @@ def calibrate(
 class _Found:
     """The parameters theta (P,) that fit best, and the solution at them.
 
-    system: the linear system at the solution. noise: (P,) from `noise_shares`. steps: the number of outer steps.
+    system: the linear system at the solution. reduced: the system with poses and landmarks eliminated. noise: (P,) from
+    `noise_shares`. steps: the number of outer steps.
     """
 
     theta: Floats
     state: InnerSolve
     system: LinearSystem
+    reduced: ReducedSystem | None
     noise: Floats
     steps: int
 
@@ -216,7 +224,7 @@ class _Fit:
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
         sigma = np.sqrt(np.diagonal(errors.prior))
         if len(theta) == 0:
-            return _Found(theta, state, linearise(state, errors, theta), theta, 0)
+            return _Found(theta, state, linearise(state, errors, theta), None, theta, 0)
 
         def deviation(values: Floats) -> float:
             """Return half the squared Mahalanobis distance of parameters (P,) from their prior."""
@@ -257,7 +265,7 @@ class _Fit:
                 self.trace.base_T_camera = now.state.measured.keyframes.base_T_camera
                 shown = Parameters(errors.names, now.theta, now.deviations)
                 self.trace.iteration("solve", now.state.cost, now.state.map_T_camera, now.state.positions, shown)
-        return _Found(now.theta, now.state, now.linear, shares, steps)
+        return _Found(now.theta, now.state, now.linear, now.system, shares, steps)
 
     def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
         """Return the same poses and landmarks with the measurements at the present noise."""

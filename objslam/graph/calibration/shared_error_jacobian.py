@@ -13,7 +13,7 @@ from scipy import sparse
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
 from objslam.core.calibration import CalibratedMeasurements, kind
-from objslam.core.geometry import inverse, log_se3
+from objslam.core.geometry import inverse, lengths, log_se3
 from objslam.core.types import Keyframes, Rays
 from objslam.graph.calibration.clock_instruments import ClockInstruments
 from objslam.graph.calibration.instruments import ODOMETRY_SCALES, Motions, motion_instruments
@@ -215,9 +215,9 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
     axes = graph.bearing_axes(to_landmark)
     bearing_root, _ = graph.bearing_roots(graph.bearing_residuals(graph.rays.direction, to_landmark, axes))
     range_ = graph.rays.range[ranged]
-    range_root, _ = graph.range_roots(np.linalg.norm(to_landmark[ranged], axis=1))
+    range_root, _ = graph.range_roots(lengths(to_landmark[ranged]))
     moved = inverse(map_T_camera[before]) @ map_T_camera[after]
-    motion_weight, _ = graph.motion_weights(map_T_camera)
+    motion_weight = graph.motion_weights(map_T_camera)
     floor = of.measured.settings.odometry.floor_xy
     _, absolute_root, _ = graph.absolute_roots(map_T_camera)
     absolute = map_T_camera[: len(absolute_root)]
@@ -228,7 +228,7 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
         return bearing_root * graph.bearing_residuals(direction, to_landmark, axes) * (usual / sigma)[:, None]
 
     def distances(measured: Floats, to_landmark: Floats) -> Floats:
-        return np.asarray(range_root * (np.linalg.norm(to_landmark, axis=1) - measured) / (measured / range_))
+        return np.asarray(range_root * (lengths(to_landmark) - measured) / (measured / range_))
 
     def turned(keyframes: Keyframes) -> Floats:
         """Return the poses (P, 4, 4) of the cameras on another mount in the frames of these cameras on the present one."""

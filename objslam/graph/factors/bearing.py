@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.geometry import make_pose
+from objslam.core.geometry import lengths, make_pose
 from objslam.core.rotation import cross
 from objslam.graph.factors.noise import Noise
 from objslam.graph.variables import L0, X0
@@ -113,7 +113,7 @@ def tangent_basis(directions: Floats) -> Floats:
     component in absolute value.
     """
     first = cross(directions, np.eye(3)[np.argmin(np.abs(directions), axis=1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first /= lengths(first)[:, None]
     return np.stack([first, cross(directions, first)], axis=2)
 
 
@@ -125,7 +125,7 @@ def residual_axes(directions: Floats, to_landmark: Floats, offset: Floats | None
     """
     if metric:
         return tangent_basis(directions)
-    to = to_landmark / np.linalg.norm(to_landmark, axis=1, keepdims=True)
+    to = to_landmark / lengths(to_landmark)[:, None]
     return tangent_basis(to if offset is None else np.where((offset != 0).any(axis=1)[:, None], directions, to))
 
 
@@ -139,8 +139,8 @@ def ray_residuals(directions: Floats, to_landmark: Floats, axes: Floats, metric:
     across = to_landmark - along[:, None] * directions
     residuals = np.einsum("rij,ri->rj", axes, across)
     if not metric:
-        angle = np.arctan2(np.linalg.norm(across, axis=1), along)
-        residuals *= (angle / np.maximum(np.linalg.norm(residuals, axis=1), 1e-300))[:, None]
+        angle = np.arctan2(lengths(across), along)
+        residuals *= (angle / np.maximum(lengths(residuals), 1e-300))[:, None]
     return np.asarray(residuals)
 
 
@@ -152,8 +152,7 @@ def ray_jacobians(directions: Floats, to_landmark: Floats, axes: Floats, offset:
     across = np.swapaxes(axes, 1, 2)
     if metric:
         return across
-    length = np.linalg.norm(to_landmark, axis=1)
-    by_position = across / length[:, None, None]
+    by_position = across / lengths(to_landmark)[:, None, None]
     away = np.zeros(len(directions), dtype=bool) if offset is None else (offset != 0).any(axis=1)
     if away.any():  # In the camera of `bearings`, the landmark has depth z, and distance r from the optical axis.
         flat = (across[away] @ to_landmark[away, :, None])[..., 0]

@@ -16,7 +16,7 @@ from objslam.graph.least_squares.normal_equations import NormalEquations, elimin
 
 _SLOW = 0.5
 """Normal equations are made anew if a step promises more than this share of what the step before it promised. A larger share
-makes them anew more rarely, and takes more steps. With old equations, a step takes a third of the time."""
+makes them anew more rarely, and takes more steps. With old equations, a step takes a fifth of the time."""
 
 OnStep = Callable[[float, Floats, Floats], None]
 """A function that is called after each step with the cost, the poses (P, 4, 4) and the positions (m, 3)."""

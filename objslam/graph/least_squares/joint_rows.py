@@ -4,6 +4,7 @@ A calibration solves the same graph for many values of the shared errors. To mak
 it, so these solves have arrays instead. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -12,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.geometry import adjoint, inverse, log_se3
+from objslam.core.geometry import adjoint, inverse, lengths, log_se3
 from objslam.core.rotation import cross
 from objslam.core.statistics import CAUCHY_K
 from objslam.core.types import Association, Rays
@@ -29,14 +30,20 @@ from objslam.graph.tags.square_rows import SquareRows
 class JointRows:
     """A graph at some values: M rows in the order of `Measurements.factors`, then those of `Measurements.further_rows`.
 
-    The robust weights are in the rows.
-    jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns each. residual: (M,) whitened.
-    cost: half the sum of the squared residuals, with the robust losses.
+    The robust weights are in the rows. residual: (M,) whitened. cost: half the sum of the squared residuals, with the robust
+    losses. derive: returns `jacobian`.
     """
 
-    jacobian: sparse.csr_matrix
     residual: Floats
     cost: float
+    derive: Callable[[], sparse.csr_matrix]
+
+    @cached_property
+    def jacobian(self) -> sparse.csr_matrix:
+        """(M, D) by the landmarks, three columns each, then by the poses, six columns each.
+
+        The rows after the last step of a solve, or after a step that is not taken, need no derivatives."""
+        return self.derive()
 
 
 @dataclass(frozen=True)
@@ -149,7 +156,7 @@ class JointGraph:
     def bearing_roots(self, residuals: Floats) -> tuple[Floats, Floats]:
         """Return the factors (n, 1) that whiten residuals (n, 2), with the weights of their loss, and their costs (n,)."""
         sigma = np.full(len(self.rays), EQ1_SIGMA) if self._metric else self.rays.sigma
-        size = np.linalg.norm(residuals, axis=1) / sigma
+        size = lengths(residuals) / sigma
         weight, cost = (np.ones_like(size), size**2 / 2) if self.gaussian else huber_roots(size)
         return (weight / sigma)[:, None], cost
 
@@ -166,7 +173,7 @@ class JointGraph:
         """
         keyframes, roots = self.measured.keyframes, self._absolute_roots
         off = log_se3(inverse(keyframes.map_T_camera[: len(roots)]) @ map_T_camera[: len(roots)])
-        size = np.linalg.norm((roots @ off[..., None])[..., 0], axis=1)
+        size = lengths((roots @ off[..., None])[..., 0])
         if not keyframes.localized_every:
             return off, roots, size**2 / 2
         weight, cost = huber_roots(size)
@@ -174,75 +181,111 @@ class JointGraph:
 
     def rows(self, map_T_camera: Floats, landmarks: Floats) -> JointRows:
         """Return the rows at poses (P, 4, 4) and positions (m, 3), m."""
-        rays, ranged = self.rays, self.ranged
+        rays, ranged, weakly = self.rays, self.ranged, 1 / self.measured.settings.joint.prior_sigma
         seen = self.seen(map_T_camera, landmarks)
         to_landmark = from_origins(rays, seen)
         axes = self.bearing_axes(to_landmark)
         off = self.bearing_residuals(rays.direction, to_landmark, axes)
         roots, ray_cost = self.bearing_roots(off)
-        by_seen = roots[:, :, None] * ray_jacobians(rays.direction, to_landmark, axes, rays.offset, self._metric)
-        distance = np.linalg.norm(to_landmark[ranged], axis=1)
+        distance = lengths(to_landmark[ranged])
         range_root, range_cost = self.range_roots(distance)
-        by_distance = (range_root / np.maximum(distance, 1e-12))[:, None] * to_landmark[ranged]
-        by_seen = np.concatenate([by_seen.reshape(-1, 3), by_distance])
-        ray = np.concatenate([np.repeat(np.arange(len(rays)), 2), ranged])
-        on_landmark = (map_T_camera[rays.keyframe, :3, :3][ray] @ by_seen[..., None])[..., 0]
-        seen_rows = np.hstack([on_landmark, cross(by_seen, seen[ray]), -by_seen])
-        way, move_rows, move_cost = self._motion_rows(map_T_camera)
+        moves = self._moves(map_T_camera)
         further = [kind.rows(map_T_camera, landmarks) for kind in self.further]
         apart, absolute_roots, absolute_cost = self.absolute_roots(map_T_camera)
         held = (absolute_roots @ apart[..., None]).ravel()
-        weak = (landmarks - self.weak).ravel() / self.measured.settings.joint.prior_sigma
-        by_weak = np.full(weak.size, 1 / self.measured.settings.joint.prior_sigma)
-        by_absolute = (absolute_roots @ by_end(apart)).ravel()
-        by_further = [derivatives.ravel() for _, derivatives, _ in further]
-        data = np.concatenate([seen_rows.ravel(), by_weak, move_rows.ravel(), by_absolute, *by_further])
-        columns, first = self.pattern
-        jacobian = sparse.csr_matrix((data, columns.copy(), first.copy()), shape=(len(first) - 1, len(self.blocks)))
-        jacobian.eliminate_zeros()  # On a plane, half of the entries are zero.
+        weak = (landmarks - self.weak).ravel() * weakly
         past = range_root * (distance - rays.range[ranged])
-        residual = np.concatenate([(roots * off).ravel(), past, weak, way, held, *(off.ravel() for off, _, _ in further)])
-        cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + move_cost.sum() + weak @ weak / 2
+        parts = (roots * off).ravel(), past, weak, moves.residual.ravel(), held, *(own.ravel() for own, _, _ in further)
+        cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + moves.cost.sum() + weak @ weak / 2
         cost += sum(cost for _, _, cost in further)
-        return JointRows(jacobian, residual, float(cost))
 
-    def motion_weights(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
-        """Return the roots (s,) of the weights of motions, and their costs (s,).
+        def jacobian() -> sparse.csr_matrix:
+            columns, first = self.pattern
+            data, ends = np.empty(len(columns)), np.cumsum([18 * len(rays), 9 * len(ranged), weak.size, moves.size])
+            bearings, ranges, by_weak, by_moves, others = np.split(data, ends)
+            to_map = np.swapaxes(map_T_camera[rays.keyframe, :3, :3], 1, 2)
+            by_seen = roots[:, :, None] * ray_jacobians(rays.direction, to_landmark, axes, rays.offset, self._metric)
+            _put_by_seen(bearings.reshape(-1, 2, 9), by_seen, seen[:, None], to_map)
+            by_seen = (range_root / np.maximum(distance, 1e-12))[:, None] * to_landmark[ranged]
+            _put_by_seen(ranges.reshape(-1, 1, 9), by_seen[:, None], seen[ranged, None], to_map[ranged])
+            by_weak[:] = weakly
+            moves.put(by_moves.reshape(-1, 6, 12))
+            by_absolute = (absolute_roots @ by_end(apart)).ravel()
+            np.concatenate([by_absolute, *(derivatives.ravel() for _, derivatives, _ in further)], out=others)
+            shape = len(first) - 1, len(self.blocks)
+            if data.all():
+                return sparse.csr_matrix((data, columns, first), shape=shape)
+            found = sparse.csr_matrix((data, columns.copy(), first.copy()), shape=shape)
+            found.eliminate_zeros()  # On a plane, half of the entries are zero.
+            return found
+
+        return JointRows(np.concatenate(parts), float(cost), jacobian)
+
+    def motion_weights(self, map_T_camera: Floats) -> Floats:
+        """Return the roots (s,) of the weights of motions.
 
         A motion that fiducials measure too has Cauchy's loss. Other motions have none.
         """
-        if not len(self.motion_roots):
-            return np.zeros(0), np.zeros(0)
-        off = log_se3(self.motion_errors(map_T_camera)[1])
-        return self._motion_weights((self.motion_roots @ off[..., None])[..., 0])
+        return self._moves(map_T_camera).weight
 
-    def _motion_weights(self, whitened: Floats) -> tuple[Floats, Floats]:
-        """Return the same as `motion_weights`, from the whitened residuals (s, 6)."""
-        square = (whitened**2).sum(axis=1)
-        robust, ratio = self.measured.seen_twice, square / JUMP**2
-        return np.where(robust, 1 / np.sqrt(1 + ratio), 1.0), np.where(robust, JUMP**2 * np.log1p(ratio), square) / 2
+    @cached_property
+    def _back(self) -> Floats:
+        """(s, 4, 4) the inverses of the measured motions."""
+        of = self.measured.motions
+        return np.zeros((0, 4, 4)) if of is None else inverse(of.motion)
 
-    def motion_errors(self, map_T_camera: Floats) -> tuple[Floats, Floats]:
-        """Return the motions (s, 4, 4) of poses (P, 4, 4), and the same in the frame after the measured motion."""
+    def _moves(self, map_T_camera: Floats) -> "_Moves":
+        """Return the motions at poses (P, 4, 4)."""
         before, after = self.moves
         moved = inverse(map_T_camera[before]) @ map_T_camera[after]
-        of = self.measured.motions
-        assert of is not None
-        return moved, inverse(of.motion) @ moved
-
-    def _motion_rows(self, map_T_camera: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the residuals (6 s,) of the motions, their derivatives (s, 6, 12) by the poses before and after, and their
-        costs (s,)."""
-        if not len(self.motion_roots):
-            return np.zeros(0), np.zeros((0, 6, 12)), np.zeros(0)
-        moved, error = self.motion_errors(map_T_camera)
-        off = log_se3(error)
+        off = log_se3(self._back @ moved)
         whitened = (self.motion_roots @ off[..., None])[..., 0]
-        weight, cost = self._motion_weights(whitened)
-        rows = np.empty((len(off), 6, 12))
-        np.matmul(weight[:, None, None] * self.motion_roots, by_end(off), out=rows[:, :, 6:])
-        np.matmul(-rows[:, :, 6:], adjoint(inverse(moved)), out=rows[:, :, :6])
-        return (weight[:, None] * whitened).ravel(), rows, cost
+        square = np.einsum("si,si->s", whitened, whitened)
+        robust = self.measured.seen_twice
+        if not robust.any():
+            return _Moves(moved, off, self.motion_roots, np.ones(len(off)), whitened, square / 2)
+        ratio = square / JUMP**2
+        weight = np.where(robust, 1 / np.sqrt(1 + ratio), 1.0)
+        cost = np.where(robust, JUMP**2 * np.log1p(ratio), square) / 2
+        return _Moves(moved, off, weight[:, None, None] * self.motion_roots, weight, weight[:, None] * whitened, cost)
+
+
+@dataclass(frozen=True)
+class _Moves:
+    """The motions by odometry at some poses.
+
+    moved: (s, 4, 4) the motions of the poses. off: (s, 6) the twists from the measured motions. roots: (s, 6, 6) matrices
+    that whiten the twists, with the roots of the robust weights (s,) in them. residual: (s, 6) whitened. cost: (s,).
+    """
+
+    moved: Floats
+    off: Floats
+    roots: Floats
+    weight: Floats
+    residual: Floats
+    cost: Floats
+
+    @property
+    def size(self) -> int:
+        """The number of entries that `put` writes."""
+        return 72 * len(self.off)
+
+    def put(self, rows: Floats) -> None:
+        """Write the derivatives (s, 6, 12) of the residuals by the poses before and after."""
+        after = self.roots @ by_end(self.off)
+        rows[:, :, 6:] = after
+        np.negative(after @ adjoint(inverse(self.moved)), out=rows[:, :, :6])
+
+
+def _put_by_seen(rows: Floats, by_seen: Floats, seen: Floats, to_map: Floats) -> None:
+    """Write the derivatives (n, k, 9) of k residuals of each ray by its landmark and its pose.
+
+    by_seen: (n, k, 3) by the landmark `seen` (n, 1, 3), both in the camera frame. to_map: (n, 3, 3) the rotations from
+    map to this frame.
+    """
+    np.matmul(by_seen, to_map, out=rows[..., :3])
+    rows[..., 3:6] = cross(by_seen, seen)
+    np.negative(by_seen, out=rows[..., 6:])
 
 
 def _ranged(rays: Rays) -> Ints:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -72,6 +73,13 @@ class BoxViews:
     def edges(self, touched: Floats | None = None) -> BoxEdges:
         """Return the planes of the boxes. touched: (B, 4, P, 3) m, the points at which the bodies may touch them, if
         known."""
+        return self._at_middles if touched is None else self._edges(touched)
+
+    @cached_property
+    def _at_middles(self) -> BoxEdges:
+        return self._edges(None)
+
+    def _edges(self, touched: Floats | None) -> BoxEdges:
         rays, settings, poses, camera = self.rays, self.settings, self.poses, self.camera
         count = len(self.body)
         normal, turn, bound = np.zeros((count, 4, 3)), np.ones((count, 4)), self.bound.copy()

@@ -89,7 +89,8 @@ def check_path(log: Log, settings: Settings) -> list[Finding]:
 def _find_restarts(odometry: Trajectory, max_gap: float) -> Iterator[Finding]:
     """Find gaps after which the odometry counts from zero again."""
     seconds = np.diff(odometry.stamps)
-    restarts = np.flatnonzero((seconds > max_gap) & counts_from_zero(odometry.poses[:-1], odometry.poses[1:]))
+    gaps = np.flatnonzero(seconds > max_gap)
+    restarts = gaps[counts_from_zero(odometry.poses[gaps], odometry.poses[gaps + 1])]
     if len(restarts):
         first = int(restarts[0])
         yield Finding(

@@ -9,6 +9,8 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, project, undistort
+from objslam.core.geometry import lengths
+from objslam.core.rotation import cross
 
 LEFT, TOP, RIGHT, BOTTOM = range(4)
 """The order of the edges of a box (x1, y1, x2, y2)."""
@@ -77,10 +79,9 @@ def tangent_planes(
     parts = [pixel, pixel - along, pixel + along, pixel - _ACROSS * _STEP, pixel + _ACROSS * _STEP]
     direction, valid = undistort(camera, np.stack(parts).reshape(-1, 2))
     ray, before, after, inside, outside = direction.reshape(5, -1, 4, 3)
-    normal = np.cross(ray, after - before)
-    length = np.linalg.norm(normal, axis=2, keepdims=True)
-    normal /= np.maximum(length, 1e-12)
-    turn = (normal * (outside - inside)).sum(axis=2) / (2 * _STEP)
+    normal = cross(ray, after - before)
+    normal /= np.maximum(lengths(normal), 1e-12)[..., None]
+    turn = np.einsum("bei,bei->be", normal, outside - inside) / (2 * _STEP)
     normal *= (np.sign(turn) * _OUTWARD)[..., None]
     good = valid.reshape(5, -1, 4).all(axis=(0, 2)) & (np.abs(turn) > 0).all(axis=1) & (high > low).all(axis=1)
     return normal @ np.swapaxes(map_T_camera[:, :3, :3], 1, 2), np.abs(turn), good
