@@ -133,13 +133,18 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
     """Return covariances (3, 3) of the x, y (m) and yaw (rad) of keyframe `now` relative to each anchor, in the axes of map.
 
     anchors: keyframes. Each anchor before `now` with a finite covariance gives one covariance for each factor in `_SLIPS`.
-    The covariances include `POSE_FLOOR`.
+    The covariances include `POSE_FLOOR`. An anchor whose covariance cannot be computed gives none.
     """
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = map_T_camera[now, :3, :3]
     result = []
     for anchor in (a for a in anchors if a < now):
-        joint = marginals.jointMarginalCovariance([X0 + anchor, X0 + now]).fullMatrix()
+        try:
+            joint = marginals.jointMarginalCovariance([X0 + anchor, X0 + now]).fullMatrix()
+        except (
+            RuntimeError
+        ):  # The order of elimination is another one for each pair, and the system may be indeterminate in it.
+            continue
         relative = inverse(map_T_camera[anchor]) @ map_T_camera[now]
         jacobian = np.hstack([-adjoint(inverse(relative)), np.eye(6)])
         planar = (turn @ jacobian @ joint @ jacobian.T @ turn.T)[np.ix_([3, 4, 2], [3, 4, 2])]

@@ -34,6 +34,7 @@ from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
+from objslam.mapping.fixed.far_sides import with_far_sides
 from objslam.mapping.fixed.lasting_errors import with_lasting_errors
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
@@ -113,7 +114,7 @@ def run(
             diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
     if settings.mode == "fixed":
-        solution = with_lasting_errors(solution, settings)
+        solution = with_far_sides(with_lasting_errors(solution, settings))
     if diagnosis.jumps is not None:
         solution = with_jumps(solution, diagnosis.jumps)
     solution = with_hidden_parts(with_bodies(solution, cameras, settings), cameras)

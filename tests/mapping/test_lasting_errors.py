@@ -14,7 +14,7 @@ from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log
 from objslam.mapping import pipeline
-from objslam.mapping.fixed.lasting_errors import Cells, lasting_variances
+from objslam.mapping.fixed.lasting_noise import Cells, lasting_variances
 from objslam.simulation import PoseNoise, preset, simulate
 
 
@@ -68,21 +68,43 @@ def test_the_status_of_an_object_knows_its_lasting_errors(monkeypatch):
     np.testing.assert_allclose(after.seen_sigma[there], largest)
 
 
-@pytest.mark.parametrize(("factor", "time"), [(0.0, 1.0), (0.5, 4.0), (1.5, 16.0), (4.0, 64.0)])
-def test_the_size_of_lasting_errors_is_found(factor, time):
-    """Angles that are drawn from the model, at places that are off by some centimetres."""
-    rng, seen = np.random.default_rng(1), []
-    for _ in range(15):
-        times = np.sort(rng.uniform(0, 600, 40))
-        heading = rng.uniform(-np.pi, np.pi, 40)
-        size, white, level = np.full(40, 0.007), np.full(40, 0.003), rng.uniform(2, 5, 40)
-        shift = np.column_stack([np.cos(heading), np.sin(heading)]) / level[:, None]
-        cells = Cells(times, np.zeros(40), white, shift, size, np.zeros((40, 3)))
-        lasting = rng.multivariate_normal(np.zeros(40), factor**2 * np.outer(size, size) * cells.alike(time))
-        mean = lasting + white * rng.standard_normal(40) + shift @ rng.normal(0, 0.05, 2)
-        seen.append(replace(cells, mean=mean))
-    found = lasting_variances(seen)
-    assert np.sqrt(found.sum()) == pytest.approx(factor, rel=0.25, abs=0.1)
+def drawn(times, owner, factors, time, rng):
+    """Angles that are drawn from the model: all objects share the errors of the poses, and each is off by some
+    centimetres."""
+    count = len(times)
+    order = np.lexsort((times, owner))
+    times, owner = times[order], owner[order]
+    heading, level = rng.uniform(-np.pi, np.pi, owner.max() + 1)[owner] + rng.normal(0, 0.3, count), rng.uniform(2, 5, count)
+    axis = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(count)])
+    turn, move, white = np.tile([0.0, 0.0, 0.005], (count, 1)), 0.02 * axis / level[:, None], np.full(count, 0.003)
+    alike = np.exp(-np.abs(times[:, None] - times) / time)
+    errors = factors[0] ** 2 * turn @ turn.T + factors[1] ** 2 * move @ move.T
+    off = (rng.normal(0, 0.05, (owner.max() + 1, 3))[owner] * axis).sum(axis=1) / level
+    mean = rng.multivariate_normal(np.zeros(count), errors * alike) + white * rng.standard_normal(count) + off
+    return Cells(owner, times, mean, white, axis / level[:, None], turn, move, np.zeros((count, 3)))
+
+
+@pytest.mark.parametrize(
+    ("factors", "time"), [((0.0, 0.0), 1.0), ((0.5, 0.5), 4.0), ((1.5, 1.5), 16.0), ((4.0, 4.0), 64.0), ((2.0, 0.0), 4.0)]
+)
+def test_the_size_of_lasting_errors_is_found(factors, time):
+    rng = np.random.default_rng(1)
+    cells = drawn(rng.uniform(0, 600, 600), np.repeat(np.arange(15), 40), factors, time, rng)
+    found = np.sqrt(lasting_variances(cells).sum(axis=1))
+    assert found[0] == pytest.approx(factors[0], rel=0.3, abs=0.15)
+    assert np.hypot(*found) == pytest.approx(np.hypot(*factors), rel=0.3, abs=0.2)
+
+
+def test_objects_that_were_seen_once_show_the_errors_that_they_share():
+    """Each object was seen for 6 s, so its place absorbs much of an error that lasts for 4 s. Together they show it."""
+    found = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        begin = np.repeat(np.linspace(0, 150, 60), 6)
+        cells = drawn(begin + np.tile(np.arange(6.0), 60), np.repeat(np.arange(60), 6), (2.0, 0.0), 4.0, rng)
+        found.append(np.sqrt(lasting_variances(cells)[0].sum()))
+    assert np.mean(found) == pytest.approx(2.0, rel=0.15)
+    assert min(found) > 1.4
 
 
 def test_lasting_errors_are_the_same_with_any_axis_up_and_reach_heights_in_3d(monkeypatch):

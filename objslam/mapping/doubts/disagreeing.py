@@ -6,11 +6,15 @@ import numpy as np
 
 from objslam.association.crossings.one_or_two import find_crossings
 from objslam.core.result import Doubt, RunResult
+from objslam.core.statistics import logistic
 from objslam.mapping.checks.misfits import Misfits, find_misfits
 from objslam.mapping.doubts.evidence import Evidence
 
 _NAMED = 3
 """The most objects that the assessment names. A larger number makes the assessment longer."""
+_ONE_THING = 0.5
+"""An object whose rays may cross is doubted if it is one thing with less than this probability: then it more likely is not.
+With a larger value, fewer maps are good."""
 
 
 def misfits_of(result: RunResult) -> Misfits:
@@ -42,19 +46,22 @@ def disagreeing(result: RunResult, misfits: Misfits) -> list[Doubt]:
 
 
 def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
-    """Return a doubt for each object that is clearly more likely two things whose rays cross than one, the likeliest first.
+    """Return a doubt for each object that is more likely not one thing at its place than one, the likeliest first.
 
-    The association divides such objects. It allows for more noise than the solved poses have, so some are left.
+    Its rays come from two sides, and two things whose rays cross explain them too. The association divides such objects only
+    if they are clearly two, because to divide one thing may lose it. It also allows for more noise than the solved poses
+    have. And the object may be no thing at all, because frames that should show it do not (`existence`).
     """
     state = evidence.state
     sized = np.array([camera.sees_size for camera in result.cameras], dtype=bool)
     if not state.count or not sized.any():
         return []
     found = find_crossings(state, sized[result.keyframes.camera[result.rays.keyframe[evidence.ray]]], fewest=1)
+    objects = [result.map.objects[j] for j in evidence.object[found.landmark].tolist()]
+    one = logistic(found.odds) * np.array([1.0 if o.existence is None else o.existence for o in objects])
     doubts = []
-    for s in np.argsort(found.odds, kind="stable")[: int(found.two.sum())].tolist():
-        j = int(found.landmark[s])
-        o, mine = result.map.objects[evidence.object[j]], state.matched == j
+    for s in np.argsort(one, kind="stable")[: int((one < _ONE_THING).sum())].tolist():
+        o, mine = objects[s], state.matched == found.landmark[s]
         second, number = int((found.second & mine).sum()), int(mine.sum())
         doubts.append(
             Doubt(
@@ -62,12 +69,17 @@ def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
                 "crossing",
                 o.label,
                 f"{o.label} #{o.id} may be where the rays of two things cross: {number - second} of its rays and {second} "
-                "others come from two sides, and two things explain them and the sizes of their boxes better (log odds "
-                f"{-found.odds[s]:.1f}).",
+                f"others come from two sides. By its rays, the sizes of their boxes, and frames without a box, it is one "
+                f"thing with a probability of {one[s]:.2g}.",
                 (o.id,),
                 o.position,
                 evidence.ray[np.flatnonzero(mine)],
-                {"log_odds": -float(found.odds[s]), "rays": number - second, "other_rays": second},
+                {
+                    "probability": float(one[s]),
+                    "log_odds": -float(found.odds[s]),
+                    "rays": number - second,
+                    "other_rays": second,
+                },
             )
         )
     return doubts

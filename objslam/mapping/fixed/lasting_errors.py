@@ -4,7 +4,7 @@ Poses in a plane turn and shift rays to the left or to the right. Poses in 3D tu
 rays from one visit do not average such an error out, so they count as few. The rays of several visits show its size.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from objslam.core.rotation import cross
 from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, noise_up
 from objslam.graph.robust_cost import ray_information
+from objslam.mapping.fixed.lasting_noise import TIMES, Cells, lasting_variances
 from objslam.mapping.solution import Solution
 
 _CELL = 1.0
@@ -26,39 +27,9 @@ shorter errors as noise."""
 _MOST_CELLS = 48
 """The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
 slower."""
-_TIMES = (1.0, 4.0, 16.0, 64.0)
-"""The correlation times (s) of errors, after which the correlation is 1/e. The shortest fits a jump of a scan matcher, the
-longest an error of the map around a place. More times are finer and slower."""
-_FACTORS = np.append(0.0, np.geomspace(0.1, 20.0, 40))
-"""The tried standard deviations of lasting errors, as multiples of the noise in `localization`. More factors are finer and
-slower."""
-_LOOSE = 1.0
-"""The prior standard deviation (m) of the error of a solved position. With a larger value, the rays decide more."""
 _POOLED = 20.0
 """With this many rays, the scatter inside cells weighs as much as the noise in the settings. A larger number trusts the
 settings more."""
-
-
-@dataclass(frozen=True)
-class Cells:
-    """The misses of the rays of one object along one axis, by time, in C cells.
-
-    times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left, or above it. white: (C,)
-    rad, the standard deviation of the mean from noise that does not last. shift: (C, n) rad per m, the derivative of the
-    mean by n coordinates of the object. size: (C,) rad, the error of the mean by one standard deviation of the poses. pull:
-    (C, 3) m, the shift of the object by such an error in the cell.
-    """
-
-    times: Floats
-    mean: Floats
-    white: Floats
-    shift: Floats
-    size: Floats
-    pull: Floats
-
-    def alike(self, time: float) -> Floats:
-        """Return the correlations (C, C) of errors that last for `time`, s."""
-        return np.asarray(np.exp(-np.abs(self.times[:, None] - self.times) / time))
 
 
 def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
@@ -74,48 +45,25 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
     if not solution.keyframes.localized_every:
         return solution
     seen = _cells_of(solution, settings)
-    if not any(seen):
+    if not seen:
         return solution
     from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
 
     covariance = solution.estimate.covariance.copy()
-    for alike in seen:
-        variance = lasting_variances([cells for _, cells in alike])
-        for j, cells in alike:
-            kernel = sum(v * cells.alike(time) for v, time in zip(variance.tolist(), _TIMES, strict=True))
-            covariance[j] += cells.pull.T @ kernel @ cells.pull
-    if (tilt := noise_up(solution.keyframes, settings)[0]) > 0:  # The variance of the last list is that of the ground.
-        at = solution.keyframes
-        covariance[:, 2, 2] += rise_of(at.stamps, at.map_T_base, tilt * np.sqrt(variance), np.array(_TIMES)) ** 2
+    for cells in seen:
+        variances = lasting_variances(cells)
+        objects, more = cells.covariances(variances)
+        covariance[objects] += more
+    if (tilt := noise_up(solution.keyframes, settings)[0]) > 0:  # The variances of the last cells are those of the ground.
+        at, rolls = solution.keyframes, tilt * np.sqrt(variances[0])
+        covariance[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
     wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
     return replace(solution, estimate=wider)
 
 
-def lasting_variances(seen: list[Cells]) -> Floats:
-    """Return the expected squared factor of the errors that last for each of `_TIMES`. The sum over these times is the
-    squared factor of all errors.
-
-    seen: the cells of each object along each axis.
-    """
-    likelihood = np.tile(-0.5 * _FACTORS**2, (len(_TIMES), 1))
-    for cells in seen:
-        shift, mean = cells.shift / cells.white[:, None], cells.mean / cells.white
-        own = np.outer(cells.size / cells.white, cells.size / cells.white)
-        for row, time in zip(likelihood, _TIMES, strict=True):
-            size, vectors = np.linalg.eigh(own * cells.alike(time))
-            y, x = vectors.T @ mean, vectors.T @ shift
-            variance = 1 + _FACTORS[:, None] ** 2 * np.maximum(size, 0.0)
-            matrix = np.einsum("ki,kj,sk->sij", x, x, 1 / variance) + np.eye(x.shape[1]) / _LOOSE**2
-            vector = np.einsum("ki,k,sk->si", x, y, 1 / variance)
-            explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
-            row -= 0.5 * ((y**2 / variance + np.log(variance)).sum(axis=1) + np.linalg.slogdet(matrix)[1] - explained)
-    weight = np.exp(likelihood - likelihood.max()) * np.gradient(_FACTORS)
-    return np.asarray((weight * _FACTORS**2).sum(axis=1) / weight.sum())
-
-
-def _cells_of(solution: Solution, settings: Settings) -> list[list[tuple[int, Cells]]]:
-    """Return the index of an object and its cells along one axis, for each object with a covariance and each axis. Rejected
-    rays, and ranges, do not count. The errors of one list have one size and one correlation time."""
+def _cells_of(solution: Solution, settings: Settings) -> list[Cells]:
+    """Return the cells of all objects with a covariance. The errors of one entry have one size and one correlation time.
+    Rejected rays, and ranges, do not count."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
@@ -146,15 +94,19 @@ def _cells_of(solution: Solution, settings: Settings) -> list[list[tuple[int, Ce
     times = keyframes.stamps[rays.keyframe]
     turned = np.maximum(np.hypot(direction[:, 0], direction[:, 1]), 1e-6)
     miss = (direction * left).sum(axis=1) / turned
-    found = [_by_cell(times, owner, miss, rays.sigma * distance / level, left, level, (yaw, place), strength, inverse)]
     in_space, uneven = not is_planar(keyframes.map_T_base), tilt > 0 or z > 0
+    axes = np.ones(3) if in_space else np.array([0.0, 0.0, 1.0])  # Planar poses turn about the vertical axis only.
+    turn = cross(direction, left) / turned[:, None] * (yaw * axes)
+    move = place * left / level[:, None]
+    found = [_by_cell(times, owner, miss, rays.sigma * distance / level, left, level, (turn, move), strength, inverse)]
     if in_space or uneven:
         above = cross(to / distance[:, None], left)
         miss = (direction * above).sum(axis=1)
-        noise = (yaw, place) if in_space else (tilt, z)
-        raised = _by_cell(times, owner, miss, rays.sigma, above, distance, noise, strength, inverse)
-        found = [found[0] + raised] if in_space else [*found, raised]
-    return [[(number, replace(cells, pull=cells.pull @ up)) for number, cells in alike] for alike in found]
+        angle, shift = (yaw * axes, place * axes) if in_space else (tilt * (1 - axes), z * axes)
+        turn, move = cross(direction, above) * angle, above / distance[:, None] * shift
+        raised = _by_cell(times, owner, miss, rays.sigma, above, distance, (turn, move), strength, inverse)
+        found = [_joined(found[0], raised)] if in_space else [*found, raised]
+    return [replace(cells, pull=cells.pull @ up) for cells in found]
 
 
 def _by_cell(
@@ -164,40 +116,43 @@ def _by_cell(
     white: Floats,
     axis: Floats,
     lever: Floats,
-    noise: tuple[float, float],
+    errors: tuple[Floats, Floats],
     strength: Floats,
     inverse: Floats,
-) -> list[tuple[int, Cells]]:
-    """Return the index and the cells of each object, from misses along one axis.
+) -> Cells:
+    """Return the cells of all objects, from misses along one axis.
 
     times: (R,) s. owner: (R,) objects. miss: (R,) rad, and white: (R,) rad, its noise. axis: (R, 3) the unit vector, and
-    lever: (R,) m, the distance, at which the miss moves an object. noise: of headings, rad, and of places, m. strength: (R,)
-    the weight of each ray in the solve. inverse: (N, 3, 3) of the information about each object.
+    lever: (R,) m, the distance, at which the miss moves an object. errors: (R, 3) rad each, the miss by one standard
+    deviation of rotations and of places. strength: (R,) the weight of each ray in the solve. inverse: (N, 3, 3) of the
+    information about each object.
     """
-    size = np.hypot(noise[0], noise[1] / lever)
     first, cell = _cells(times, owner, len(inverse))
     weight = white**-2
     total = np.bincount(cell, weight)
 
     def mean(values: Floats) -> Floats:
-        return np.asarray(np.bincount(cell, weight * values) / total)
+        """Return the means (C,) of values (R,), or (C, n) of values (R, n)."""
+        columns = np.atleast_2d(values.T)
+        means = np.column_stack([np.bincount(cell, weight * column) / total for column in columns])
+        return means if values.ndim > 1 else means[:, 0]
 
     within = miss - mean(miss)[cell]
     free = len(cell) - len(total)
     scatter = ((within / white) ** 2).sum()
     factor = np.sqrt((scatter + _POOLED) / (free + _POOLED))
     pull = np.zeros((len(total), 3))
-    np.add.at(pull, cell, (strength * size * lever)[:, None] * axis)
-    columns = mean(times), mean(miss), factor / np.sqrt(total), mean(size)
-    shift = np.column_stack([mean(axis[:, k] / lever) for k in range(3)])
+    np.add.at(pull, cell, (strength * lever)[:, None] * axis)
     pull = np.einsum("cij,cj->ci", inverse[first], pull)
-    seen, begin = [], 0
-    for end in (np.flatnonzero(np.diff(first, append=len(inverse))) + 1).tolist():
-        mine = slice(begin, end)
-        when, missed, noisy, sized = (column[mine] for column in columns)
-        seen.append((int(first[begin]), Cells(when, missed, noisy, shift[mine], sized, pull[mine])))
-        begin = end
-    return seen
+    turn, move = errors
+    noise = factor / np.sqrt(total)
+    return Cells(first, mean(times), mean(miss), noise, mean(axis / lever[:, None]), mean(turn), mean(move), pull)
+
+
+def _joined(one: Cells, other: Cells) -> Cells:
+    """Return the cells of both, in the order of objects."""
+    both = Cells(*(np.concatenate(pair) for pair in zip(vars(one).values(), vars(other).values(), strict=True)))
+    return both.take(np.argsort(both.owner, kind="stable"))
 
 
 def _cells(times: Floats, owner: Ints, count: int) -> tuple[Ints, Ints]:

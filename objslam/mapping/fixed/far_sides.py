@@ -1,0 +1,53 @@
+"""The far side of objects that were seen with little parallax.
+
+Rays from one stretch of the path measure the inverse of a depth (Civera, Davison and Montiel 2008). The same error of a ray
+moves an object far away, or a little nearer. So an object that errs is mostly too near, and there the same noise of rays
+gives a small covariance. Such an object would be far outside its ellipsoid.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.mapping.solution import Solution
+
+_SIGMAS = 2.0
+"""The far end of the ellipsoid, in standard deviations of the inverse depth: the ellipsoid of 95 % of a normal distribution
+reaches as far along one axis. A larger number widens more."""
+_MOST = 0.4
+"""The largest standard deviation, as a share of the depth, at which the far end counts. From 0.5 on, the far end is at
+infinity. A larger share widens objects more that the rays hardly place."""
+
+
+def with_far_sides(solution: Solution) -> Solution:
+    """Return the solution with covariances that reach to the far end of the depths that the rays allow.
+
+    The standard deviation s along the mean ray of an object at the depth d is that of the inverse depth, s / d^2. The far
+    end, at `_SIGMAS` of them, is at d / (1 - `_SIGMAS` s / d), so s becomes s / (1 - `_SIGMAS` s / d). Objects with a
+    measured range keep their covariance, because a range errs as much to both sides. So do, nearly, objects that were seen
+    from many sides: their s is a small share of d.
+    """
+    rays, estimate = solution.rays, solution.estimate
+    index, covariance = solution.association.object, estimate.covariance
+    used = np.flatnonzero((estimate.weight > 0) & (index >= 0))
+    origin, direction = (values[used] for values in rays.in_map(solution.keyframes.map_T_camera))
+    owner, count = index[used], len(covariance)
+    number = np.bincount(owner, minlength=count)
+    ranged = np.bincount(owner, np.isfinite(rays.range[used]), count) > 0
+    whole = np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)) & (number > 0) & ~ranged)
+    mean = np.column_stack([np.bincount(owner, column, count) for column in direction.T])[whole]
+    ahead = mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
+    away = np.linalg.norm(estimate.positions[owner] - origin, axis=1)
+    depth = np.bincount(owner, away, count)[whole] / number[whole]
+    sigma = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", ahead, covariance[whole], ahead), 0.0))
+    wider = covariance.copy()
+    more = far_sigma(sigma, depth) ** 2 - sigma**2
+    wider[whole] += more[:, None, None] * ahead[:, :, None] * ahead[:, None, :]
+    return replace(solution, estimate=replace(estimate, covariance=wider))
+
+
+def far_sigma(sigma: Floats, depth: Floats) -> Floats:
+    """Return the standard deviations (N,), m, that reach to the far end of depths (N,), m. sigma: (N,) m, at the depths."""
+    share = np.minimum(sigma / np.maximum(depth, 1e-9), _MOST)
+    return np.asarray(sigma / (1 - _SIGMAS * share))

@@ -1,0 +1,111 @@
+"""The size of errors of given poses that last for some seconds, from the rays of all objects together.
+
+An object that was seen for a few seconds only fits its place to the errors of these seconds, so its own rays miss it by
+little. But the same errors turn the rays to every object of these seconds, and each object can absorb only what a shift of
+its own explains. So the objects count together.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+
+TIMES = (1.0, 4.0, 16.0, 64.0)
+"""The correlation times (s) of errors, after which the correlation is 1/e. The shortest fits a jump of a scan matcher, the
+longest an error of the map around a place. More times are finer and slower."""
+_FACTORS = np.append(0.0, np.geomspace(0.1, 20.0, 40))
+"""The tried standard deviations of lasting errors, as multiples of the noise of the poses. More factors are finer and
+slower."""
+_KINDS = np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+"""The tried mixtures: only rotations err, rotations and places err by one factor, only places err. More mixtures are finer
+and slower."""
+_LOOSE = 1.0
+"""The prior standard deviation (m) of the error of a solved position. With a larger value, the rays decide more."""
+_MOST = 400
+"""The most cells that count. Some hundred cells determine the factor to a few percent. The time grows with the cube."""
+_TOGETHER = 50
+"""If there are more cells, those that count come from stretches of this many cells that follow each other in time, because
+only cells of the same seconds share their errors. A longer stretch shows longer errors, and fewer parts of the drive."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The misses of the rays of objects along one axis, in C cells of an object and a short time, in the order of objects.
+
+    owner: (C,) the object. times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left, or
+    above it. white: (C,) rad, the standard deviation of the mean from noise that does not last. shift: (C, n) rad per m, the
+    derivative of the mean by n coordinates of the object. turn, move: (C, 3) rad, the error of the mean by one standard
+    deviation of a rotation of the poses about each axis, and of a shift along it. pull: (C, 3) m per rad, the shift of the
+    object by an error of the mean.
+    """
+
+    owner: Ints
+    times: Floats
+    mean: Floats
+    white: Floats
+    shift: Floats
+    turn: Floats
+    move: Floats
+    pull: Floats
+
+    def take(self, which: Ints) -> "Cells":
+        """Return the cells `which`."""
+        return Cells(*(column[which] for column in vars(self).values()))
+
+    def alike(self, time: float) -> Floats:
+        """Return the correlations (C, C) of errors that last for `time`, s."""
+        return np.asarray(np.exp(-np.abs(self.times[:, None] - self.times) / time))
+
+    def covariances(self, variances: Floats) -> tuple[Ints, Floats]:
+        """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 of each by errors that last.
+
+        variances: (2, T) as of `lasting_variances`.
+        """
+        objects, first = np.unique(self.owner, return_index=True)
+        found = np.zeros((len(objects), 3, 3))
+        for j, mine in enumerate(np.split(np.arange(len(self.owner)), first[1:])):
+            cells = self.take(mine)
+            kernel = sum(cells._errors(each) * cells.alike(time) for each, time in zip(variances.T, TIMES, strict=True))
+            found[j] = cells.pull.T @ kernel @ cells.pull
+        return objects, found
+
+    def _errors(self, squared: Floats) -> Floats:
+        """Return the covariances (C, C) rad^2 of the misses if all poses had one error. squared: (2,) the squared factors on
+        the noise of rotations and of places."""
+        return np.asarray(squared[0] * self.turn @ self.turn.T + squared[1] * self.move @ self.move.T)
+
+
+def lasting_variances(cells: Cells) -> Floats:
+    """Return the expected squared factors (2, T) of the errors of rotations and of places that last for each of `TIMES`.
+    Their sums over these times are the squared factors of all errors.
+
+    The factor has a half-normal prior of 1. Its likelihood is restricted (Patterson and Thompson 1971): the errors of the
+    positions of all objects are integrated out. The mixture, the factor and the correlation time are averaged over their
+    posterior.
+    """
+    cells = cells.take(_counted(cells.times))
+    same = cells.owner[:, None] == cells.owner
+    known = np.diag(cells.white**2) + _LOOSE**2 * np.where(same, cells.shift @ cells.shift.T, 0.0)
+    root = np.linalg.cholesky(known)
+    mean = np.linalg.solve(root, cells.mean)
+    squared = _FACTORS**2
+    likelihood = np.tile(-0.5 * squared, (len(_KINDS), len(TIMES), 1))
+    for rows, kind in zip(likelihood, _KINDS, strict=True):
+        errors = cells._errors(kind)
+        for row, time in zip(rows, TIMES, strict=True):
+            left = np.linalg.solve(root, errors * cells.alike(time))
+            size, vectors = np.linalg.eigh(np.linalg.solve(root, left.T))
+            variance = 1 + squared[:, None] * np.maximum(size, 0.0)
+            row -= 0.5 * ((vectors.T @ mean) ** 2 / variance + np.log(variance)).sum(axis=1)
+    weight = np.exp(likelihood - likelihood.max()) * np.gradient(_FACTORS)
+    return np.asarray(np.einsum("mtf,f,mk->kt", weight, squared, _KINDS) / weight.sum())
+
+
+def _counted(times: Floats) -> Ints:
+    """Return the cells that count, ascending: all, or those of stretches that are spread evenly over the time."""
+    if len(times) <= _MOST:
+        return np.arange(len(times))
+    stretches = np.array_split(np.argsort(times, kind="stable"), -(-len(times) // _TOGETHER))
+    some = np.linspace(0, len(stretches) - 1, _MOST // _TOGETHER).round().astype(np.int64)
+    return np.sort(np.concatenate([stretches[i] for i in some]))

@@ -1,0 +1,52 @@
+"""Covariances between two poses of a path, which a loop closure needs, against closed forms."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from objslam.core.geometry import lift_se2
+from objslam.graph.loop_closure import POSE_FLOOR, relative_covariances
+from objslam.graph.variables import X0
+
+
+def straight(steps: int) -> tuple[gtsam.Marginals, np.ndarray]:
+    """The marginals and the poses (K, 4, 4) of a straight path with steps of 1 m. A step errs by 0.02 m along each axis."""
+    poses = lift_se2(np.column_stack([np.arange(steps + 1.0), np.zeros(steps + 1), np.zeros(steps + 1)]))
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([1e-6] * 3 + [0.02] * 3))
+    for k, pose in enumerate(poses):
+        values.insert(X0 + k, gtsam.Pose3(pose))
+        if k:
+            step = gtsam.Pose3(np.linalg.inv(poses[k - 1]) @ pose)
+            graph.add(gtsam.BetweenFactorPose3(X0 + k - 1, X0 + k, step, noise))
+    graph.add(gtsam.PriorFactorPose3(X0, gtsam.Pose3(poses[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+    return gtsam.Marginals(graph, values), poses
+
+
+class Unsure:
+    """Marginals that are indeterminate for one anchor, as a landmark with hardly any parallax makes them."""
+
+    def __init__(self, marginals: gtsam.Marginals, anchor: int) -> None:
+        self.marginals, self.anchor = marginals, anchor
+
+    def jointMarginalCovariance(self, keys: list[int]) -> gtsam.JointMarginal:
+        if keys[0] == X0 + self.anchor:
+            raise RuntimeError("Indeterminate linear system")
+        return self.marginals.jointMarginalCovariance(keys)
+
+
+def test_the_covariance_relative_to_an_anchor_grows_with_the_steps_between():
+    marginals, poses = straight(9)
+    near, far = (relative_covariances(marginals, poses, [anchor], 9)[0] for anchor in (5, 0))
+    assert near[0, 0] == pytest.approx(4 * 0.02**2 + POSE_FLOOR[0] ** 2, rel=1e-3)
+    assert far[0, 0] == pytest.approx(9 * 0.02**2 + POSE_FLOOR[0] ** 2, rel=1e-3)
+
+
+def test_an_anchor_without_a_covariance_leaves_the_others():
+    marginals, poses = straight(9)
+    every = relative_covariances(marginals, poses, [0, 5], 9)
+    left = relative_covariances(Unsure(marginals, 5), poses, [0, 5], 9)
+    assert len(left) == len(every) / 2
+    np.testing.assert_allclose(left, every[: len(left)])

@@ -1,0 +1,48 @@
+"""Doubts about objects that may be where the rays of two things cross."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from doubtful_drives import mapped
+
+from objslam.association.crossings.one_or_two import find_crossings
+from objslam.core.result import RunResult
+from objslam.mapping.doubts import disagreeing
+from objslam.mapping.doubts.evidence import evidence_of
+from objslam.simulation import preset, simulate
+
+
+@pytest.fixture(scope="module")
+def rooms() -> RunResult:
+    return mapped(simulate(preset("rooms", false=0.0, tracks="perfect"), 4))
+
+
+def test_objects_of_a_clean_drive_are_no_crossings(rooms):
+    assert disagreeing.crossing(rooms, evidence_of(rooms)) == []
+
+
+def test_an_object_is_doubted_if_it_is_more_likely_not_one_thing(rooms, monkeypatch):
+    """With an existence of 0.9, the odds 1 : 1 of one thing are a probability of 0.45, and the odds e : 1 are 0.66."""
+    objects = tuple(replace(o, existence=0.9) for o in rooms.map.objects)
+    result = replace(rooms, map=replace(rooms.map, objects=objects))
+    odds = {0: 0.0, 1: 1.0, 2: -2.0}
+
+    def given(state, sized, fewest):
+        found = find_crossings(state, sized, fewest)
+        return replace(found, odds=np.array([odds.get(k, 5.0) for k in range(len(found.landmark))]))
+
+    monkeypatch.setattr(disagreeing, "find_crossings", given)
+    evidence = evidence_of(result)
+    sized = np.ones(len(evidence.state.obs), dtype=bool)
+    landmark = find_crossings(evidence.state, sized, 1).landmark
+    found = disagreeing.crossing(result, evidence)
+    named = [result.map.objects[evidence.object[landmark[k]]].id for k in (2, 0)]  # The likeliest crossing comes first.
+    assert [doubt.objects for doubt in found] == [(number,) for number in named]
+    assert [doubt.numbers["probability"] for doubt in found] == pytest.approx([0.9 / (1 + np.exp(2)), 0.45])
+    assert len(disagreeing.in_assessment(found)) == 1
+    known = tuple(replace(o, existence=None) for o in objects)  # Names that are given say nothing of existence.
+    found = disagreeing.crossing(replace(result, map=replace(result.map, objects=known)), evidence)
+    assert [doubt.numbers["log_odds"] for doubt in found] == pytest.approx([2.0])
