@@ -18,7 +18,8 @@ from objslam.core.rotation import cross
 from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, noise_up
 from objslam.graph.robust_cost import ray_information
-from objslam.mapping.fixed.lasting_noise import TIMES, Cells, lasting_variances
+from objslam.mapping.checks.finding import Finding
+from objslam.mapping.fixed.lasting_noise import TIMES, Cells, LastingNoise, lasting_variances
 from objslam.mapping.solution import Solution
 
 _CELL = 1.0
@@ -27,13 +28,19 @@ shorter errors as noise."""
 _MOST_CELLS = 48
 """The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
 slower."""
+_LARGE = 1.0
+"""A run at given poses says that they err for seconds if they err by at least this multiple of `localization`. From this
+value on, the errors that last are as large as all errors should be. A larger value warns less often."""
+LASTING = "lasting localisation errors"
+"""The name of the finding that given poses err for seconds."""
 _POOLED = 20.0
 """With this many rays, the scatter inside cells weighs as much as the noise in the settings. A larger number trusts the
 settings more."""
 
 
-def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
-    """Return the solution of a run at given poses with their lasting errors added to its covariances.
+def with_lasting_errors(solution: Solution, settings: Settings) -> tuple[Solution, LastingNoise | None]:
+    """Return the solution of a run at given poses with their lasting errors added to its covariances, and these errors. They
+    are None if the log does not show them.
 
     A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
     poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. On uneven ground, planar
@@ -43,22 +50,41 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> Solution:
     and Thompson 1971), and averaged over their posterior.
     """
     if not solution.keyframes.localized_every:
-        return solution
+        return solution, None
     seen = _cells_of(solution, settings)
     if not seen:
-        return solution
+        return solution, None
     from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
 
     covariance = solution.estimate.covariance.copy()
-    for cells in seen:
-        variances = lasting_variances(cells)
+    found = [lasting_variances(cells) for cells in seen]
+    for cells, variances in zip(seen, found, strict=True):
         objects, more = cells.covariances(variances)
         covariance[objects] += more
     if (tilt := noise_up(solution.keyframes, settings)[0]) > 0:  # The variances of the last cells are those of the ground.
-        at, rolls = solution.keyframes, tilt * np.sqrt(variances[0])
+        at, rolls = solution.keyframes, tilt * np.sqrt(found[-1][0])
         covariance[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
     wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
-    return replace(solution, estimate=wider)
+    return replace(solution, estimate=wider), LastingNoise.of(found[0], *noise_of_poses(solution.keyframes, settings))
+
+
+def check_lasting_noise(noise: LastingNoise, settings: Settings) -> Finding | None:
+    """Return a finding if errors of given poses last for seconds, and are larger than the settings say.
+
+    All rays of these seconds miss their objects to the same side, so an object can become two. The covariances of the map
+    contain these errors.
+    """
+    said = settings.localization
+    if max(noise.yaw / said.yaw, noise.xy / said.xy) < _LARGE:
+        return None
+    return Finding(
+        LASTING,
+        f"all boxes of some seconds miss their objects together: the poses err by {np.degrees(noise.yaw):.2g} deg and "
+        f"{100 * noise.xy:.2g} cm for about {noise.seconds:.0f} s, and localization.yaw and localization.xy say "
+        f"{np.degrees(said.yaw):.2g} deg and {100 * said.xy:.2g} cm. Something may be in the map twice. A joint solve "
+        "corrects such poses (--mode joint)",
+        spoils=False,
+    )
 
 
 def _cells_of(solution: Solution, settings: Settings) -> list[Cells]:

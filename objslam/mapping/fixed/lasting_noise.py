@@ -76,6 +76,24 @@ class Cells:
         return np.asarray(squared[0] * self.turn @ self.turn.T + squared[1] * self.move @ self.move.T)
 
 
+@dataclass(frozen=True)
+class LastingNoise:
+    """The errors of given poses that last: the standard deviations of headings, rad, and of places, m, and for how long they
+    last, s."""
+
+    yaw: float
+    xy: float
+    seconds: float
+
+    @classmethod
+    def of(cls, variances: Floats, yaw: float, place: float) -> "LastingNoise":
+        """Return the errors with squared factors (2, T), as of `lasting_variances`, on noise of `yaw` rad and `place` m."""
+        turned, moved = np.sqrt(variances.sum(axis=1)).tolist()
+        weight = variances.sum(axis=0)
+        seconds = float(np.exp(weight @ np.log(TIMES) / weight.sum())) if weight.sum() > 0 else 0.0
+        return cls(turned * yaw, moved * place, seconds)
+
+
 def lasting_variances(cells: Cells) -> Floats:
     """Return the expected squared factors (2, T) of the errors of rotations and of places that last for each of `TIMES`.
     Their sums over these times are the squared factors of all errors.
