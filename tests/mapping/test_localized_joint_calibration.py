@@ -15,7 +15,12 @@ from objslam.mapping.checks.assessment import Evidence, assess, evidence_of
 from objslam.simulation import preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 
-PRIORS = {"clock": 0.1, "roll": 0.02, "tilt": 0.02, "yaw": 0.03, "x": 0.05, "y": 0.05, "z": 0.05}
+TURNS, PLACE, LENS = (
+    {"roll": 0.02, "tilt": 0.02, "yaw": 0.03},
+    dict.fromkeys("xyz", 0.05),
+    dict.fromkeys(("focal", "cx", "cy"), 0.02),
+)
+PRIORS = {"clock": 0.1, **TURNS, **PLACE, **LENS}
 
 
 def drive(seed: int, errors: dict[str, float]) -> Log:
@@ -48,9 +53,13 @@ def test_errors_drawn_from_their_priors_are_found_and_the_map_is_honest() -> Non
         assert set(found.names) == {f"front.{name}" for name in PRIORS}
         true = np.array([errors[name.partition(".")[2]] for name in found.names])
         assert (np.abs(found.values - true) < 3 * found.sigma).all()
-        # The rotation and the clock are told by the log. The height of the camera is not: it moves all objects.
+        # The log tells the clock and the focal length, and of a rotation and the image centre what they have in common. It
+        # does not tell the height of the camera, which moves all objects.
         sigma = dict(zip(found.names, found.sigma.tolist(), strict=True))
-        assert all(sigma[f"front.{name}"] < PRIORS[name] / 2 for name in ("clock", "tilt", "yaw"))
+        assert all(sigma[f"front.{name}"] < PRIORS[name] / 2 for name in ("clock", "roll", "focal"))
+        for pair in (("front.tilt", "front.cy"), ("front.yaw", "front.cx")):
+            at = [found.names.index(name) for name in pair]
+            assert np.linalg.eigvalsh(found.covariance[np.ix_(at, at)])[0] < (LENS["cx"] / 4) ** 2
         assert np.sqrt(covariance[:, 2, 2]).min() > 0.9 * PRIORS["z"]
         squared.append(np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., None])[..., 0]))
     assert np.mean(np.concatenate(squared) < chi2.ppf(0.95, 3)) >= 0.95
