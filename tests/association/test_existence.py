@@ -147,7 +147,7 @@ def test_beta_binomial_by_scipy():
     rate, concentration = 0.3, 8.0
     whole = betabinom.logpmf(seen, expected, rate * concentration, (1 - rate) * concentration)
     one = whole - np.log(comb(expected, seen))
-    np.testing.assert_allclose(_beta_binomial(seen, expected, np.full(4, rate), concentration), one)
+    np.testing.assert_allclose(_beta_binomial(seen, expected, np.zeros(4, dtype=int), np.array([rate]), concentration), one)
 
 
 def counted(seen, expected):

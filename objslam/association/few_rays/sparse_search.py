@@ -10,6 +10,7 @@ import numpy as np
 
 from objslam.association.few_rays.chance import Strays, log_volume, ray_odds
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
+from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
 
 _MOST_PAIRS = 4096
@@ -147,9 +148,9 @@ def _judge(obs: Observations, points: Floats, free: Bools, search: SparseSearch)
         points = np.linalg.solve(information + damping[:, :, None] * np.eye(3), right[:, :, None])[:, :, 0]
     count = np.bincount(point, minlength=len(points))
     dense = density[point, ray] * strays.along(away, obs.label[ray])
-    sums = [np.bincount(point, each, len(points)) for each in (odds[point, ray], dense, away)]
-    total, objects, reach = sums[0], sums[1] / np.maximum(count, 1), sums[2] / np.maximum(count, 1)
-    total = total + log_volume(information, reach) + np.log(np.maximum(objects, 1e-300))
+    total, objects, reach = grouped_sums(np.stack([odds[point, ray], dense, away], axis=1), point, len(points)).T
+    number = np.maximum(count, 1)
+    total = total + log_volume(information, reach / number) + np.log(np.maximum(objects / number, 1e-300))
     taken = np.zeros((len(points), every), dtype=bool)
     taken[point, left[ray]] = True
     return points + centre, np.where(count > 0, total, -np.inf), taken
