@@ -100,8 +100,9 @@ system_libraries() {
     fi
 }
 
+# pip would compile all modules of all packages. Python compiles those that are used, a fifth of them, when it first imports them.
 pip_install() {
-    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check "$@"
+    "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile "$@"
 }
 
 # Prints the packages of one set in tools/constraints.txt, with the hashes of their files.

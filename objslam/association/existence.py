@@ -52,11 +52,11 @@ class Rates:
     def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
         """Return -2 ln(p) (N,). p is the probability that an object of a label is detected in `seen` of `expected`
         frames."""
-        return -2 * _beta_binomial(seen, expected, self.mean[label], self.concentration)
+        return -2 * _beta_binomial(seen, expected, label, self.mean, self.concentration)
 
     def log_likelihood(self, history: DetectionHistory, label: Ints) -> float:
         """Return ln of the probability of all detections and misses of objects with these labels (N,)."""
-        return float(_beta_binomial(history.seen, history.expected, self.mean[label], self.concentration).sum())
+        return float(_beta_binomial(history.seen, history.expected, label, self.mean, self.concentration).sum())
 
     def log_odds(self, history: DetectionHistory, label: Ints, rarer: Bools | bool = True) -> Floats:
         """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses.
@@ -64,15 +64,12 @@ class Rates:
         An object has a rate of its class or, with the probability `_UNUSUAL_SHARE`, a lower one. rarer: (N,) whether it may
         have a lower one.
         """
-        seen, expected, rate = history.seen, history.expected, self.mean[label]
-        phantom = rate * _PHANTOM_SHARE
+        of, phantom = (history.seen, history.expected, label), self.mean * _PHANTOM_SHARE
         # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
-        as_phantom = _beta_binomial(seen, expected, phantom, 1 / phantom)
-        usual = np.log1p(-_UNUSUAL_SHARE) + _beta_binomial(seen, expected, rate, self.concentration)
+        as_phantom = _beta_binomial(*of, phantom, 1 / phantom)
+        usual = np.log1p(-_UNUSUAL_SHARE) + _beta_binomial(*of, self.mean, self.concentration)
         lower, concentration = _UNUSUAL_RATE
-        unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + _beta_binomial(
-            seen, expected, lower * rate, concentration
-        )
+        unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + _beta_binomial(*of, lower * self.mean, concentration)
         return np.asarray(np.logaddexp(usual, unusual) - as_phantom)
 
 
@@ -90,10 +87,11 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rate
     return replace(rates, concentration=_CONCENTRATIONS[int(np.argmax(likelihood >= likelihood.max() - _CLEAR_LEAD))])
 
 
-def _beta_binomial(seen: Ints, expected: Ints, rate: Floats, concentration: float | Floats) -> Floats:
-    """Return ln of the probability (N,) of a sequence of detections and misses, if the rate has a beta distribution."""
+def _beta_binomial(seen: Ints, expected: Ints, label: Ints, rate: Floats, concentration: float | Floats) -> Floats:
+    """Return ln of the probability (N,) of a sequence of detections and misses, if the rate has a beta distribution. label:
+    (N,) of the objects. rate, concentration: (L,) the mean rate of each class, and the sum of the two parameters."""
     a, b = concentration * rate, concentration * (1 - rate)
-    return log_beta(a + seen, b + expected - seen) - log_beta(a, b)
+    return log_beta(a[..., label] + seen, b[..., label] + expected - seen) - log_beta(a, b)[..., label]
 
 
 def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) -> Floats:

@@ -147,7 +147,11 @@ def test_beta_binomial_by_scipy():
     rate, concentration = 0.3, 8.0
     whole = betabinom.logpmf(seen, expected, rate * concentration, (1 - rate) * concentration)
     one = whole - np.log(comb(expected, seen))
-    np.testing.assert_allclose(_beta_binomial(seen, expected, np.full(4, rate), concentration), one)
+    np.testing.assert_allclose(_beta_binomial(seen, expected, np.zeros(4, dtype=int), np.array([rate]), concentration), one)
+    # Objects of another class do not change the result.
+    label, rates = np.array([1, 0, 1, 0]), np.array([0.9, rate])
+    own = _beta_binomial(seen, expected, label, rates, concentration)[label == 1]
+    np.testing.assert_allclose(own, np.asarray(one)[label == 1])
 
 
 def counted(seen, expected):

@@ -167,17 +167,35 @@ def ray_odds(
     distance: (..., R) m, from the camera. noise: factor on the noise of the rays. A deviation beyond `gate` costs as much as
     one at the gate.
     """
-    spread = noise**2 * ((obs.sigma * distance) ** 2 + obs.position_sigma**2)
-    density = strays.per_frame(number) * strays.image / distance**2
-    odds = -0.5 * np.minimum(off2 / spread, gate) - np.log(2 * np.pi * spread * density)
-    ranged = np.flatnonzero(np.isfinite(obs.range))
-    if len(ranged):
+    # The tables can be of hundreds of points and all rays, so each is changed in place where that is possible.
+    distance2 = distance**2
+    spread = obs.sigma**2 * distance2
+    spread += obs.position_sigma**2
+    spread *= noise**2
+    density = strays.per_frame(number) * strays.image / distance2
+    odds = np.minimum(off2 / spread, gate)
+    odds *= -0.5
+    spread *= density
+    spread *= 2 * np.pi
+    odds -= np.log(spread, out=spread)
+    known = np.isfinite(obs.range)
+    ranged = slice(None) if known.all() else np.flatnonzero(known)
+    if known.any():
         told, sigma = obs.range[ranged], obs.range_sigma[ranged]
-        away = distance[..., ranged]
-        fit = np.exp(-0.5 * ((away - told) / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
-        chance = strays.along(told, obs.label[ranged])
-        wrong = _WRONG_RANGE * np.minimum(strays.along(away, obs.label[ranged]) * away * _LOG_RANGE, 1.0)
-        odds[..., ranged] += np.log((1 - _WRONG_RANGE) * fit / chance + wrong)
+        away, label = distance[..., ranged], obs.label[ranged]
+        fit = away - told
+        fit /= sigma
+        fit *= fit
+        fit *= -0.5
+        np.exp(fit, out=fit)
+        fit *= (1 - _WRONG_RANGE) / (np.sqrt(2 * np.pi) * sigma * strays.along(told, label))
+        wrong = strays.along(away, label)
+        wrong *= away
+        wrong *= _LOG_RANGE
+        np.minimum(wrong, 1.0, out=wrong)
+        wrong *= _WRONG_RANGE
+        fit += wrong
+        odds[..., ranged] += np.log(fit, out=fit)
     return odds, density
 
 

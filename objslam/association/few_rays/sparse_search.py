@@ -10,6 +10,7 @@ import numpy as np
 
 from objslam.association.few_rays.chance import Strays, log_volume, ray_odds
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
+from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
 
 _MOST_PAIRS = 4096
@@ -105,7 +106,12 @@ def _odds(obs: Observations, search: SparseSearch, points: Floats, rays: Ints) -
 
 
 def _judge(obs: Observations, points: Floats, free: Bools, search: SparseSearch) -> tuple[Floats, Floats, Bools]:
-    """Refine points (H, 3), and return them with their log odds (H,) and the mask (H, R) of their rays."""
+    """Refine points (H, 3), and return them with their log odds (H,) and the mask (H, R) of their rays. free: (R,) the rays
+    that no point has taken yet. Only these are compared with the points."""
+    left, every = np.flatnonzero(free), len(obs)
+    if not len(left):
+        return points, np.full(len(points), -np.inf), np.zeros((len(points), every), dtype=bool)
+    obs, strays = obs.take(left), search.strays.take(left)
     n, known = obs.direction, np.isfinite(obs.range)
     along = n[:, :, None] * n[:, None, :]
     across = np.eye(3) - along
@@ -114,28 +120,37 @@ def _judge(obs: Observations, points: Floats, free: Bools, search: SparseSearch)
     foot, ahead = (across @ origin[:, :, None])[:, :, 0], (n * origin).sum(axis=1)
     end = n * (ahead + np.where(known, obs.range, 0.0))[:, None]
     precision = np.where(known, 1 / obs.range_sigma**2, 0.0)
-    begin = np.flatnonzero(np.diff(obs.frame, prepend=-1))
-    of_frame = np.cumsum(np.diff(obs.frame, prepend=-1) != 0) - 1
+    starts = np.diff(obs.frame, prepend=-1) != 0
+    begin, of_frame = np.flatnonzero(starts), np.cumsum(starts) - 1
+    weight, ranged = np.zeros((2, len(points), len(left)))
     for step in range(_REFINEMENTS + 1):
         depth = points @ n.T - ahead
         distance2 = (points**2).sum(axis=1)[:, None] + (origin**2).sum(axis=1) - 2 * points @ origin.T
-        distance2 = np.maximum(distance2, MIN_DEPTH**2)
+        np.maximum(distance2, MIN_DEPTH**2, out=distance2)
         distance = np.sqrt(distance2)
-        off2 = np.maximum(distance2 - depth**2, 0.0)
-        odds, density = ray_odds(obs, search.strays, search.number, off2, distance, 1.0, search.gate)
-        odds[(depth <= MIN_DEPTH) | ~free] = -np.inf
-        best = np.maximum.reduceat(odds, begin, axis=1)[:, of_frame]
-        taken = (odds > 0) & (odds == best)
-        weight = taken / ((obs.sigma * distance) ** 2 + obs.position_sigma**2)
-        ranged = taken * precision
+        off2 = distance2 - depth**2
+        np.maximum(off2, 0.0, out=off2)
+        odds, density = ray_odds(obs, strays, search.number, off2, distance, 1.0, search.gate)
+        odds[depth <= MIN_DEPTH] = -np.inf
+        # Most rays have no positive odds at a point, so the rest is computed only for those that have.
+        point, ray = np.nonzero(odds > 0)
+        best = np.maximum.reduceat(odds, begin, axis=1)[point, of_frame[ray]]
+        point, ray = (some[odds[point, ray] == best] for some in (point, ray))
+        away = distance[point, ray]
+        weight[:], ranged[:] = 0.0, 0.0
+        weight[point, ray] = 1 / ((obs.sigma[ray] * away) ** 2 + obs.position_sigma**2)
+        ranged[point, ray] = precision[ray]
         information = (weight @ across.reshape(-1, 9) + ranged @ along.reshape(-1, 9)).reshape(-1, 3, 3)
         if step == _REFINEMENTS:
             break
         damping = (_DAMPING * np.trace(information, axis1=1, axis2=2) + 1e-9)[:, None]
         right = weight @ foot + ranged @ end + damping * points
         points = np.linalg.solve(information + damping[:, :, None] * np.eye(3), right[:, :, None])[:, :, 0]
-    number = np.maximum(taken.sum(axis=1), 1)
-    objects = (taken * density * search.strays.along(distance, obs.label)).sum(axis=1) / number
-    volume = log_volume(information, (taken * distance).sum(axis=1) / number)
-    total = np.where(taken, odds, 0.0).sum(axis=1) + volume + np.log(np.maximum(objects, 1e-300))
-    return points + centre, np.where(taken.any(axis=1), total, -np.inf), taken
+    count = np.bincount(point, minlength=len(points))
+    dense = density[point, ray] * strays.along(away, obs.label[ray])
+    total, objects, reach = grouped_sums(np.stack([odds[point, ray], dense, away], axis=1), point, len(points)).T
+    number = np.maximum(count, 1)
+    total = total + log_volume(information, reach / number) + np.log(np.maximum(objects / number, 1e-300))
+    taken = np.zeros((len(points), every), dtype=bool)
+    taken[point, left[ray]] = True
+    return points + centre, np.where(count > 0, total, -np.inf), taken
