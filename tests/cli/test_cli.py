@@ -922,13 +922,18 @@ def test_a_wrong_calibration_file_fails_before_the_log_is_read(objslam, tmp_path
 def test_a_calibration_of_before_is_no_news(objslam, tmp_path, late_camera):
     """A log calibrated again from its own file tightens it like a second log. Combining keeps the prior of the file once."""
     first, twice = tmp_path / "first.yaml", tmp_path / "twice.yaml"
-    assert objslam("calibrate", str(late_camera), "-o", str(first), *BY_LABEL).code == 0
+    options = (
+        *BY_LABEL,
+        "--set",
+        "calibration.centre=0",
+    )  # An unknown image centre leaves hardly any error that the log tells.
+    assert objslam("calibrate", str(late_camera), "-o", str(first), *options).code == 0
     one = load_calibration(first)
     known = Calibration(
         (*one.names, "rear.yaw"), np.append(one.values, 0.3), block_diag(one.covariance, 1e-4), np.append(one.prior, 1)
     )
     first.write_text(dump_calibration(known))
-    done = objslam("calibrate", str(late_camera), "-o", str(twice), *BY_LABEL, "--set", f"calibration.file={first}")
+    done = objslam("calibrate", str(late_camera), "-o", str(twice), *options, "--set", f"calibration.file={first}")
     assert done.code == 0, done.err
     done.says_somewhere("rear.yaw")
     again = load_calibration(twice)
