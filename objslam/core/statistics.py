@@ -185,10 +185,12 @@ def poisson_tail(least: Ints, mean: Floats) -> Floats:
     beyond = np.maximum(mean - count, 0.0) + _DEVIATIONS * np.sqrt(np.maximum(mean, count)) + _DEVIATIONS**2
     terms = math.ceil(float(beyond.max(initial=0.0)))
     if terms * len(count) <= _FEW:
+        # Logarithms, because a large mean has a first term of 0 and ratios that overflow.
         with np.errstate(divide="ignore", under="ignore"):
-            first = np.exp(count * np.log(mean) - mean - _log_gamma(count + 1))
-            ratios = np.cumprod(mean[:, None] / (count[:, None] + np.arange(1, terms)), axis=1)
-        tail = np.minimum(first * (1 + ratios.sum(axis=1)), 1.0)
+            logs = np.empty((len(count), max(terms, 1)))
+            logs[:, 0] = count * np.log(mean) - mean - _log_gamma(count + 1)
+            logs[:, 1:] = np.log(mean)[:, None] - np.log(count[:, None] + np.arange(1, terms))
+            tail = np.minimum(np.exp(np.cumsum(logs, axis=1)).sum(axis=1), 1.0)
     else:
         from scipy.special import gammainc
 

@@ -102,6 +102,12 @@ def test_the_noise_of_each_group_is_that_of_its_median_ray():
     np.testing.assert_allclose(found, [1.0, 1.1, 3.0, 1.0, 1.0], atol=0.2)
 
 
+def test_the_poisson_tail_of_a_large_mean_is_one():
+    """The first term is 0 in floating point, and the ratios of the terms are too large for it."""
+    with np.errstate(all="raise", under="ignore", divide="ignore"):
+        np.testing.assert_allclose(poisson_tail(np.array([1, 3]), np.array([5000.0, 900.0])), 1.0, rtol=1e-14)
+
+
 def test_the_poisson_tail_is_one_less_the_sum_of_the_smaller_counts():
     least, mean = np.array([-2, 0, 1, 2, 5, 3]), np.array([1.0, 0.0, 0.5, 3.0, 2.0, 0.0])
     expected = [1 - sum(math.exp(-m) * m**k / math.factorial(k) for k in range(n)) for n, m in zip(least, mean, strict=True)]
