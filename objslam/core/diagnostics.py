@@ -58,6 +58,16 @@ class Ledger:
         for message in other.warnings:
             self.warn(message)
 
+    def copy(self) -> Ledger:
+        """Return a ledger with the same entries."""
+        return Ledger(
+            dict(self.dropped), dict(self.totals), {k: list(v) for k, v in self.examples.items()}, list(self.warnings)
+        )
+
+    def restore(self, earlier: Ledger) -> None:
+        """Replace all entries by those of an earlier copy."""
+        self.dropped, self.totals, self.examples, self.warnings = vars(earlier.copy()).values()
+
     def lines(self) -> list[str]:
         """Return each drop and then each warning as one line of text, as the terminal and summary.json show them."""
         lines = []

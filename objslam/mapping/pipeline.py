@@ -14,7 +14,7 @@ from objslam.core.geometry import interpolate
 from objslam.core.result import RunResult
 from objslam.core.trajectory import correct_path
 from objslam.core.types import Keyframes, Log, Trajectory
-from objslam.errors import LogError, ObjslamError, SolveError
+from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import take_out_expected, take_out_known
@@ -35,7 +35,7 @@ from objslam.mapping.checks.verdict import say, widened
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.far_sides import with_far_sides
-from objslam.mapping.fixed.lasting_errors import LASTING, check_lasting_noise, with_lasting_errors
+from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasting_errors
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
@@ -55,28 +55,23 @@ def run(
 ) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode.
+    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
+    it has odometry too.
     known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
     LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path.
     SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
-    at_poses = Ledger()
-    try:
-        result = _run(log, settings, at_poses, progress, known)
-    except ObjslamError:
-        ledger.add(at_poses)
-        raise
-    if settings.mode == "auto" and any(found["name"] == LASTING for found in result.summary["wrong_input"]):
-        ledger.warn(
-            "the localisation errs for seconds, so poses and objects are solved together (--mode fixed keeps the poses)"
-        )
-        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known)
-    ledger.add(at_poses)
-    return result
+    before = ledger.copy()
+    result, poses_err = _run(log, settings, ledger, progress, known)
+    if settings.mode != "auto" or not poses_err or chosen_poses(log, settings).odometry is None:
+        return result
+    ledger.restore(before)  # What a run drops counts once.
+    ledger.warn("the localisation errs for seconds, so the poses are solved too (--mode fixed keeps them)")
+    return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known)[0]
 
 
-def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known: PriorMap | None) -> RunResult:
-    """Map the objects of a log as `run` does, in one mode."""
+def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known: PriorMap | None) -> tuple[RunResult, bool]:
+    """Map the objects of a log as `run` does, in one mode. Also return whether given poses err for seconds."""
     given = log = chosen_poses(log, settings)
     unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
@@ -131,7 +126,7 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         if settings.checks.use:
             diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
-    lasting = None
+    lasting, late = None, None
     if settings.mode == "fixed":
         solution, lasting = with_lasting_errors(solution, settings)
         solution = with_far_sides(solution)
@@ -144,9 +139,10 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
     objects, residual = describe(solution, cameras, settings, trusted=trusted)
     if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings:
         calibrated, held = estimate.calibration is not None, (keyframes, solution.rays, solution.association)
-        missing = None if lasting is None else check_lasting_noise(lasting, settings)
-        missing = missing or check_pose_noise(objects, *held, settings, calibrated=calibrated)
-        missing = missing or check_residuals(objects, *held, residual, settings, calibrated=calibrated)
+        noisy = check_pose_noise(objects, *held, settings, calibrated=calibrated)
+        missing = noisy or check_residuals(objects, *held, residual, settings, calibrated=calibrated)
+        late = None if lasting is None else check_lasting_noise(lasting, settings)
+        missing = missing or late
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
     used = keyframes, solution.rays, solution.association
@@ -183,7 +179,7 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         "frames_on_path": len(frames),
         "detections": sum(len(detections) for detections in found),
     }
-    return make_result(
+    result = make_result(
         replace(solution, keyframes=with_given_stamps(keyframes, given)),
         objects,
         residual,
@@ -205,6 +201,7 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         residual_before=residual_before,
         views=with_given_stamps(solved_views(log, settings, path_after), given),
     )
+    return result, late is not None
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

@@ -276,7 +276,8 @@ def test_a_session_maps_what_is_pushed(log: Log) -> None:
     camera, boxes, path = log.cameras[0].camera, log.cameras[0].detections, log.localization
     assert boxes is not None
     assert path is not None
-    with objslam.Session(poses={"use": "localization"}, patient=True) as session:
+    known = {"focal": 0.0, "centre": 0.0}  # The simulated camera is calibrated.
+    with objslam.Session(poses={"use": "localization"}, calibration=known, patient=True) as session:
         assert session.push_camera(camera)
         at = 0
         for k, stamp in enumerate(boxes.frame_stamps):

@@ -83,7 +83,7 @@ def test_a_folder_becomes_a_result_that_answers(play: Play, folder: Path) -> Non
 
 
 def test_arrays_become_the_cup_of_the_readme(play: Play) -> None:
-    assert "cup #0 at (2.510, 0.503, 0.400) m, sigma 0.460 m, 5 rays" in play("from_arrays")
+    assert "cup #0 at (2.510, 0.503, 0.400) m, sigma 0.824 m, 5 rays" in play("from_arrays")
 
 
 def test_pushed_data_become_a_map(play: Play, folder: Path) -> None:

@@ -60,10 +60,10 @@ def test_the_noise_of_ranges_is_found():
 @pytest.mark.parametrize("said", [0.5, 2.0])
 def test_the_drift_in_the_settings_is_only_a_start(said):
     """The estimated noise hardly depends on the noise from which the search begins."""
-    usual = solved(1.0)[0]
+    usual = solved(1.0, overrides=("calibration.centre=0",))[0]
     of = Odometry()
     names = ("x_per_m", "y_per_m", "xy_per_rad", "yaw_per_m", "yaw_per_rad")
-    overrides = (*(f"odometry.{n}={said * getattr(of, n)}" for n in names), "noise.odometry=true")
+    overrides = (*(f"odometry.{n}={said * getattr(of, n)}" for n in names), "noise.odometry=true", "calibration.centre=0")
     other = solved(1.0, overrides=overrides)[0]
     assert other.noise.turning * said == pytest.approx(usual.noise.turning, rel=0.35)
     assert_allclose(other.positions, usual.positions, atol=0.05)

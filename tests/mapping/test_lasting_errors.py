@@ -144,9 +144,11 @@ def test_poses_that_err_for_seconds_are_named_and_auto_solves_them_too():
         return result, ledger, [np.linalg.norm(item.position - place[item.label]) for item in result.map.resolved()]
 
     fixed, _, off = mapped(bad, "fixed")
-    assert [found["name"] for found in fixed.summary["wrong_input"]] == ["lasting localisation errors"]
+    assert [found["name"] for found in fixed.summary["wrong_input"]] == ["localisation noise"]
     assert fixed.summary["assessment"]["level"] == "check"
-    assert "--mode joint" in " ".join(fixed.summary["warnings"])
+    less_noisy, _, _ = mapped(with_lasting(log, 2.0, 8.0, 3), "fixed")
+    assert [found["name"] for found in less_noisy.summary["wrong_input"]] == ["lasting localisation errors"]
+    assert "--mode joint" in " ".join(less_noisy.summary["warnings"])
     solved, ledger, less = mapped(bad, "auto")
     assert solved.summary["mode"] == "joint"
     assert "errs for seconds" in " ".join(ledger.lines())

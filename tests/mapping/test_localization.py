@@ -20,7 +20,8 @@ UNKNOWN = lift_se2(np.array([3.0, -7.0, 2.0]))
 def settings(mode="fixed"):
     poses = {"use": "odometry" if mode == "joint" else "localization"}
     less = {"checks": {"use": False}, "bodies": {"use": False}, "output": {"recording": False, "picture": False}}
-    return change_settings(Settings(), {"mode": mode, "poses": poses, **less})
+    camera = {"calibration": {"centre": 0.0}}  # The simulated camera is calibrated.
+    return change_settings(Settings(), {"mode": mode, "poses": poses, **less, **camera})
 
 
 def another_day(first, seed):

@@ -21,8 +21,12 @@ _ANGLES = ("yaw", "tilt", "roll")
 
 def run(errors, held):
     overrides = ("mode=joint", "poses.use=odometry", "association.method=by_label", "output.picture=false")
-    overrides = (*overrides, "checks.use=false", "bodies.use=false")  # The turn of a bearing to its body is no shared error.
-    held = (*_HELD, *(f"calibration.{name}=0" for name in held))
+    overrides = (
+        *overrides,
+        "checks.use=false",
+        "bodies.use=false",
+    )  # The turn of a bearing to its body is no shared error.
+    held = (*_HELD, *(f"calibration.{name}=0" for name in ("centre", *held)))
     log = add_shared_errors(simulate(preset("demo", frames=240, objects=8, classes=8), 1), errors)
     return pipeline.run(log, load_settings(None, (*overrides, *held)), Ledger())
 

@@ -55,7 +55,8 @@ def test_posts_without_names(data_dir):
     cameras = tuple(replace(c, detections=without_names(c.detections)) for c in log.cameras)
     posts = tuple(replace(post, label="post") for post in log.truth.objects)
     log = replace(log, cameras=cameras, truth=replace(log.truth, objects=posts))
-    settings = load_settings(None, ("mode=joint", "output.recording=false", "checks.use=false"))
+    lens = "calibration.centre=0"  # A laser has none.
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "checks.use=false", lens))
     result = pipeline.run(log, settings, Ledger())
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     path = Trajectory(stamps, result.map_T_base[first])

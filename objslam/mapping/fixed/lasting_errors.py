@@ -31,6 +31,9 @@ slower."""
 _LARGE = 1.0
 """A run at given poses says that they err for seconds if they err by at least this multiple of `localization`. From this
 value on, the errors that last are as large as all errors should be. A larger value warns less often."""
+_FEWEST = 3
+"""A run says this only if at least this number of objects show it. Boxes of one object lie beside it in the same way for
+seconds, so one object tells little of the poses. A larger number warns less often."""
 LASTING = "lasting localisation errors"
 """The name of the finding that given poses err for seconds."""
 _POOLED = 20.0
@@ -40,7 +43,7 @@ settings more."""
 
 def with_lasting_errors(solution: Solution, settings: Settings) -> tuple[Solution, LastingNoise | None]:
     """Return the solution of a run at given poses with their lasting errors added to its covariances, and these errors. They
-    are None if the log does not show them.
+    are None if the log does not show them, or if the poses are not planar.
 
     A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
     poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. On uneven ground, planar
@@ -65,7 +68,10 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> tuple[Solutio
         at, rolls = solution.keyframes, tilt * np.sqrt(found[-1][0])
         covariance[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
     wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
-    return replace(solution, estimate=wider), LastingNoise.of(found[0], *noise_of_poses(solution.keyframes, settings))
+    if not is_planar(solution.keyframes.map_T_base):  # A camera in the hand keeps its view, so errors of boxes last as well.
+        return replace(solution, estimate=wider), None
+    noise = LastingNoise.of(seen[0], found[0], *noise_of_poses(solution.keyframes, settings))
+    return replace(solution, estimate=wider), noise
 
 
 def check_lasting_noise(noise: LastingNoise, settings: Settings) -> Finding | None:
@@ -75,7 +81,7 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings) -> Finding | No
     contain these errors.
     """
     said = settings.localization
-    if max(noise.yaw / said.yaw, noise.xy / said.xy) < _LARGE:
+    if noise.objects < _FEWEST or max(noise.yaw / said.yaw, noise.xy / said.xy) < _LARGE:
         return None
     return Finding(
         LASTING,

@@ -79,19 +79,20 @@ class Cells:
 @dataclass(frozen=True)
 class LastingNoise:
     """The errors of given poses that last: the standard deviations of headings, rad, and of places, m, and for how long they
-    last, s."""
+    last, s. objects: the number of objects that show them."""
 
     yaw: float
     xy: float
     seconds: float
+    objects: int
 
     @classmethod
-    def of(cls, variances: Floats, yaw: float, place: float) -> "LastingNoise":
+    def of(cls, cells: Cells, variances: Floats, yaw: float, place: float) -> "LastingNoise":
         """Return the errors with squared factors (2, T), as of `lasting_variances`, on noise of `yaw` rad and `place` m."""
         turned, moved = np.sqrt(variances.sum(axis=1)).tolist()
         weight = variances.sum(axis=0)
         seconds = float(np.exp(weight @ np.log(TIMES) / weight.sum())) if weight.sum() > 0 else 0.0
-        return cls(turned * yaw, moved * place, seconds)
+        return cls(turned * yaw, moved * place, seconds, len(np.unique(cells.owner)))
 
 
 def lasting_variances(cells: Cells) -> Floats:
