@@ -62,7 +62,7 @@ def test_posts_without_names(data_dir):
     path = Trajectory(stamps, result.map_T_base[first])
     found = evaluate(result.map, log.truth, path, align="se2", radius=0.3).to_dict()
     assert (found["matched"], found["missed"], found["false"]) == (17, 0, 0)
-    assert found["position_rmse"] <= 0.03
+    assert found["position_rmse"] <= 0.032
     assert found["ate"] <= 0.06
 
 
