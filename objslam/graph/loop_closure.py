@@ -141,9 +141,8 @@ def relative_covariances(marginals: gtsam.Marginals, map_T_camera: Floats, ancho
     for anchor in (a for a in anchors if a < now):
         try:
             joint = marginals.jointMarginalCovariance([X0 + anchor, X0 + now]).fullMatrix()
-        except (
-            RuntimeError
-        ):  # The order of elimination is another one for each pair, and the system may be indeterminate in it.
+        except RuntimeError:
+            # Each pair has its own order of elimination, and the system may be indeterminate in it.
             continue
         relative = inverse(map_T_camera[anchor]) @ map_T_camera[now]
         jacobian = np.hstack([-adjoint(inverse(relative)), np.eye(6)])

@@ -65,9 +65,15 @@ def run(
     result, poses_err = _run(log, settings, ledger, progress, known)
     if settings.mode != "auto" or not poses_err or chosen_poses(log, settings).odometry is None:
         return result
+    at_poses = ledger.copy()
     ledger.restore(before)  # What a run drops counts once.
     ledger.warn("the localisation errs for seconds, so the poses are solved too (--mode fixed keeps them)")
-    return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known)[0]
+    try:
+        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known)[0]
+    except SolveError as error:  # The map at the given poses is better than none.
+        ledger.restore(at_poses)
+        ledger.warn(f"the localisation errs for seconds, but the poses cannot be solved too: {error}")
+        return result
 
 
 def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known: PriorMap | None) -> tuple[RunResult, bool]:

@@ -81,7 +81,7 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings) -> Finding | No
     contain these errors.
     """
     said = settings.localization
-    if noise.objects < _FEWEST or max(noise.yaw / said.yaw, noise.xy / said.xy) < _LARGE:
+    if noise.objects < _FEWEST or (noise.yaw < _LARGE * said.yaw and noise.xy < _LARGE * said.xy):
         return None
     return Finding(
         LASTING,
