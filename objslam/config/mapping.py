@@ -31,6 +31,9 @@ class RayNoise(Section):
     box_sigma: NotNegative = 0.05
     """Box centre noise as a share of the box size (geometric mean of width and height), added in quadrature to
     pixel_sigma."""
+    unknown_size: NotNegative = 0.2
+    """Width and height in m that an object is taken to have if its boxes do not show its size, as those of sensors that
+    measure a bearing only. box_sigma is a share of it. 0: such an object is a point."""
     min_score: NotNegative = 0.0
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     border: Finite = 1.0

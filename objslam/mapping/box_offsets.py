@@ -60,7 +60,7 @@ class SizedRays:
     """R rays of boxes that show the size of their objects.
 
     landmark: (R,) the object of each ray. origin, direction: (R, 3) in map. distance: (R,) m to the object. noise: (R,) rad,
-    the standard deviation of the direction. size: (R,) rad, the angular size of the box. along: (R,) 1/m, one over the
+    the standard deviation of the direction. size: (R,) rad, the angular size of the object. along: (R,) 1/m, one over the
     standard deviation of the range, 0 without a range.
     """
 
@@ -80,11 +80,17 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     the object's size. `rays.box_sigma` is the prior standard deviation of this share. The share is estimated from the rays
     if `noise.rays` is true, or if `noise.rays` is auto and `rays.box_sigma` has its default value. In joint mode, the path
     must also be planar.
+
+    A sensor that measures bearings only shows no sizes, but its objects are not points either. They get offsets of the prior
+    share of `rays.unknown_size`.
     """
     estimate, prior = solution.estimate, settings.rays.box_sigma
     rays = _sized_rays(solution, cameras, settings)
     if prior == 0 or not len(rays.landmark):
         return solution
+    map_T_camera = estimate.map_T_base @ solution.keyframes.base_T_camera
+    sizes = extents(solution.rays, solution.association, estimate.positions, map_T_camera, solution.keyframes, cameras)
+    sized = np.isfinite(sizes).all(axis=1)
     joint = settings.mode == "joint"
     seen = sides_of(rays, estimate.positions, plain=not joint and settings.fixed.loss == "l1")
     told = settings.noise.rays
@@ -93,14 +99,12 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     # elevation.
     if learnt and joint:
         learnt = is_planar(solution.keyframes.map_T_base) and not any(noise_of_ground(settings))
-    share = (
-        _share([one.in_elevation() for one in seen.values()] if joint else list(seen.values()), prior) if learnt else prior
-    )
-    map_T_camera = estimate.map_T_base @ solution.keyframes.base_T_camera
-    sizes = extents(solution.rays, solution.association, estimate.positions, map_T_camera, solution.keyframes, cameras)
+    shown = [one.in_elevation() if joint else one for j, one in seen.items() if sized[j]]
+    share = _share(shown, prior) if learnt else prior
     covariance, bodies = estimate.covariance.copy(), list(solution.bodies or ())
     for j, sides in seen.items():
-        offset = offset_covariance(sides, sizes[j], share)
+        unknown = np.full(2, settings.rays.unknown_size)
+        offset = offset_covariance(sides, sizes[j], share) if sized[j] else offset_covariance(sides, unknown, prior)
         covariance[j] += offset
         body = bodies[j] if bodies else None
         if body is not None and body.behind:  # Its centre comes from the edges that are visible, so from few of them.
@@ -108,7 +112,7 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
             wider[:3, :3] += offset
             bodies[j] = replace(body, covariance=wider)
     solution = replace(solution, bodies=tuple(bodies)) if bodies else solution
-    return replace(solution, estimate=replace(estimate, covariance=covariance, box_offset=share))
+    return replace(solution, estimate=replace(estimate, covariance=covariance, box_offset=share if shown else None))
 
 
 def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
@@ -121,21 +125,23 @@ def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
 
 
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
-    """Return the rays with a weight above 0 of objects with a position, for cameras whose boxes show a size.
+    """Return the rays with a weight above 0 of objects with a position. `rays.unknown_size` is the size of objects in boxes
+    that do not show it.
 
     Fiducials whose corners were used are left out, because their positions do not come from boxes.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
-    sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[solution.rays.keyframe]]
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
-    which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0) & sees_size)
+    which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     placed[list(estimate.tags)] = False
     which = which[placed[association.object[which]]]
     rays, landmark = solution.rays.take(which), association.object[which]
     origin, direction = rays.in_map(estimate.map_T_base @ keyframes.base_T_camera)
     distance = np.maximum(np.linalg.norm(estimate.positions[landmark] - origin, axis=1), MIN_DEPTH)
     angle, place = (rays.sigma, 0.0) if settings.mode == "joint" else pose_noise(rays, keyframes, settings)
-    size = np.sqrt(size_per_metre(rays, keyframes, cameras).prod(axis=1))
+    sees_size = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe]]
+    shown = np.sqrt(size_per_metre(rays, keyframes, cameras).prod(axis=1))
+    size = np.where(sees_size, shown, settings.rays.unknown_size / distance)
     along = np.where(np.isfinite(rays.range), 1 / rays.range_sigma, 0.0)
     return SizedRays(landmark, origin, direction, distance, np.hypot(angle, place / distance), size, along)
 

@@ -1,5 +1,7 @@
 """Boxes that err together: against drives around objects whose boxes are shifted by a known law."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -119,6 +121,20 @@ def test_more_rays_from_one_side_tell_no_more():
     wide, _ = drive(0.05, 1, arc=2.0)
     assert sigma(log) > 0.6 * sigma(few)  # 0.41 if all rays were independent
     assert sigma(wide) < 0.7 * sigma(log)
+
+
+def test_objects_whose_boxes_show_no_size_are_not_points():
+    """They err as objects of the size that the settings give, with the share that is expected before any ray."""
+    log, _ = drive(0.0, 3)
+    sized = mapped(log, "rays.box_sigma=0.08", "bodies.use=false")
+    blind = replace(log, cameras=tuple(replace(one, camera=replace(one.camera, sees_size=False)) for one in log.cameras))
+    results = [mapped(blind, f"rays.unknown_size={size}", "rays.box_sigma=0.08") for size in (SIZE, 2 * SIZE, 0)]
+    like, large, points = (np.array([o.covariance for o in one.map.resolved()]) for one in results)
+    np.testing.assert_allclose(like, [o.covariance for o in sized.map.resolved()], rtol=0.15, atol=1e-5)
+    np.testing.assert_allclose(large - points, 4 * (like - points), rtol=1e-6, atol=1e-12)
+    assert np.linalg.eigvalsh(like)[:, 0].min() > (0.08 * SIZE) ** 2
+    assert np.linalg.eigvalsh(points)[:, -1].max() < (0.03 * SIZE) ** 2
+    assert [one.summary["box_offset"] for one in results] == [None] * 3
 
 
 def test_a_turned_world_gives_a_turned_covariance():

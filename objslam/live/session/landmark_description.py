@@ -41,8 +41,9 @@ def describe_landmark(m: MapState, row: int, position: Floats, covariance: Float
         sigma = float(largest_sigma(wider * seen[None])[0])
     status = status_of(sigma, away, count, parallax, bool(np.isfinite(obs.range).any()), limits)
     fixed, extent = status == "ok", _extent(m, some, position) if count else None
-    if fixed and extent is not None:
-        covariance = covariance + _offsets(m, some, obs, position, np.array(extent))
+    if fixed and count:
+        size = np.array(extent) if extent else np.full(2, m.settings.rays.unknown_size)
+        covariance = covariance + _offsets(m, some, obs, position, size)
     return MapObject(
         id=j,
         label=m.labels[int(landmarks.label[row])],
