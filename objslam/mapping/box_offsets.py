@@ -90,7 +90,7 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
         return solution
     map_T_camera = estimate.map_T_base @ solution.keyframes.base_T_camera
     sizes = extents(solution.rays, solution.association, estimate.positions, map_T_camera, solution.keyframes, cameras)
-    sized = np.isfinite(sizes).all(axis=1)
+    sized = np.asarray(np.isfinite(sizes).all(axis=1))
     joint = settings.mode == "joint"
     seen = sides_of(rays, estimate.positions, plain=not joint and settings.fixed.loss == "l1")
     told = settings.noise.rays
