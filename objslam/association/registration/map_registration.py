@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
-from scipy.spatial import KDTree
 from scipy.special import gammaln
 
 from objslam.association.place_recognition import Constellation
+from objslam.association.registration.bending import bent_matches
 from objslam.association.registration.fitting import (
     Problem,
     covariances,
@@ -189,29 +188,16 @@ def _log_odds(problem: Problem, index: Ints, x: Floats, tried: int) -> Floats:
 
 
 def _finish(problem: Problem, x: Floats) -> tuple[Floats, Floats, Ints]:
-    """Match all objects one-to-one under a transform (4,) and fit it to the matches.
+    """Match all objects one-to-one near a transform (4,), in maps that bend, and fit the transform to the matches.
 
     Return the transform, its covariance (4, 4), and the matches (P, 2).
     """
-    a = b = np.zeros(0, dtype=np.int64)
+    matches = bent_matches(problem, x)
+    a, b = matches.T
+    if len(a) < 2:
+        return x, np.full((4, 4), np.nan), matches
     for _ in range(_FITS):
         moved = move(x[None], problem.a.position[None])[0]
-        near = KDTree(moved).sparse_distance_matrix(KDTree(problem.b.position), _reach(problem), output_type="coo_matrix")
-        one, two = (np.asarray(rows, dtype=np.int64) for rows in (near.row, near.col))
-        equal = problem.a.label[one] == problem.b.label[two]
-        one, two = one[equal], two[equal]
-        miss = problem.b.position[two] - moved[one]
-        squared = (
-            miss * np.linalg.solve(covariances(problem, x[None], one[None], two[None])[0], miss[..., None])[..., 0]
-        ).sum(axis=1)
-        good = squared <= SAME_POINT
-        gain = np.zeros((len(moved), len(problem.b.label)))
-        gain[one[good], two[good]] = 2 * SAME_POINT - squared[good]
-        a, b = linear_sum_assignment(-gain)
-        matched = gain[a, b] > 0
-        a, b = a[matched], b[matched]
-        if len(a) < 2:
-            break
         fitted, _ = robust_step(
             x[None],
             (problem.b.position[b] - moved[a])[None],
@@ -220,11 +206,4 @@ def _finish(problem: Problem, x: Floats) -> tuple[Floats, Floats, Ints]:
             np.ones((1, len(a)), dtype=bool),
         )
         x = fitted[0]
-    covariance = transform_covariance(problem, x, a, b) if len(a) > 1 else np.full((4, 4), np.nan)
-    return x, covariance, np.column_stack([a, b])
-
-
-def _reach(problem: Problem) -> float:
-    """Return the largest distance (m) of two objects that may match."""
-    widest = sum(float(np.linalg.eigvalsh(m.covariance)[:, -1].max()) for m in (problem.a, problem.b))
-    return float(np.sqrt(SAME_POINT * widest))
+    return x, transform_covariance(problem, x, a, b), matches

@@ -31,7 +31,7 @@ from objslam.core.maps.shared_covariance import NUMBERS, SIZE, jacobian, moved, 
 _FLOOR = 0.01
 """The standard deviation (m) added to each position, so that exact maps can be registered. A larger value matches more
 objects."""
-_STRAIN = [3, 4, SIZE]
+STRAIN = [3, 4, SIZE]
 """The numbers of a shared error that a shift and a yaw do not absorb: the tilt about x and y, and the size."""
 
 
@@ -121,5 +121,5 @@ def strain(position: Floats, shared: Floats) -> Floats:
 
     position: (N, 3) m, relative to the centre of the map. shared: (7, 7) the covariance of the shared error.
     """
-    lever = jacobian(position)[:, :, _STRAIN]
-    return np.asarray(lever @ shared[np.ix_(_STRAIN, _STRAIN)] @ np.swapaxes(lever, 1, 2))
+    lever = jacobian(position)[:, :, STRAIN]
+    return np.asarray(lever @ shared[np.ix_(STRAIN, STRAIN)] @ np.swapaxes(lever, 1, 2))
