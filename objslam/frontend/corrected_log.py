@@ -273,10 +273,24 @@ def refocused(directions: Floats, mine: Bools, errors: tuple[float, float, float
     """
     if not any(errors):
         return directions
-    (focal, cx, cy), (x, y, z) = errors, directions.T
-    corrected = np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=1)
-    longer = np.where(mine[:, None], corrected, directions)
+    longer = np.where(mine[:, None], _refocused(directions, errors), directions)
     return np.asarray(longer / np.linalg.norm(longer, axis=1, keepdims=True))
+
+
+def refocused_noise(directions: Floats, mine: Bools, errors: tuple[float, float, float]) -> Floats:
+    """Return factors (R,) on the standard deviations of unit directions (R, 3), which `refocused` corrects.
+
+    The correction is a linear map M and a projection onto the unit sphere. It multiplies areas on the sphere by det M / |M
+    d|^3 at direction d, and standard deviations by the root. Towards the edge of an image, angles change by less than in its
+    middle. With one factor for all directions, noise at the edge would ask for a shorter focal length.
+    """
+    return np.where(mine, np.sqrt((1 + errors[0]) / np.linalg.norm(_refocused(directions, errors), axis=1) ** 3), 1.0)
+
+
+def _refocused(directions: Floats, errors: tuple[float, float, float]) -> Floats:
+    """Return unit directions (R, 3), corrected by the errors `LENS`, with other lengths."""
+    (focal, cx, cy), (x, y, z) = errors, directions.T
+    return np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=1)
 
 
 def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:

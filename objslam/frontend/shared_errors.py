@@ -21,6 +21,7 @@ from objslam.frontend.corrected_log import (
     later,
     lens_errors,
     refocused,
+    refocused_noise,
     take_out,
 )
 from objslam.frontend.known_errors import (
@@ -157,7 +158,7 @@ class SharedErrors:
         """Return keyframes, rays and settings corrected by the errors (P,).
 
         The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. The noise of
-        directions follows the focal length for the same reason: with a longer focal length, all angles are smaller.
+        directions follows the lens for the same reason: with a longer focal length, all angles are smaller.
         Keyframes stay on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap
         takes the nearest pose. drift: whether the drift is computed for the corrected odometry. If not, the drift and the
         variance of the interpolated path stay as measured.
@@ -172,8 +173,8 @@ class SharedErrors:
             base_T_camera[mine] = corrected_mount(mounts, error, one.camera.name)
             lens = lens_errors(error, one.camera.name)
             if any(lens):
+                sigma *= refocused_noise(direction, mine[rays.keyframe], lens)
                 direction = refocused(direction, mine[rays.keyframe], lens)
-                sigma[mine[rays.keyframe]] /= 1 + lens[0]
         gathered, step, wander = keyframes.drift, keyframes.step, keyframes.wander
         if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.

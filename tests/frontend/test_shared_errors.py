@@ -15,7 +15,7 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Images, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.corrected_log import take_out
+from objslam.frontend.corrected_log import refocused, refocused_noise, take_out
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import take_out_known
 from objslam.frontend.odometry_drift import gathered_drift
@@ -285,3 +285,26 @@ def test_an_offset_never_turns_a_short_depth_round(clean):
     assert np.isnan(corrected[np.isnan(depths)]).all()
     with np.errstate(all="raise"):  # A fisheye sees things beside it, where a ray has no depth.
         assert_allclose(measured_ranges({}, np.array([2.0]), np.array([[1.0, 0.0, 0.0]]), np.ones(1)), 2.0)
+
+
+@pytest.mark.parametrize("lens", [(-0.05, 0.0, 0.0), (0.1, 0.0, 0.0), (0.0, 0.06, -0.04), (-0.05, 0.04, 0.02)])
+@pytest.mark.parametrize("off", [0, 20, 40])
+def test_another_lens_does_not_fit_noise_better(lens, off):
+    """Drawn noise of directions, before and after the correction of a lens. In units of its sigma, it stays as large.
+
+    With one factor for the whole image, noise at its edge was 3 % larger or smaller for a focal length of 5 %. So all rays
+    together asked for a shorter focal length: 4 % for a camera that looks to the side.
+    """
+    rng, sigma = np.random.default_rng(0), 1e-3
+    around = rng.uniform(0, 2 * np.pi, 100_000)
+    tip = np.tan(np.radians(off))
+    true = np.column_stack([tip * np.cos(around), tip * np.sin(around), np.ones_like(around)])
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    noise = sigma * rng.normal(size=true.shape)
+    seen = true + noise - true * (noise * true).sum(axis=1, keepdims=True)
+    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    every = np.ones(len(true), dtype=bool)
+    angle = np.linalg.norm(np.cross(refocused(true, every, lens), refocused(seen, every, lens)), axis=1)
+    after = angle / (sigma * refocused_noise(true, every, lens))
+    assert np.mean(after**2) / 2 == pytest.approx(1.0, abs=0.012)
+    assert (refocused_noise(true, ~every, lens) == 1).all()

@@ -223,7 +223,7 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
     absolute = map_T_camera[: len(absolute_root)]
 
     def bearings(direction: Floats, sigma: Floats, to_landmark: Floats) -> Floats:
-        # A longer focal length makes all angles smaller, and the noise of directions too (`SharedErrors.at`). Without the
+        # The lens changes angles between directions, and the noise of directions as well (`SharedErrors.at`). Without the
         # noise, every log would ask for a longer focal length.
         return bearing_root * graph.bearing_residuals(direction, to_landmark, axes) * (usual / sigma)[:, None]
 
