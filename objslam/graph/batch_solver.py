@@ -22,9 +22,10 @@ from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.factors.odometry_motions import find_ties
 from objslam.graph.fixed_pose_triangulation import flat_noise
 from objslam.graph.init_known_correspondences import initialize_known
+from objslam.graph.multi_start import MultiStart
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
-from objslam.graph.outlier_rejection import ROUNDS, misfit, reject_outliers, rejected_stretches, widening
+from objslam.graph.outlier_rejection import ROUNDS, JointSolution, misfit, reject_outliers, rejected_stretches, widening
 from objslam.graph.posterior.evidence import log_evidence
 from objslam.graph.posterior.marginals import (
     Solved,
@@ -178,8 +179,21 @@ def solve_joint(
     nothing = np.zeros(len(rays), dtype=bool)
     tolerance = _TOLERANCE if errors is None else _TOLERANCE_BEFORE
     rounds = ROUNDS if errors is None else _ROUNDS_BEFORE
-    first = measured, association, map_T_camera, positions, nothing, nothing
-    found = reject_outliers(*first, trace, tolerance, rounds, close=grown or places is not None)
+
+    def from_start(map_T_camera: Floats, positions: Floats, trace: Trace | None) -> JointSolution:
+        begin = measured, association, map_T_camera, positions, nothing, nothing
+        return reject_outliers(*begin, trace, tolerance, rounds, close=grown or places is not None)
+
+    def misfit_of(solution: JointSolution) -> float:
+        if errors is None or theta is None or hold:
+            return misfit(solution.map_T_camera, solution.positions, measured, association)
+        from objslam.graph.calibration.self_calibration import misfit_at_shared_errors
+
+        return misfit_at_shared_errors(errors, measure, association, solution, theta)
+
+    found = from_start(map_T_camera, positions, trace)
+    if grown:
+        found = MultiStart(measured, association, from_start, misfit_of).best(found, trace)
     loose = keyframes.odom_T_base is not None and not keyframes.localized_every and places is None
     back = rejected_stretches(rays, association, found) if loose else nothing
     if back.any():

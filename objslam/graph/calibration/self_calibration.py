@@ -27,7 +27,7 @@ from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.calibration.variance_components import estimate_noise
-from objslam.graph.outlier_rejection import JointSolution, known_landmarks, reject_outliers
+from objslam.graph.outlier_rejection import JointSolution, known_landmarks, misfit, reject_outliers
 
 _ROUNDS = 8
 """The most outer steps of a search. The MRCLAM robots, whose clocks are 0.2 s off, take 1 or 2 steps before the noise is
@@ -140,6 +140,20 @@ def calibrate(
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
     calibration = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
     return CalibratedSolution(calibration, fit.errors, state.measured, final, sensitivity)
+
+
+def misfit_at_shared_errors(
+    errors: CalibratedMeasurements, measure: Measure, association: Association, found: JointSolution, theta: Floats
+) -> float:
+    """Return the misfit of a joint solution at the shared errors that fit it best, with their squared deviations.
+
+    It compares solutions at the noise of `errors`. The search begins at theta (P,). SolveError as of `calibrate`.
+    """
+    state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
+    at = _Fit(errors, measure, None).shared_errors(state.ordered(found.near), theta, _NEARLY)
+    off = at.theta - errors.mean
+    rays = misfit(at.state.map_T_camera, at.state.positions, at.state.measured, association)
+    return rays + float(off @ np.linalg.solve(errors.prior, off)) if len(off) else rays
 
 
 @dataclass(frozen=True)
