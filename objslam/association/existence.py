@@ -122,9 +122,10 @@ def static_odds(state: State, gate: float, fitted: int = 0) -> Floats:
 def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
     """Return which landmarks (N,) may be objects that are detected more rarely than their class.
 
-    The rays of a phantom belong to other things. So a landmark whose rays also pass other landmarks within the gate (a
-    squared deviation) must be detected as often as its class. From odometry alone, all landmarks must: where the path is
-    wrong, the rays of a known thing miss it, meet elsewhere, and only misses refute what they meet in.
+    The rays of a phantom belong to other things. So a landmark whose rays also pass other
+    landmarks within the gate (a squared deviation) must be detected as often as its class. From odometry alone, all
+    landmarks must be. Where the path is wrong, the rays of a known thing miss it and may meet elsewhere. Only misses then
+    show that this landmark is a phantom.
     """
     if not state.view.localized:
         return np.zeros(state.count, dtype=bool)

@@ -1,8 +1,9 @@
 """Jumps of a localisation: steps that no robot makes, or that the odometry does not show.
 
-A particle filter that was wrong for a while jumps when it corrects itself, or when it takes another place for its own. The
-poses of one side of a jump are then wrong by the whole jump, so objects seen from both sides would be at two places, and a
-calibration would take a part of it. The path itself shows how large the jump is. It does not show which side is right.
+A particle filter jumps when it corrects an earlier mistake, or when it takes another place for the robot's place. Then the
+poses on one side of the jump are wrong by the whole jump. Objects seen from both sides would be at two places, and a
+calibration would take a part of the jump for an error of a sensor. The path itself shows how large the jump is. It does not
+show which side is right.
 """
 
 from dataclasses import dataclass, replace
@@ -85,8 +86,9 @@ class Jumps:
     def likely(self) -> Floats:
         """(J + 1,) the probability that each part is right, proportional to the root of its share of the time.
 
-        It lies between two beliefs: that a localisation is right at a random moment, so that a short part is hardly ever
-        right, and that each part is right with the same probability, so that a single wrong pose would be one of three.
+        It lies between two assumptions. If a localisation were right at a random moment, a short part would hardly ever be
+        right. If each part were right with the same probability, a single wrong pose between two right parts would be right
+        with probability 1/3.
         """
         found = np.sqrt(self.shares)
         return found / found.sum()
@@ -188,9 +190,10 @@ def _usual_corrections(off: Floats, usual: Floats) -> Floats:
 def _by_neighbours(path: Trajectory) -> tuple[Floats, Floats, Bools]:
     """Judge each step of a path by the steps beside it.
 
-    Returns by how much each step (N-1, 2, 3) differs from the median velocity of the two steps before it and the two steps
-    after it, how odd it is (N-1, 2), and which steps (N-1,) are judged. The first of each pair is a move, m, and the second
-    a turn, rad.
+    Returns the differences (N-1, 2, 3) between each step and a step at the median velocity of four steps, the two before it
+    and the two after it. Also returns the oddness (N-1, 2) of each step, and which steps (N-1,) are judged. In the axis of
+    length 2, the first entry is the move, m, and the second is the turn, rad. The oddness is the difference from the more
+    similar of the two neighbouring steps.
     """
     seconds = np.diff(path.stamps)
     velocity = _steps(path.poses) / seconds[:, None, None]

@@ -119,7 +119,7 @@ def test_wrong_input_at_fixed_poses_is_named_before_the_solve_and_no_shared_erro
     assert any("upside down" in line for line in heard["solve"])
     assert result.summary["wrong_input"]
     assert result.calibration is None
-    assert "what-ifs about the input" in heard
+    assert "possible corrections of the input" in heard
 
 
 class Heard(Exception):

@@ -208,11 +208,11 @@ def _as_one(bundles: Bundles) -> tuple[Floats, Floats]:
 
 
 def _alone(bundles: Bundles, free: FreeFit) -> tuple[Floats, Floats, Floats]:
-    """Return the log likelihood (G,) of each bundle as a thing of its own without that of its bearings, their cost (G,), and
-    where it most likely is (G, 3) m.
+    """Judge the explanation that each bundle shows a thing of its own.
 
-    Many distances explain the bearings of a bundle. The sizes of its boxes, and distances that are usual for the class,
-    decide between them.
+    Return its log likelihood (G,) without the bearings, the cost (G,) of the bearings, and the likeliest position (G, 3) m
+    of the thing. Many distances explain the bearings of a bundle. The sizes of its boxes, and the distances that are usual
+    for the class, decide between them.
     """
     usual, landmark = bundles.usual, bundles.landmark
     mean, spread2 = usual.class_mean[landmark], usual.class_spread[landmark] ** 2 + usual.view**2
@@ -230,8 +230,11 @@ def _alone(bundles: Bundles, free: FreeFit) -> tuple[Floats, Floats, Floats]:
 
 
 def _as_another(bundles: Bundles) -> tuple[Floats, Floats]:
-    """Return the log likelihood (G,) of each bundle as rays of another landmark without that of its bearings, and their cost
-    (G,). The likelihood is -inf if no other landmark fits."""
+    """Judge the explanation that each bundle shows another landmark.
+
+    Return its log likelihood (G,) without the bearings, and the cost (G,) of the bearings. The likelihood is -inf if no
+    other landmark fits.
+    """
     state, usual = bundles.state, bundles.usual
     bundle = np.full(len(state.obs), -1)
     bundle[bundles.ray] = bundles.group

@@ -48,9 +48,10 @@ def fit_freely(bundles: Bundles) -> tuple[FreeFit, Floats]:
 def fit_points(bundles: Bundles, index: Ints, landmark: Ints, noise: Floats, start: Floats) -> tuple[Floats, Floats, Floats]:
     """Fit points to groups of rays, from start values (N, 3) m.
 
-    Returns the positions (N, 3) m, ln of the volume (N,) m^3 over which the likelihood integrates, and the standard
-    deviation (N,) m along the direction that is known least. Without parallax, the usual distance of the class limits both.
-    index: (P,) the group of each ray. landmark, noise: (N,) of each group.
+    Returns the positions (N, 3) m, ln of their volumes (N,) m^3, and their largest standard deviations (N,) m over all
+    directions. A volume is (2 pi)^1.5 times the root of the determinant of the covariance (Laplace's method). Without
+    parallax, the usual distance of the class limits the volume and the standard deviation. index: (P,) the group of each
+    ray. landmark, noise: (N,) of each group.
     """
     state, ray, count = bundles.state, bundles.ray, len(landmark)
     position = refine(state.obs, ray, index, start, noise)

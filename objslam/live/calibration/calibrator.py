@@ -39,8 +39,9 @@ would wait that much longer for its pose, and the gain is small. A larger value 
 
 
 _LATE = frozenset(("turn_slip", *LENS))
-"""The kinds of errors that a session estimates at its end, if no calibration file has them. Early curves hardly tell a slip
-from wrong turns, and a short drive hardly tells a lens from a clock and a turn, so the other estimates are worse with them.
+"""The kinds of errors that a session estimates only at its end, if no calibration file has them. After a few curves, a slip
+looks like a wrong scale of turns. After a short drive, an error of the lens looks like an error of the clock together with a
+turn of the camera. So the other estimates would become worse.
 Because of the slip, three of four sessions of MRCLAM 6, robot 3, had up to five landmarks too many while the robot drove.
 Because of the lens, the map of a simulated drive with a late clock was 12 cm off after 100 frames instead of 3 cm."""
 

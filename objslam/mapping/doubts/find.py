@@ -28,11 +28,11 @@ maps are good."""
 
 
 _LOST = (0.1, 0.5)
-"""A group of boxes that became no object counts in the assessment if it has at least the first share of the boxes of its
-label, or the second share of the boxes of an object of its label (median). A detector's false boxes of one kind at one place
-are rarer. With larger shares, more maps are good."""
+"""Two shares. A group of boxes that became no object counts in the assessment if it has at least the first share of all
+boxes of its label. It also counts if it has at least the second share of the boxes that an object of its label has (median).
+False boxes of a detector at one place are rarer. With larger shares, more maps are good."""
 _FEWEST_LOST = 5
-"""The fewest boxes of such a group. With a larger number, more maps are good."""
+"""The fewest boxes of a group that counts in the assessment. With a larger number, more maps are good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
 """The reasons of groups whose boxes agree on one place at rest, and more closely than by chance."""
 _MOVED: tuple[Reason, ...] = ("moves",)

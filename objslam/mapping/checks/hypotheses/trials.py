@@ -71,7 +71,7 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
 
     def corrected() -> Iterator[Log]:
         for number, hypothesis in enumerate(every):
-            progress("what-ifs about the input", number, len(every))
+            progress("possible corrections of the input", number, len(every))
             logs.append(hypothesis.put_right(part.log))
             yield logs[-1]
 
