@@ -14,17 +14,17 @@ from objslam.core.arrays import Floats, Ints
 _STEPS = 48
 """The number of distances that are tried for a bundle, evenly in ln distance. A larger number is more exact, and slower."""
 _FEW_STEPS = 8
-"""The same to find a start for the point that fits a bundle best. Bundles without parallax fit at many distances."""
+"""The number of distances that are tried for the start of a fit of one point to a bundle. Bundles without parallax fit at
+many distances. A larger number is more exact, and slower."""
 _NEAREST, _FURTHEST = 0.03, 2.0
 """The least and the greatest tried distance of a bundle, in usual distances of its class."""
 
 
 @dataclass(frozen=True)
 class FreeFit:
-    """Points that fit the bearings of G bundles best, wherever that is.
-
-    position: (G, 3) m. log_volume: (G,) ln of the volume, m^3, over which the likelihood integrates. along: (G,) m, standard
-    deviation along the direction that is known least.
+    """Points that fit the bearings of G bundles best, at any distance. position: (G, 3) m. log_volume: (G,) ln of the
+    volume, m^3, of each position, as of `fit_points`. along: (G,) m, the largest standard deviation of each position over
+    all directions.
     """
 
     position: Floats

@@ -53,7 +53,7 @@ class JointGraph:
     measured: all measurements. which: (n,) the rays of `measured` that are in the graph. rays: these n rays. landmarks: (m,)
     the landmarks in the graph. landmark: (n,) the row of each ray's landmark in `landmarks`. weak: (m, 3) m, the means of
     the landmarks' weak priors. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each
-    row. gaussian: whether bearings have no loss.
+    row. gaussian: whether the bearings have Gaussian noise, without a robust loss.
     """
 
     measured: Measurements

@@ -20,8 +20,9 @@ from objslam.triangulation.bodies.solve import Bodies
 
 _UNLIKE = 0.3
 """The standard deviation of the difference between the surfaces of a thing and of its body, as a share of half the width.
-The surfaces of rendered rings, buttons and stands with open fronts were 0.3 behind those of their bodies, with a spread of
-0.3. Those of simulated boxes, cylinders and balls were there, to 0.07. A larger number trusts bodies less."""
+The surfaces of rendered rings, buttons and stands with open fronts were 0.3 behind the surfaces of their bodies, with a
+spread of 0.3. For simulated boxes, cylinders and balls, the two surfaces agreed to 0.07. A larger number trusts bodies
+less."""
 _UNSEEN = 0.5
 """The standard deviation of the distance from the surface to the centre of a body that was seen from one side, as a share of
 half the width. Such a body has only its prior. In simulated drives past things, it was 0.4 to 0.6. A larger number trusts

@@ -33,8 +33,8 @@ _LARGE = 1.0
 `localization`. At 1, the lasting errors alone are as large as all errors together should be. A larger value warns less
 often."""
 _FEWEST = 3
-"""A run says this only if at least this number of objects show it. Boxes of one object lie beside it in the same way for
-seconds, so one object tells little of the poses. A larger number warns less often."""
+"""A run warns of such errors only if at least this number of objects show them. Boxes of one object lie beside it in the
+same way for seconds, so one object tells little of the poses. A larger number warns less often."""
 LASTING = "lasting localisation errors"
 """The name of the finding that given poses err for seconds."""
 _POOLED = 20.0

@@ -17,8 +17,9 @@ _EQUAL = 1.0
 """The prior of the shares of shapes weighs as much as this number of things of each shape. With a larger number, the other
 things of a log say less about the shape of one."""
 _MOST = 6.0
-"""The other things of a label, and those of a log, count as at most this number. If their true shape is not among those that
-are tried, all err alike, so a hundred tell little more than a few. With a larger number, the shape of one thing is surer."""
+"""The other things of a label count as at most this number of things, and so do the other things of a log. If their true
+shape is not among the tried shapes, all of them have the same error, so a hundred tell little more than a few. With a larger
+number, the shape of one thing is surer."""
 _REPEATS = 20
 """How often `with_shares_of_shapes` repeats its expectation. More are slower and change little."""
 

@@ -88,7 +88,7 @@ def _boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
 
 
 def _images() -> Iterator[Hypothesis]:
-    """Yield the hypotheses that keep the unit of boxes: the images were turned before detection, or x and y are swapped."""
+    """Yield the hypotheses that boxes are mirrored, turned by 180 degrees, or have x and y swapped."""
     what, cause = "the boxes mirrored", "the images were mirrored before detection"
     yield Hypothesis("image mirrored", what, cause, _boxed(_mirrored))
     what, cause = "the boxes turned by 180 degrees", "the camera or its images are upside down"
