@@ -30,9 +30,9 @@ _TIMES_ODD = 3.5
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
 deviations. A larger number finds fewer jumps."""
 _CERTAIN = float(np.sqrt(27.6))
-"""The least size of a jump, in standard deviations of the noise in the settings, which is that of two poses and of the
-odometry between them. Noise is larger with a chance of 1e-6 (chi-squared with 2 degrees of freedom): in one of a thousand
-logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
+"""The least size of a jump, in standard deviations. They are those of two poses and of the odometry between them, by the
+settings. Noise exceeds this size with a probability of 1e-6 (chi-squared with 2 degrees of freedom), which is once in a
+thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
 _OF_MEDIAN = float(np.sqrt(np.log(10) / np.log(2)))
 """The length that a tenth of the steps exceeds, as a multiple of their median length, for normal noise in a plane."""
 _FEWEST_STEPS = 20
@@ -111,11 +111,10 @@ class Jumps:
         return replace(path, poses=poses)
 
     def spread(self, stamps: Floats, origins: Floats, owner: Ints, positions: Floats) -> Floats:
-        """Return the error of the objects because it is not known which part is right, as a factor (N, 3, m), m.
-
-        Each part is right with its probability `likely`, and then all objects are off by its distance from the mean. Beside
-        this, the size of each jump is known to its noise only. It moves an object by the share of its rays that are beyond
-        the jump.
+        """Return the errors that the jumps cause in the objects, as a factor (N, 3, m), m, of their joint covariance. There
+        are two causes. It is not known which part is right: if a part is right, which has its probability `likely`, all
+        objects are off by the distance of this part from the mean. The size of each jump has noise too: it moves an object
+        by the share of its rays that are beyond the jump.
 
         stamps: (R,) s, origins: (R, 3) m, owner: (R,) the object of each ray. positions: (N, 3) m of the objects.
         """

@@ -1,8 +1,9 @@
 """Estimate the noise of a localisation, and how long its errors last, from the rest of the log.
 
 Odometry and rays predict the path, up to a shift and a turn of the whole. The localisation differs from this prediction by
-the error of the prediction, whose covariance the graph knows, and by its own error. The size of its own error, the share of
-it that lasts, and for how long, are those of the largest restricted likelihood (Patterson and Thompson 1971).
+the error of the prediction, whose covariance the graph knows, and by its own error. Three values of its own error are
+estimated by restricted maximum likelihood (Patterson and Thompson 1971): its size, the share of it that lasts, and how long
+this share lasts.
 """
 
 from dataclasses import replace

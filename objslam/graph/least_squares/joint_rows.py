@@ -1,7 +1,7 @@
 """The graph of a joint solve as arrays: its whitened residuals and its sparse Jacobian, without an object for each factor.
 
-A calibration solves the same graph for many values of the shared errors. To make a GTSAM graph takes longer than to solve
-it, so these solves have arrays instead. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
+A calibration solves the same graph for many values of the shared errors. The construction of a GTSAM graph takes longer than
+its solution, so these solves use arrays. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
 """
 
 from collections.abc import Callable

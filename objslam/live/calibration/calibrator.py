@@ -34,8 +34,9 @@ _CHANGED = 1.0
 """The map is corrected if an error has changed by more than this, in standard deviations. A larger value corrects more
 rarely."""
 _NO_DELAY = 1.0
-"""A session does not correct a camera clock that is behind by at most this multiple of its standard deviation. Each frame
-would wait that much longer for its pose, and the gain is small. A larger value maps sooner, but with larger errors."""
+"""A session does not correct a camera clock that is behind by at most this multiple of the standard deviation of the
+estimate. With a correction, each frame would wait longer for its pose, by the offset of the clock, and the gain is small. A
+larger value maps sooner, but with larger errors."""
 
 
 _LATE = frozenset(("turn_slip", *LENS))

@@ -67,9 +67,9 @@ def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
                 "split",
                 "crossing",
                 o.label,
-                f"{o.label} #{o.id} may be where the rays of two things cross: {number - second} of its rays and {second} "
-                f"others come from two sides. By its rays, the sizes of their boxes, and frames without a box, it is one "
-                f"thing with a probability of {one[s]:.2g}.",
+                f"{o.label} #{o.id} may be where the rays of two things cross: {number - second} of its rays come from one "
+                f"side, and {second} from another. The rays, the sizes of their boxes, and frames without a box give a "
+                f"probability of {one[s]:.2g} that it is one thing.",
                 (o.id,),
                 o.position,
                 evidence.ray[np.flatnonzero(mine)],

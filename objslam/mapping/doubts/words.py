@@ -90,7 +90,7 @@ def _splits(result: RunResult, splits: Splits) -> Iterator[Doubt]:
             "may be two",
             o.label,
             f"{_name(o)} may be two: {m} of its rays meet near {in_place(one)} and {n} near {in_place(two)}, "
-            f"{_length(splits.gap[i])} apart as seen, where 3 sigma of a ray are {_length(3 * splits.noise[i])}{both}.",
+            f"{_length(splits.gap[i])} apart across the rays; 3 sigma of a ray are {_length(3 * splits.noise[i])}{both}.",
             (o.id,),
             o.position,
             np.flatnonzero(result.association.object == j),

@@ -87,7 +87,7 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings) -> Finding | No
     return Finding(
         LASTING,
         f"all boxes of some seconds miss their objects together: the poses err by {np.degrees(noise.yaw):.2g} deg and "
-        f"{100 * noise.xy:.2g} cm for about {noise.seconds:.0f} s, and localization.yaw and localization.xy say "
+        f"{100 * noise.xy:.2g} cm for about {noise.seconds:.0f} s, but localization.yaw and localization.xy say "
         f"{np.degrees(said.yaw):.2g} deg and {100 * said.xy:.2g} cm. Something may be in the map twice. A joint solve "
         "corrects such poses (--mode joint)",
         spoils=False,

@@ -47,7 +47,7 @@ def log_evidence(
 
 
 def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
-    """Return the logarithm of the evidence (S, N), with that of how usual each shape is among the other things of the log.
+    """Return the logarithm of the evidence (S, N), plus the logarithm of the share of each shape among the other things.
 
     One thing often hardly tells an ellipsoid from a cylinder. But things of one label are alike, and so are the things of a
     room. The shares of the shapes are those of the other things of the label. Their prior is the shares in the whole log,
@@ -74,7 +74,8 @@ def _told(number: Floats) -> Floats:
 
 
 def shapes_disagree(evidence: Floats, axes: Floats, chosen: Ints) -> Floats:
-    """Return by how much the shapes that fit about as well differ from the chosen ones, as covariances (N, A, A).
+    """Return the covariances (N, A, A) that show how much bodies of other shapes, weighted by their evidence, differ from
+    the chosen bodies.
 
     evidence: (S, N) the logarithm of the evidence of each shape. axes: (S, N, A) centres and half axes, m, of the bodies of
     each shape, NaN for what a shape does not tell. chosen: (N,). The result is the second moment about the chosen shape: a

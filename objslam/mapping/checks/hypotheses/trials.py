@@ -160,8 +160,8 @@ def _shift(trial: Trial) -> float:
 def _of_another_drive(first: Trial, best: Trial) -> Finding:
     """Return the finding of a log whose boxes fit better at other times. best: the best trial with another clock."""
     message = (
-        f"only {100 * first.share:.0f} % of the boxes agree with the poses. With earlier stamps of the frames, and as well "
-        f"with later ones, up to {100 * best.share:.0f} % do, so no error of the clock explains it: the poses may be of "
+        f"only {100 * first.share:.0f} % of the boxes agree with the poses. Earlier and later stamps of the frames both "
+        f"raise this share, to up to {100 * best.share:.0f} %, so no error of the clock explains it: the poses may be of "
         "another drive than the boxes"
     )
     return Finding("boxes disagree", message, basis="boxes")
