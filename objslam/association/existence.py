@@ -22,8 +22,8 @@ _UNUSUAL_RATE = (0.6, 12.0)
 of the class: about a half, as for a thing that is hidden on one visit of two. The second number is its concentration. With a
 larger mean, misses drop more objects."""
 _SHARED_RAYS = 0.5
-"""The largest share of the rays of such an object that also pass another landmark of their label. With a larger share, fewer
-neighbours are dropped, and more phantoms stay."""
+"""A landmark may be detected more rarely than its class only if at most this share of its rays also passes another landmark
+of their label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
 _CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
 _POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.

@@ -24,7 +24,8 @@ _ACCELERATION = 5.0
 """The acceleration (m/s^2) that a robot does not exceed from one step to the next and back. Wheels on a floor slip at 4 to
 8. A larger value finds fewer jumps."""
 _FREE_ACCELERATION = 20.0
-"""The same for poses that are not in a plane: a hand swings a camera, and a drone flies, with up to 2 g."""
+"""The highest acceleration (m/s^2) of poses that are not in a plane: a hand swings a camera, and a drone flies, with up to 2
+g. With a larger value, fewer steps are jumps."""
 _TIMES_ODD = 3.5
 """The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard

@@ -25,9 +25,9 @@ _LOOSE = 1e4
 """The factor on the noise of the localisation in the graph that predicts it. With a larger factor, the prediction contains
 less of the localisation, and more rounding errors."""
 _FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
-"""A long log is seen at 18 times that are spread evenly, and at these numbers of keyframes after each. Near poses show
-errors that are new in each pose, far ones errors that last. More poses are more exact, and the time grows with their
-cube."""
+"""In a long log, the poses are compared at `_FIRST` times, spread evenly, and at the numbers `_LAGS` of keyframes after
+each. Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are
+more exact, and the time grows with the cube of their number."""
 
 
 def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:

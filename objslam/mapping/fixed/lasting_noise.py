@@ -33,7 +33,8 @@ but fewer parts of the drive."""
 
 @dataclass(frozen=True)
 class Cells:
-    """The misses of the rays of objects along one axis, in C cells of an object and a short time, in the order of objects.
+    """The misses of the rays of objects along one axis, in C cells. A cell holds the rays of one object in a short time. The
+    cells are in the order of their objects.
 
     owner: (C,) the object. times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left, or
     above it. white: (C,) rad, the standard deviation of the mean from noise that does not last. shift: (C, n) rad per m, the

@@ -52,12 +52,12 @@ taken for noisy places."""
 _FEWEST = 20
 """The fewest boxes of a log that is searched. Fewer boxes agree with any noise by chance."""
 _NEAR = 30.0
-"""The log odds, below those of the likeliest noise, from which a noise is a start. With a larger number, more starts are
-tried, and each takes about a second."""
+"""A noise is tried as a start if its log odds are at most this below those of the likeliest noise. With a larger number,
+more starts are tried, and each takes about a second."""
 _NOISY = 3.0
-"""The least factor on `localization.xy` of noisy places. A noise with exact places counts only if each start leads to one.
-Boxes that err by far more explain few boxes as well, but they are rare, and the sigmas are then too small. With a larger
-factor, a good GPS is taken for a bad detector."""
+"""Places count as noisy from this factor on `localization.xy` on. If any start leads to noisy places, results with more
+exact places are left out. Large errors of boxes would explain few boxes as well, but they are rare, and the sigmas would
+then be too small. With a larger factor, a good GPS is taken for a bad detector."""
 _SETTLED = 2
 """How often the objects are searched with the noise of their residuals. A third time gave the same objects on 15 simulated
 streets. A larger number takes longer."""

@@ -29,9 +29,10 @@ def log_evidence(
 ) -> Floats:
     """Return the logarithm of the evidence (N,) of a fit.
 
-    side: (B,) px, half the length of the image, the range of a measurement that the shape does not explain. free: (B, 4)
-    which shifts and sizes a point does not explain. None for other shapes, which explain all but the bounds that they reach
-    beyond. Boxes from one direction share an error, so together they count as one measurement.
+    side: (B,) px, half the length of the image. A measurement that the shape does not explain is uniform over this length.
+    free: (B, 4) the shifts and sizes that a point does not explain, None for other shapes. Other shapes explain all
+    measurements except bounds that the body reaches. Boxes from one direction share an error, so together they count as one
+    measurement.
     """
     now, spread, worth = fit.found, weights.spread[:, :4], np.minimum(weights.spread**2 / weights.variance, 1.0)[:, :4]
     unexplained = now.use[:, :4] == 0 if free is None else free
