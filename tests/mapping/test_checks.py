@@ -542,7 +542,7 @@ def test_clocks_that_contradict_each_other_explain_nothing():
     both = found(0.44, 0.42, 0.45)
     assert both.name == "boxes disagree"
     assert "only 35 % of the boxes" in both.message
-    assert "up to 69 % do" in both.message
+    assert "to up to 69 %, so no error of the clock" in both.message
     assert "another drive" in both.message
     assert both.spoils
     assert found(0.44, 0.42, 0.6).message.endswith("the boxes")  # What fits clearly better than both is the cause.
