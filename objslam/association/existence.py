@@ -18,11 +18,12 @@ _UNUSUAL_SHARE = 0.05
 """The share of objects that are detected more rarely than their class, because neighbours hide them on one visit, or one of
 their sides is hard to detect. With a larger share, misses drop fewer objects, and more phantoms stay."""
 _UNUSUAL_RATE = (0.6, 12.0)
-"""The mean rate of these objects, as a share of the rate of their class, and the concentration of their rates: about a half,
-as of a thing that is hidden on one visit of two. With a larger mean, misses drop more objects."""
+"""The detection rates of these rarer objects have a beta distribution. The first number is its mean, as a share of the rate
+of the class: about a half, as for a thing that is hidden on one visit of two. The second number is its concentration. With a
+larger mean, misses drop more objects."""
 _SHARED_RAYS = 0.5
-"""The largest share of the rays of such an object that also pass another landmark of their label. With a larger share, fewer
-neighbours are dropped, and more phantoms stay."""
+"""A landmark may be detected more rarely than its class only if at most this share of its rays also passes another landmark
+of their label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
 _CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
 _POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
@@ -35,9 +36,9 @@ _REST_PRIOR = 3.0  # The prior log odds of a static object over a moving one. A 
 _WITHIN_SIZE = 0.5  # The share of an object's size that its apparent motion may have, because box centres wander that far.
 _DRIFTED = 2.0  # An object may seem to move by this many standard deviations of the drift of the path. More drops fewer.
 _WITHIN_NOISE = 8.0
-"""Errors of poses that last for seconds may explain a way of this many standard deviations of a ray. Things at rest seem to
-move by up to 8 if the poses err for 2 s at a time (simulated), and people who walk by 30. With a larger number, more things
-that move become objects."""
+"""Poses that err for seconds may make a thing at rest seem to move by up to this number of standard deviations of a ray. In
+simulations with errors of 2 s, things at rest seemed to move by up to 8, and people who walk by 30. With a larger number,
+more things that move become objects."""
 _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test.
 
 
@@ -123,8 +124,8 @@ def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
     """Return which landmarks (N,) may be objects that are detected more rarely than their class.
 
     The rays of a phantom belong to other things. So a landmark whose rays also pass other landmarks within the gate (a
-    squared deviation) must be detected as often as its class. From odometry alone, all landmarks must: where the path is
-    wrong, the rays of a known thing miss it, meet elsewhere, and only misses refute what they meet in.
+    squared deviation) must be detected as often as its class. From odometry alone, all landmarks must be. Where the path is
+    wrong, the rays of a known thing miss it and may meet elsewhere. Only misses then show that this landmark is a phantom.
     """
     if not state.view.localized:
         return np.zeros(state.count, dtype=bool)
@@ -191,11 +192,11 @@ def _no_stronger(number: Ints, label: Ints) -> Ints:
 def rest_odds(state: State, fitted: int = 0) -> Floats:
     """Return the log odds (N,), at most 0, of a static point over a point with constant velocity.
 
-    Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from
-    the share of the squared deviations that a velocity explains. The errors of poses last for seconds, so they look like a
-    motion too. So a way that such errors explain counts only as far as the deviations exceed their nominal noise. A box
-    centre wanders over its object as the view changes, which also looks like motion. So only a few rays count, and motion
-    within the object's size does not count, nor motion within the drift of the path. fitted: the number of measured
+    Rays of a slow object may meet for a while, but a moving point explains them much better. BIC gives the odds from the
+    share of the squared deviations that a velocity explains. Errors of poses last for seconds, so they look like a motion
+    too. If they can explain the distance that the point moved, only the part of the deviations beyond their nominal noise
+    counts. A box centre wanders over its object as the view changes, which also looks like motion. So only a few rays count.
+    Motion within the size of the object, or within the drift of the path, does not count. fitted: the number of measured
     coordinates that a moving point explains even by chance. They matter if there are few rays.
     """
     obs, landmarks = state.obs, state.landmarks

@@ -224,9 +224,9 @@ def pair_up(row: Ints, column: Ints, gain: Floats, shape: tuple[int, int]) -> tu
 def track_bonus(edges: Edges, track: Ints, matched: Ints) -> Floats:
     """Return the cost reduction (E,) of each edge: `TRACK_GAIN` if the other boxes of the ray's track support it, else 0.
 
-    The track supports an edge if at least two of its other boxes have the landmark of the edge, and if most of its other
-    boxes with a landmark have this landmark. track, matched: (R,) the track and the previous landmark of each ray, -1 for
-    none.
+    An edge pairs a ray with a landmark. Of the other boxes of the ray's track, only those that already have a landmark
+    count. They support the edge if at least two of them, and more than half of them, have its landmark. track, matched: (R,)
+    the track and the previous landmark of each ray, -1 for none.
     """
     bonus = np.zeros(len(edges.ray))
     known = np.flatnonzero((track >= 0) & (matched >= 0))

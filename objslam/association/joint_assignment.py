@@ -35,9 +35,12 @@ class Pairings:
 
 @dataclass(frozen=True)
 class JointAssignment:
-    """The best hypothesis. chosen: (n,) its pairings. odds: its log odds over "everything is new". margin: (n,) `odds` minus
-    the log odds of the best hypothesis without this pairing. rival: (n,) whether that hypothesis pairs the measurement with
-    another landmark."""
+    """The best hypothesis.
+
+    chosen: (n,) the indices of its pairings. odds: its log odds over "all measurements are of new things". margin, rival:
+    (n,) compare it, for each pairing, with the best hypothesis that lacks this pairing. margin: how much larger its log odds
+    are. rival: whether the other hypothesis pairs the same measurement with another landmark.
+    """
 
     chosen: Ints
     margin: Floats

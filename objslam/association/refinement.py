@@ -22,7 +22,7 @@ _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, becau
 _FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 """The rows and the columns of the six entries that determine a symmetric 3 x 3 matrix. The diagonal comes first."""
 _MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
-"""For each entry of the matrix, its index among these six entries."""
+"""The index of each entry of a symmetric 3 x 3 matrix among the six entries of `_FIRST` and `_SECOND`."""
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:

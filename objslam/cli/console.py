@@ -73,7 +73,8 @@ def progress_bar(ledger: SpeakingLedger | None = None, *, quiet: bool = False) -
 
 @contextmanager
 def _bar() -> Iterator[tuple[Show, Callable[[], None]]]:
-    """Yield a function that updates a bar, and one that does nothing, because a bar tells the time itself."""
+    """Yield the two functions of a progress bar. The first one updates the bar. The second one tells the time, and does
+    nothing here, because the bar shows the time."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,

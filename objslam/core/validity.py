@@ -182,7 +182,7 @@ def _matrix_fault(matrix: Floats) -> str | None:
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not matrix.any():
         return "without a calibration: its matrix is not (3, 3), not finite, or zero"
     if not (np.abs(matrix) < MAX_PIXEL).all():
-        return f"whose matrix has a number of {MAX_PIXEL:g} px or more"
+        return f"whose matrix has an entry of {MAX_PIXEL:g} px or more"
     if matrix[1, 0] != 0 or not np.array_equal(matrix[2], [0, 0, 1]):
         return "whose matrix is not fx 0 cx, 0 fy cy, 0 0 1"
     if min(matrix[0, 0], matrix[1, 1]) < 1 / MAX_PIXEL:

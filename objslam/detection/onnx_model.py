@@ -35,9 +35,9 @@ _NOT_A_MODEL = "INVALID_PROTOBUF"  # The error of onnxruntime for a file that is
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _GIB = 1 << 30  # bytes
 _MOST_MEMORY = 8 * _GIB
-"""The most memory of the computer, bytes, that the models of a process take together. On a computer with less than 16 GiB,
-they take at most half of its memory. A larger value allows larger models, but a damaged model can then take the memory from
-all other programs. YOLO12n with images of 640 px takes 0.1 GiB."""
+"""The limit (bytes) of the main memory that all models of a process take together. On a computer with less than 16 GiB, the
+limit is half of its memory. A larger value allows larger models, but a damaged model can then take the memory from all other
+programs. YOLO12n with images of 640 px takes 0.1 GiB."""
 _MOST_PIXELS = 1 << 26
 """The most pixels of the images of a run, if the model fixes their size and number: an image of 8192x8192. A larger value
 takes more memory before the model runs."""
@@ -163,7 +163,7 @@ def _digest(path: Path) -> str:
 
 
 def _memory() -> int:
-    """Return the most memory of the computer, bytes, that the models of this process take together."""
+    """Return the limit (bytes) of the main memory that all models of this process take together."""
     try:
         return min(_MOST_MEMORY, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
     except (AttributeError, OSError, ValueError):  # Not every system says how much memory it has.

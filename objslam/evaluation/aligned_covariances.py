@@ -1,8 +1,8 @@
 """The covariances of a map after its alignment with the truth.
 
 The alignment takes out the errors that all objects share, as far as it can follow them, and spreads a little of each
-object's own error over all others. What is left has another covariance than the map gives. Only with that one, the squared
-Mahalanobis distances after an alignment tell whether the covariances of the map are right.
+object's own error over all others. The remaining errors have another covariance than the map gives. The squared Mahalanobis
+distances after an alignment must use this covariance. Only then do they tell whether the covariances of the map are right.
 """
 
 import numpy as np
@@ -14,8 +14,9 @@ from objslam.evaluation.alignment import Alignment, Transform
 _ROTATIONS = {"se2": (2,), "sim2": (2,), "se3": (0, 1, 2), "sim3": (0, 1, 2)}
 """The axes about which each alignment turns the map."""
 _UNDETERMINED = 1e-6
-"""An alignment does not follow a motion whose lever is smaller than this share of the largest one, as a turn about the line
-on which all objects lie. A larger value leaves out more motions."""
+"""An alignment leaves out a motion that hardly moves the objects, such as a turn about the line on which all objects lie. It
+is left out if its effect on the objects is smaller than this share of the largest effect. A larger value leaves out more
+motions."""
 
 
 def aligned_covariances(

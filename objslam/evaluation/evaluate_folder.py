@@ -26,7 +26,7 @@ def choose_alignment(out: Path) -> tuple[Alignment, str]:
     """
     summary = load_summary(out)
     if summary.get("map_frame") == "localization":
-        return "none", "a localisation fixed the frame of the map"
+        return "none", "the map has the frame of the localisation"
     if summary.get("map_frame") == "map":
         return "none", "the drive was found in an older map, whose frame it has"
     if summary.get("map_frame") == SITE_FRAME:

@@ -29,8 +29,8 @@ _SQUEEZED = 1e-3
 moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2
 us."""
 _LEVEL = 1e-6
-"""The largest tilt (rad) and change of height (m) of a path whose drift is computed in the plane. A path with more takes
-longer, and is exact. A larger value neglects more of a tilt."""
+"""The largest tilt (rad) and change of height (m) of a path whose drift is computed in the plane. The drift of any other
+path is computed in 3D, which takes longer. A larger value neglects more of a tilt."""
 _CURVE = 0.5
 """The time (s) over which the curvature of a path is measured. Over a longer time, short curves count less. Over a shorter
 time, the jitter of the headings of fast odometry looks like curves."""

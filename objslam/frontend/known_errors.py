@@ -21,14 +21,14 @@ _PLACE = 0.05
 """The prior standard deviation (m) of each axis of the place of a camera: a place that was measured with a ruler. With a
 larger value, a log must show more before an error counts as known."""
 _PLACE_BESIDE_ODOMETRY = 0.02
-"""The same for joint mode with localisation and odometry. Poses that may move explain what a wrong place does. In a short
-live drive, the map was off by 4 cm with this value, and by 11 cm with `_PLACE`. Logs with places that were 1.5 cm off were
-as good with both."""
+"""In joint mode with localisation and odometry, this replaces `_PLACE`, because poses that may move can take up the effect
+of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by 11 cm with `_PLACE`. Logs with
+places that were 1.5 cm off were as good with both."""
 _FOCAL = 0.02
-"""The prior standard deviation of the focal length, as a share: a field of view from a data sheet. A calibrated camera errs
-less. It counts against given poses. A path from odometry alone also bends as a focal length asks, so a wrong association
-fits: one of 36 parts of recorded drives had four landmarks twice. With a larger value, a log must show more before an error
-counts as known."""
+"""The prior standard deviation of the focal length, as a share, as of a field of view from a data sheet. A calibrated camera
+errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone bends
+to fit a wrong focal length, and then a wrong association fits too: one of 36 parts of recorded drives had four landmarks
+twice. With a larger value, a log must show more before an error counts as known."""
 COARSE = 0.3
 """Fixed poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
@@ -94,9 +94,9 @@ def possible(log: Log, settings: Settings) -> list[str]:
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
     position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
-    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves: that in
-    space comes from a camera or a scanner, not from wheels. With a localisation, odometry only leads from pose to pose, and
-    a slip, which these short ways hardly tell, would give wrong associations more freedom.
+    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves: that in space comes
+    from a camera or a scanner, not from wheels. With a localisation, odometry only leads from one pose to the next. Such
+    short ways hardly show a slip, and a free slip would let wrong associations fit.
     """
     asked, place = settings.calibration.use is True, usual_place(log, settings)
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}

@@ -1,8 +1,9 @@
 """Jumps of a localisation: steps that no robot makes, or that the odometry does not show.
 
-A particle filter that was wrong for a while jumps when it corrects itself, or when it takes another place for its own. The
-poses of one side of a jump are then wrong by the whole jump, so objects seen from both sides would be at two places, and a
-calibration would take a part of it. The path itself shows how large the jump is. It does not show which side is right.
+A particle filter jumps when it corrects an earlier mistake, or when it takes another place for the robot's place. Then the
+poses on one side of the jump are wrong by the whole jump. Objects seen from both sides would be at two places, and a
+calibration would take a part of the jump for an error of a sensor. The path itself shows how large the jump is. It does not
+show which side is right.
 """
 
 from dataclasses import dataclass, replace
@@ -23,15 +24,16 @@ _ACCELERATION = 5.0
 """The acceleration (m/s^2) that a robot does not exceed from one step to the next and back. Wheels on a floor slip at 4 to
 8. A larger value finds fewer jumps."""
 _FREE_ACCELERATION = 20.0
-"""The same for poses that are not in a plane: a hand swings a camera, and a drone flies, with up to 2 g."""
+"""The highest acceleration (m/s^2) of poses that are not in a plane: a hand swings a camera, and a drone flies, with up to 2
+g. With a larger value, fewer steps are jumps."""
 _TIMES_ODD = 3.5
 """The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
 deviations. A larger number finds fewer jumps."""
 _CERTAIN = float(np.sqrt(27.6))
-"""The least size of a jump, in standard deviations of the noise in the settings, which is that of two poses and of the
-odometry between them. Noise is larger with a chance of 1e-6 (chi-squared with 2 degrees of freedom): in one of a thousand
-logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
+"""The least size of a jump, in standard deviations. They are those of two poses and of the odometry between them, by the
+settings. Noise exceeds this size with a probability of 1e-6 (chi-squared with 2 degrees of freedom), which is once in a
+thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
 _OF_MEDIAN = float(np.sqrt(np.log(10) / np.log(2)))
 """The length that a tenth of the steps exceeds, as a multiple of their median length, for normal noise in a plane."""
 _FEWEST_STEPS = 20
@@ -85,8 +87,9 @@ class Jumps:
     def likely(self) -> Floats:
         """(J + 1,) the probability that each part is right, proportional to the root of its share of the time.
 
-        It lies between two beliefs: that a localisation is right at a random moment, so that a short part is hardly ever
-        right, and that each part is right with the same probability, so that a single wrong pose would be one of three.
+        It lies between two assumptions. If a localisation were right at a random moment, a short part would hardly ever be
+        right. If each part were right with the same probability, a single wrong pose between two right parts would be right
+        with probability 1/3.
         """
         found = np.sqrt(self.shares)
         return found / found.sum()
@@ -109,11 +112,10 @@ class Jumps:
         return replace(path, poses=poses)
 
     def spread(self, stamps: Floats, origins: Floats, owner: Ints, positions: Floats) -> Floats:
-        """Return the error of the objects because it is not known which part is right, as a factor (N, 3, m), m.
-
-        Each part is right with its probability `likely`, and then all objects are off by its distance from the mean. Beside
-        this, the size of each jump is known to its noise only. It moves an object by the share of its rays that are beyond
-        the jump.
+        """Return the errors that the jumps cause in the objects, as a factor (N, 3, m), m, of their joint covariance. There
+        are two causes. It is not known which part is right: if a part is right, which has its probability `likely`, all
+        objects are off by the distance of this part from the mean. The size of each jump has noise too: it moves an object
+        by the share of its rays that are beyond the jump.
 
         stamps: (R,) s, origins: (R, 3) m, owner: (R,) the object of each ray. positions: (N, 3) m of the objects.
         """
@@ -188,9 +190,10 @@ def _usual_corrections(off: Floats, usual: Floats) -> Floats:
 def _by_neighbours(path: Trajectory) -> tuple[Floats, Floats, Bools]:
     """Judge each step of a path by the steps beside it.
 
-    Returns by how much each step (N-1, 2, 3) differs from the median velocity of the two steps before it and the two steps
-    after it, how odd it is (N-1, 2), and which steps (N-1,) are judged. The first of each pair is a move, m, and the second
-    a turn, rad.
+    Returns the differences (N-1, 2, 3) between each step and a step at the median velocity of four steps, the two before it
+    and the two after it. Also returns the oddness (N-1, 2) of each step, and which steps (N-1,) are judged. In the axis of
+    length 2, the first entry is the move, m, and the second is the turn, rad. The oddness is the difference from the more
+    similar of the two neighbouring steps.
     """
     seconds = np.diff(path.stamps)
     velocity = _steps(path.poses) / seconds[:, None, None]

@@ -53,7 +53,8 @@ class DriftPath:
 
     @classmethod
     def of(cls, odometry: Trajectory) -> Self:
-        """Measure the steps of the odometry. Where poses were left out, a step is as long as what was travelled in it."""
+        """Measure the steps of the odometry. If poses were left out of a step, its length is that of the whole way between
+        its ends."""
         poses = odometry.poses
         start, places = poses[0, :3, :3], (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3]
         up = start[:, 2] @ poses[:, :3, :3]

@@ -6,11 +6,12 @@ from objslam.core.arrays import Bools, Floats, Ints
 
 PARTS = "boxes inside another box of their label (parts of a thing)"
 _INSIDE = 0.9
-"""The least share of a box that lies in the other box if the box shows a part of the other's thing. With a smaller share,
-more boxes of neighbours that hide each other are dropped."""
+"""A box shows a part of the thing in another box only if at least this share of its area lies in the other box. With a
+smaller share, more boxes of neighbours that hide each other are dropped."""
 _AS_LARGE = 0.3
-"""The least area of such a box, as a share of the other's area. The suppression of a detector leaves parts of about a half.
-A smaller box may show a second thing farther away. With a smaller share, more boxes are dropped."""
+"""The least area of a box that may show a part of the thing in another box, as a share of the area of the other box. The
+suppression of a detector leaves parts of about a half. A smaller box may show a second thing farther away. With a smaller
+share, more boxes are dropped."""
 _COMPARED = 32  # The most boxes of a label and frame that each box is compared with. A larger number takes longer.
 
 

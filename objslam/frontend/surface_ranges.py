@@ -36,7 +36,7 @@ def half_widths_of_rays(rays: Rays, keyframes: Keyframes, cameras: Sequence[Came
 def to_centres(half: Floats, share: Floats | float) -> Floats:
     """Return the ratio (R,) of the distance of the centre of a thing to the range of its surface.
 
-    half: (R,) as `half_widths`. share: how far the centre is behind the surface, as a share of half the width.
+    half: (R,) from `half_widths`. share: how far the centre is behind the surface, as a share of half the width.
     """
     return np.asarray(1 / np.maximum(1 - share * half, _LEAST))
 

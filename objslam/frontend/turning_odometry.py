@@ -23,7 +23,8 @@ _MOST, _STEP = 0.3, 0.02
 """The largest error that is tried, as a share of the turns, and the step between errors. The cost of a window is a parabola
 around the best error, so a smaller step is only slower."""
 _CLIP = 9.0
-"""A larger squared deviation of a ray counts as this. With a larger value, a false link of a track has more influence."""
+"""The largest squared deviation of a ray. A deviation above it counts as this value. With a larger value, a false link of a
+track has more influence."""
 _FEWEST = 3
 """The fewest rays of a track in a window. Two rays nearly always meet."""
 _WINDOWS = 5

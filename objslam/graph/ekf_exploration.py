@@ -43,7 +43,8 @@ _BENT = 0.07
 """The standard deviation (m) of the distance between two estimates of one landmark, in addition to what the filter expects.
 A larger value ties more landmarks, and confuses neighbours more often."""
 _TIED = 0.02
-"""The standard deviation (m) of the distance between tied landmarks. A larger value ties them less closely."""
+"""The standard deviation (m) of the measurement that ties two landmarks: "they are one point". With a larger value, a closed
+loop corrects the path less."""
 _EXPLAINED = 0.8
 """An exploration is reliable if at least this share of the rays has a landmark. With ranges, the share is 0.86 to 1 in
 simulated rooms and on the log Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM logs, whose landmarks stand 0.18 m apart.

@@ -105,7 +105,7 @@ def _new_landmarks(
 ) -> tuple[Ints, Floats, Floats, Ints]:
     """Triangulate landmarks from the rays `waiting` (w,) at the camera poses (K, 4, 4).
 
-    Return the determined landmarks (n,), their positions (n, 3) and covariances (n, 3, 3), and the rays (m,) that agree.
+    Return the determined landmarks (n,), their positions (n, 3) and covariances (n, 3, 3), and their inlier rays (m,).
     """
     waiting = waiting[_may_have_parallax(rays.take(waiting), association.object[waiting], map_T_camera, settings)]
     if len(waiting) == 0:

@@ -212,7 +212,7 @@ class IncrementalGraph(GrowingGraph):
     def _layout(self, values: gtsam.Values | None = None) -> dict[int, int]:
         """Return a group number for each key that is eliminated late. A higher group is eliminated later.
 
-        values: the variables of a tree that is built anew. If not given, the layout is for the present tree.
+        values: the variables of a new tree. If not given, the layout is for the present tree.
 
         The newest keyframe X(k) and the landmarks that it observes make the root. The landmarks `coming` make the clique
         below the root. GTSAM merges a clique into its parent if the clique involves all variables of the parent. The cliques

@@ -104,9 +104,9 @@ def reject_outliers(
 class _Solver:
     """Solves the graph of the same measurements for different inliers.
 
-    If the first solve starts far from the optimum, GTSAM solves it, by Levenberg-Marquardt. Other solves are on arrays. To
-    make a graph of GTSAM anew takes longer than such a solve. near: as in `JointSolution`. close: whether the next solve
-    starts near its optimum. graph: the last graph of GTSAM.
+    If the first solve starts far from the optimum, GTSAM solves it, by Levenberg-Marquardt. Other solves are on arrays,
+    which takes less time than the construction of a graph of GTSAM. near: as in `JointSolution`. close: whether the next
+    solve starts near its optimum. graph: the last graph of GTSAM.
     """
 
     measured: Measurements
@@ -200,9 +200,10 @@ def second_opinion(
 ) -> tuple[Floats, Bools, Ints]:
     """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
-    Corners of fiducials stay, because four corners of one square are better known than four separate points. An object with
-    `enough` (N,) agreeing rays stays too: with so many, an earlier new position was not better. Return the positions (N, 3)
-    m, whether each ray (R,) agrees with its object, and `enough` for the next time.
+    Corners of fiducials stay, because four corners of one square are better known than four separate points. An object also
+    stays if at least `enough` (N,) of its rays agree. `enough` is the number of agreeing rays at which an earlier new
+    position was not better. Return the positions (N, 3) m, whether each ray (R,) agrees with its object, and `enough` for
+    the next call.
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)

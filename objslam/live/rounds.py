@@ -50,7 +50,7 @@ class Rounds(ABC, Generic[Answer, Told]):
         self._replaying = False
 
     def expect(self, known: Iterable[Told]) -> None:
-        """Make the corrections of a journal, each at its keyframe. Start no new rounds until `begin`."""
+        """Replay the corrections of a journal, each at its keyframe. No new round starts before `begin`."""
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:

@@ -228,7 +228,10 @@ def _share(seen: list[Sides], prior: float) -> float:
 
 
 def _azimuth_elevation(directions: Floats) -> Floats:
-    """Return unit axes (n, 3, 2) of azimuth and elevation, across each direction (n, 3). No direction may be vertical."""
+    """Return the unit vectors (n, 3, 2) of growing azimuth and elevation, both perpendicular to the direction (n, 3).
+
+    No direction may be vertical.
+    """
     azimuth = np.cross([0.0, 0.0, 1.0], directions)
     azimuth /= np.linalg.norm(azimuth, axis=1, keepdims=True)
     return np.stack([azimuth, np.cross(directions, azimuth)], axis=2)

@@ -231,8 +231,10 @@ def _by_label(state: JointState) -> tuple[JointState, bool]:
 
 
 def _with_doubles(state: JointState) -> tuple[JointState, bool]:
-    """Return the state of one object per label with the nearest box of each label and keyframe, and whether the other boxes
-    show no second object of any label."""
+    """Return the state with one object per label, from the nearest box of each label in each keyframe.
+
+    Also return whether the other boxes show no second object of any label.
+    """
     assert state.association is not None
     assert state.estimate is not None
     nearest = associate_by_label(state.rays, angles_to_objects(state.rays, state.estimate, state.solved_poses))

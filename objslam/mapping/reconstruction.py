@@ -136,7 +136,7 @@ def _fuse(
             return None
         if grid.left_out:
             ledger.warn(
-                f"the reconstruction is not whole: {grid.left_out} times a block had no room "
+                f"the reconstruction is not whole: {grid.left_out} blocks, counted for each image, are beyond its limit "
                 "(raise reconstruction.max_blocks or reconstruction.voxel)"
             )
         surface = grid.surface(chosen.min_views)

@@ -25,7 +25,8 @@ OTHER_EXTENT = (0.2, 0.2)  # The width and height of objects of other classes, m
 WALL = 0.3  # The least distance of random objects from the walls, m.
 CLEARANCE = 0.4  # The least horizontal distance of random objects from the path, m.
 CHECKED_FRAMES = 500
-"""The largest number of images of each camera that are checked for views of a position. They are evenly spaced."""
+"""The largest number of images of each camera in which a new object is looked for, to see whether its position is good. They
+are evenly spaced."""
 ROUNDS = 50  # The most sets of random positions that are drawn. With a larger value, positions are found for more objects.
 
 

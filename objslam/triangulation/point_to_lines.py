@@ -138,9 +138,10 @@ def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Ten
 
 
 def _unit_lines(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[LineBlock, Tensor, Tensor]:
-    """Return lines in units of their mean distance from the coordinate origin, this unit (B,) m, and which lines meet (B,).
+    """Return lines in units of their mean distance from the coordinate origin. Also return this unit (B,) m, and for which
+    objects (B,) all lines meet in the coordinate origin, up to rounding.
 
-    origin: (3, n, B) m. Its coordinate origin is a point of the object. Lines that meet there, up to rounding, stay in m.
+    Lines that meet there stay in m. origin: (3, n, B) m. The coordinate origin is a point of the object.
     """
     xp = module_of(origin)
     lines = through(origin, direction, weight)

@@ -64,10 +64,11 @@ class Bundles:
         return grouped_median(away, self.group, self.count)
 
     def size(self, position: Floats) -> tuple[Floats, Floats]:
-        """Return the median ln size (G,) of each bundle's boxes if they show a thing at a point (G, 3) m, NaN without sizes,
-        and the log likelihood (G,) of how they grow, up to a constant.
+        """Return the size of the thing in each bundle if it is at a point (G, 3) m, and how well the boxes fit one size.
 
-        The likelihood is that of a normal distribution of unknown variance.
+        The first value is the median ln size (G,), NaN for boxes without sizes. The second is the log likelihood (G,), up to
+        a constant, that the boxes grow with nearness as the boxes of one thing do. It assumes a normal distribution of
+        unknown variance.
         """
         away = np.linalg.norm(position[self.group] - self.state.obs.origin[self.ray], axis=1)
         ln_size = self.usual.ln_size[self.ray] + np.log(np.maximum(away, MIN_DEPTH))

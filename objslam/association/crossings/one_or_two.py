@@ -2,8 +2,9 @@
 
 Rays from a short stretch of the path, a bundle, hardly tell how far away their thing is. Two bundles in a plane always meet
 somewhere. So two stretches that see two things give a landmark behind both, or between them, and all rays fit it. The
-likelihood of all data of both bundles tells which explanation is right: of bearings, of the sizes of boxes, of how they
-grow, and of distances, which are usual for the class or not. The unknown positions are integrated out.
+likelihood of all data of both bundles tells which explanation is right. The data are the bearings, the sizes of boxes, their
+growth as the robot comes nearer, and whether the distances are usual for the class. The unknown positions are integrated
+out.
 """
 
 from __future__ import annotations
@@ -25,28 +26,31 @@ _GAP = np.radians(2.0)
 """The least gap (rad) between the two bundles of a landmark. Closer bundles are one stretch of the path. A smaller gap tests
 more landmarks."""
 _HIDDEN, _HIDDEN_WIDTH = 0.1, 4.6
-"""The assumed share of views that show only a part of a thing, and the width of the uniform distribution of their ln size: a
-factor of 100. With a larger share, different sizes tell less."""
+"""`_HIDDEN` is the assumed share of views that show only a part of a thing. Their ln size has a uniform distribution of the
+width `_HIDDEN_WIDTH`: a factor of 100 between the smallest and the largest size. With a larger share, or a smaller width,
+different sizes tell less."""
 _CLEAR = 3.0
-"""A landmark is two things only if two are more likely by this, in ln, which is a factor of 20. A larger value splits fewer
-landmarks. To split one thing may lose it."""
+"""The least log odds of two things over one for a landmark that is split: 3 is a factor of 20. A larger value splits fewer
+landmarks. A thing may be lost if it is split."""
 _ASSUMED = 3
-"""The number of landmarks that are assumed to have the usual gain, beside those of the log. With a larger number, errors
-that rays share make more landmarks two."""
+"""The number of landmarks that are assumed to have the usual gain (`_USUAL_GAIN`), in addition to those of the log. With a
+larger number, errors that rays share split more landmarks."""
 _LEAST_EXCESS = 1 / 16
-"""The least factor on the gain of two points: that of rays with a quarter of the nominal noise. A smaller factor makes more
-landmarks two."""
+"""The least factor on the usual gain of two points. It is that of rays with a quarter of the nominal noise. A smaller factor
+splits more landmarks."""
 _OFF_CENTRE = 0.02
-"""By how much the middles of all boxes of a bundle are off the middle of their thing, as a share of their size. By
-perspective alone, this is the share of a cube seen from six times its size. A larger share makes fewer large things two."""
+"""The offset between the middle of a thing and the middles of its boxes in one bundle, as a share of the boxes' size.
+Perspective alone gives this share for a cube that is seen from six times its size. A larger share splits fewer large
+things."""
 _FREE = 3
 """The degrees of freedom of a second point."""
 _USUAL_GAIN = 2.366
-"""The median by which the cost of the rays of one thing falls if two points explain them: that of chi-squared with `_FREE`
-degrees of freedom."""
+"""The usual gain: the median decrease of the cost of the rays of one thing if two points explain them in place of one. It is
+the median of chi-squared with `_FREE` degrees of freedom."""
 _USUAL_GAINS = ((0.5, _USUAL_GAIN), (0.8, 4.642))
-"""Quantiles of this chi-squared distribution. Errors that last for a while, as of a wheel that slips, concern some landmarks
-only, and show in the second one. One landmark in five may be two things without effect on it."""
+"""Two pairs of a probability and the quantile of this chi-squared distribution. Errors that last for a while, such as those
+of a wheel that slips, concern only some landmarks, and show in the second quantile. If one landmark in five is two things,
+this does not change the second quantile."""
 
 
 @dataclass(frozen=True)
@@ -208,11 +212,11 @@ def _as_one(bundles: Bundles) -> tuple[Floats, Floats]:
 
 
 def _alone(bundles: Bundles, free: FreeFit) -> tuple[Floats, Floats, Floats]:
-    """Return the log likelihood (G,) of each bundle as a thing of its own without that of its bearings, their cost (G,), and
-    where it most likely is (G, 3) m.
+    """Judge the explanation that each bundle shows a thing of its own.
 
-    Many distances explain the bearings of a bundle. The sizes of its boxes, and distances that are usual for the class,
-    decide between them.
+    Return its log likelihood (G,) without the bearings, the cost (G,) of the bearings, and the likeliest position (G, 3) m
+    of the thing. Many distances explain the bearings of a bundle. The sizes of its boxes, and the distances that are usual
+    for the class, decide between them.
     """
     usual, landmark = bundles.usual, bundles.landmark
     mean, spread2 = usual.class_mean[landmark], usual.class_spread[landmark] ** 2 + usual.view**2
@@ -230,8 +234,11 @@ def _alone(bundles: Bundles, free: FreeFit) -> tuple[Floats, Floats, Floats]:
 
 
 def _as_another(bundles: Bundles) -> tuple[Floats, Floats]:
-    """Return the log likelihood (G,) of each bundle as rays of another landmark without that of its bearings, and their cost
-    (G,). The likelihood is -inf if no other landmark fits."""
+    """Judge the explanation that each bundle shows another landmark.
+
+    Return its log likelihood (G,) without the bearings, and the cost (G,) of the bearings. The likelihood is -inf if no
+    other landmark fits.
+    """
     state, usual = bundles.state, bundles.usual
     bundle = np.full(len(state.obs), -1)
     bundle[bundles.ray] = bundles.group

@@ -14,17 +14,17 @@ from objslam.core.arrays import Floats, Ints
 _STEPS = 48
 """The number of distances that are tried for a bundle, evenly in ln distance. A larger number is more exact, and slower."""
 _FEW_STEPS = 8
-"""The same to find a start for the point that fits a bundle best. Bundles without parallax fit at many distances."""
+"""The number of distances that are tried for the start of a fit of one point to a bundle. Bundles without parallax fit at
+many distances. A larger number is more exact, and slower."""
 _NEAREST, _FURTHEST = 0.03, 2.0
 """The least and the greatest tried distance of a bundle, in usual distances of its class."""
 
 
 @dataclass(frozen=True)
 class FreeFit:
-    """Points that fit the bearings of G bundles best, wherever that is.
-
-    position: (G, 3) m. log_volume: (G,) ln of the volume, m^3, over which the likelihood integrates. along: (G,) m, standard
-    deviation along the direction that is known least.
+    """Points that fit the bearings of G bundles best, at any distance. position: (G, 3) m. log_volume: (G,) ln of the
+    volume, m^3, of each position, as of `fit_points`. along: (G,) m, the largest standard deviation of each position over
+    all directions.
     """
 
     position: Floats
@@ -48,9 +48,10 @@ def fit_freely(bundles: Bundles) -> tuple[FreeFit, Floats]:
 def fit_points(bundles: Bundles, index: Ints, landmark: Ints, noise: Floats, start: Floats) -> tuple[Floats, Floats, Floats]:
     """Fit points to groups of rays, from start values (N, 3) m.
 
-    Returns the positions (N, 3) m, ln of the volume (N,) m^3 over which the likelihood integrates, and the standard
-    deviation (N,) m along the direction that is known least. Without parallax, the usual distance of the class limits both.
-    index: (P,) the group of each ray. landmark, noise: (N,) of each group.
+    Returns the positions (N, 3) m, ln of their volumes (N,) m^3, and their largest standard deviations (N,) m over all
+    directions. A volume is (2 pi)^1.5 times the root of the determinant of the covariance (Laplace's method). Without
+    parallax, the usual distance of the class limits the volume and the standard deviation. index: (P,) the group of each
+    ray. landmark, noise: (N,) of each group.
     """
     state, ray, count = bundles.state, bundles.ray, len(landmark)
     position = refine(state.obs, ray, index, start, noise)

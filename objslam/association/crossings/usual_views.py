@@ -18,16 +18,19 @@ _LARGER = 1.4
 """The factor on the distance of a box by which it may exceed the others. A thing that is larger than others of its class by
 half of `_CLASS_SIZE` is detected from further away by this factor. A larger factor allows landmarks further away."""
 _BOXES = 50
-"""A class with fewer boxes of other landmarks takes the distances of all classes. With a larger number, rare classes more
-often do."""
+"""A class with fewer boxes of other landmarks takes the distances of all classes. With a larger number, rare classes do so
+more often."""
 _LANDMARKS = 3
-"""The same for the usual distance, in landmarks of the class. One of three may be wrong without effect on their median."""
+"""A class with fewer other landmarks takes the usual distance of all classes. With a larger number, rare classes do so more
+often. One of three landmarks may be wrong without effect on their median."""
 _VIEW_SIZE, _THINGS = 0.25, 5.0
-"""The assumed standard deviation of ln size between two views of one thing, as in `gating`, and the number of landmarks at
-which the measured one weighs as much. With a larger deviation, sizes tell less."""
+"""`_VIEW_SIZE` is the assumed standard deviation of ln size between two views of one thing, as in `gating`. With `_THINGS`
+landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, sizes tell less. With a
+larger number, the assumed deviation counts longer."""
 _CLASS_SIZE, _OF_CLASS = 0.7, 3.0
-"""The assumed standard deviation of ln size within a class, a factor of 2, and the number of landmarks at which the measured
-one weighs as much. With a larger deviation, the size tells less about the distance."""
+"""`_CLASS_SIZE` is the assumed standard deviation of ln size within a class: sizes differ by a factor of 2. With `_OF_CLASS`
+landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, the size tells less about
+the distance. With a larger number, the assumed deviation counts longer."""
 _LEAST_VIEW = 1e-3
 """The least measured deviation of ln size between views, so that its logarithm is finite."""
 _SIZED_BY = 5

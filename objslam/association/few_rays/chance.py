@@ -275,10 +275,11 @@ def _expected(state: State, rates: Rates) -> tuple[Ints, Floats]:
 def _likelihoods(odds: Floats, number: Floats, label: Ints, boxes: Ints, objects: Floats) -> Floats:
     """Return the log likelihoods (L, D, S) of the density of objects and of the share of stray boxes, for each label.
 
-    The tried values are `_DENSITY_FACTORS` (D,) and `_SHARES` (S,). The numbers of strays and objects are Poisson
-    distributed. The mean number of strays is c n, for n boxes. The mean number of objects is m times the nominal number.
-    Then the likelihood is c^n exp(-c n - m objects), times 1 + m o c^-k for each landmark with k rays and the odds o at c =
-    m = 1. odds, number, label: (N,). boxes, objects: (L,), the nominal numbers of boxes and objects.
+    The tried densities are the factors m in `_DENSITY_FACTORS` (D,), and the tried shares are the c in `_SHARES` (S,). The
+    numbers of strays and objects are Poisson distributed. The mean number of strays is c n, for n boxes. The mean number of
+    objects is m times the nominal number. Then the likelihood is c^n exp(-c n - m objects), times a factor for each
+    landmark. This factor is 1 + m o c^-k for a landmark with k rays whose odds are o at c = m = 1. odds: (N,) ln o. number:
+    (N,) k. label: (N,). boxes, objects: (L,) the numbers of boxes, and the nominal numbers of objects.
     """
     log_share, log_density = np.log(_SHARES), np.log(_DENSITY_FACTORS)
     grid = np.zeros((len(boxes), _TRIED, _TRIED))

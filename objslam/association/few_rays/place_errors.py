@@ -17,13 +17,14 @@ _HALF = 3.0
 """The squared deviation at which a ray has half of its full weight. On 30 simulated streets, 2 and 4 give the same objects,
 and 6 finds 1 % fewer. With a larger value, rays of other things pull more."""
 _DENSE = 500
-"""Up to this number of landmarks, their matrix is dense: things in a room are seen together. More landmarks lie along a way,
-and hardly any two are seen from one place. With a larger number, the time of large maps grows with its cube."""
+"""The normal equations are a dense matrix up to this number of landmarks, because things in a room are seen together. With
+more landmarks the matrix is sparse, because they lie along a way, and hardly any two are seen from one place. With a larger
+number, the time of large maps grows with its cube."""
 _STEPS = 8
 """The steps of the robust fit. A larger number is more exact and slower."""
 _WIDE = 3
-"""The first steps, in which the errors of the places count as noise of the residuals. Later, they are estimated. With fewer
-such steps, rays of other things pull more."""
+"""The number of first steps in which the errors of the places count as noise of the residuals. Later steps estimate these
+errors. With fewer first steps, rays of other things pull more."""
 
 
 @dataclass(frozen=True)

@@ -53,9 +53,11 @@ class Motions:
         )
 
     def costs(self, k: int, grid: Grid) -> tuple[Cells, Cells, Cells]:
-        """Return the costs of motion `k` by x (2 X - 1, Y), by y (2 X - 1, Y) and by yaw (2 Y - 1,). The first axis is the
-        step from the state before to the state after, in increasing order. Y is the turn, which is the same before and after
-        the steps in x and y. The drift in x, y and yaw counts as independent."""
+        """Return the costs of motion `k`, as three arrays: by x (2 X - 1, Y), by y (2 X - 1, Y) and by yaw (2 Y - 1,).
+
+        The first axis is the step from the state before to the state after, in increasing order. The second axis is the yaw
+        of the states, because a step in x or y depends on it. The drift in x, y and yaw counts as independent.
+        """
         shifts, turns = (np.arange(1 - len(axis), len(axis)) for axis in (grid.shifts, grid.turns))
         cos, sin, way = np.cos(grid.turns) - 1, np.sin(grid.turns), self.way[k]
         carried = cos * way[0] - sin * way[1], sin * way[0] + cos * way[1]  # A turn about one pivot shifts the next one.
@@ -100,11 +102,10 @@ def _steps_to(state: int, count: int) -> slice:
 
 
 def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
-    """Return for each state the least sum (Y, X, X) of the costs of a state before and of the motion from it, at most
-    `_SLIP`.
+    """Return for each state the least sum (Y, X, X) of two costs: of a state before, and of the motion from there.
 
-    Only states below `_SLIP` can lead to such a sum. So the search is in the part of the grid that contains them. It is
-    small where the rays tell well where the robot is.
+    A sum is at most `_SLIP`. Only states below `_SLIP` can lead to a smaller sum, so only the part of the grid that contains
+    them is searched. It is small where the rays tell well where the robot is.
 
     Args:
         total: (Y, X, X) of the states before.
@@ -127,11 +128,13 @@ def _extent(there: Bools) -> slice:
 
 
 def _least(total: Cells, cost: Cells, states: slice, count: int) -> tuple[Cells, slice]:
-    """Return for each state the least sum (m, W, n) of the costs of a state before and of the step from it along the second
-    axis, and the slice of the W states along this axis that are reached.
+    """Take a step along the second axis of a grid of states.
 
-    The sum counts as at most `_SLIP`, so only the steps that cost less are tried. These are few steps, because the odometry
-    drifts little between two stretches. All sums at once take three times as long.
+    Return the least sum (m, W, n) for each reached state: the cost of a state before, plus the cost of the step from there.
+    Also return the slice of the W states along this axis that are reached.
+
+    A sum is at most `_SLIP`, so only the steps that cost less are tried. They are few, because the odometry drifts little
+    between two stretches of the path. All sums at once take three times as long.
 
     Args:
         total: (m, V, n) of the states before.

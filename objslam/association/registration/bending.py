@@ -17,14 +17,15 @@ from objslam.core.maps.shared_covariance import jacobian as shared_jacobian
 from objslam.core.statistics import SAME_POINT
 
 _BESIDE = 40
-"""The most shifts that are tried, the smallest ones. A shift moves one object onto another partner. A larger number looks
-farther around, and takes longer."""
+"""The largest number of shifts that are tried, beginning with the smallest shift. A shift moves one object onto another
+partner. A larger number looks farther around, and takes longer."""
 _MOST = 20_000
-"""The most objects of all these shifts together. In large maps, few shifts are tried, because many objects in many rows
-hardly ever match their neighbours all together. A larger number takes longer."""
+"""The largest number of tried shifts times the number of objects in map a. So few shifts are tried in large maps, because
+there it hardly ever happens that all rows of objects match their neighbours. A larger number takes longer."""
 _SIZES = (0.0, -1.0, 1.0, -2.0, 2.0)
-"""The sizes at which a search starts, in standard deviations of the size of one map relative to the other. A size is at most
-half a standard deviation from one of them, and the wide gates of the first round hold this. More sizes take longer."""
+"""The sizes at which a search starts, in standard deviations of the size of one map relative to the other. A true size
+between them is at most half a standard deviation from the nearest one, and the wide gates of the first round allow for this.
+More sizes take longer."""
 _WIDE = 0.5
 """The share of the standard deviations of tilt and size by which the gates of the first round are wider. 0.5 is half the
 step of `_SIZES`. A larger value lets more wrong partners in."""

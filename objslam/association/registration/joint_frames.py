@@ -36,8 +36,8 @@ _POOLED = 10.0
 """A map's given covariances weigh as much as this number of residuals. A larger number trusts the covariances more. At 10, a
 map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""
 _AGAIN = 0.01
-"""The standard deviation (m) that each map adds to the errors that are not shared. A larger value trusts small distances in
-maps less. Without it, one pair of nearly exact objects would fix the shared errors."""
+"""The standard deviation (m) that is added to each measured position, as an error that is not shared. Without it, one pair
+of nearly exact objects would fix the shared errors. A larger value trusts small distances in maps less."""
 _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 """Squared lengths of normal residuals (chi-squared, 3 degrees of freedom) at equal steps of probability. The mean over them
 gives the expectation of a weighted squared residual. More steps give it more exactly."""

@@ -89,14 +89,14 @@ def register_maps(
     """Find the transform (yaw and translation) from the frame of a to the frame of b. Both maps use the same label numbers.
 
     shared_a, shared_b: (7, 7) the covariances of the errors that all objects of a map share, None if they are not known. The
-    covariances of a and b contain them (`shapes` says what a registration makes of them).
+    covariances of the objects in a and b include the shared errors. The module `shapes` explains how they are used.
 
     Both maps have z up. The log odds are -ln(T * P(X >= m - 2)) for T tried proposals and m matched objects. The two objects
-    of the proposing pair do not count. X, the number of matches by chance, is Poisson distributed. Its mean is a sum over
-    the objects of a. Each object adds the local density of objects in b, times the area of the gate, times the share of the
-    objects of b that have its label and height. True matches are close together, and chance matches are anywhere in the
-    gate. So several gates are tried, the best one counts, and T is the number of proposals times gates (Moisan & Stival
-    2004).
+    of the proposing pair do not count. X is the number of matches by chance, and is Poisson distributed. Its mean is a sum
+    over the objects of a. The term of an object is a product: the local density of objects in b, the area of the gate, and
+    the share of the objects of b that have the label and the height of this object. True matches are close together, and
+    chance matches are anywhere in the gate. So several gates are tried, the best one counts, and T is the number of
+    proposals times gates (Moisan & Stival 2004).
     """
     keep_a, keep_b = np.flatnonzero(np.isin(a.label, b.label)), np.flatnonzero(np.isin(b.label, a.label))
     if min(len(keep_a), len(keep_b)) < 2:

@@ -41,7 +41,8 @@ def _pairs(m: Shape, spread: Floats) -> tuple[Ints, Ints]:
 def propose(problem: Problem) -> tuple[Ints, Floats, int]:
     """Return H proposals: the first object (H,) of each pair in a, the transforms (H, 4), and the number of tried proposals.
 
-    A transform is x, y, z (m) and yaw (rad) of a in b, both relative to their centres. H is at most `_MAX_PROPOSALS`.
+    A transform is x, y, z (m) and yaw (rad) of map a in map b. The origin of each map is its centre. H is at most
+    `_MAX_PROPOSALS`.
     """
     a, b = problem.a, problem.b
     (i, j), (k, n) = _pairs(a, problem.spread_a), _pairs(b, problem.spread_b)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 Speed = Annotated[
-    float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0, also for stdin: as fast as the map follows.")
+    float, typer.Option("--speed", min=0.0, help="Speed factor of a replay. 0 (also for stdin): as fast as the map follows.")
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue a session that was killed or has ended, from its journal.")]
 Interval = Annotated[float, typer.Option("--interval", min=0.1, help="Time in s between two writes of objects.json.")]

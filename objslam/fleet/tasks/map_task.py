@@ -181,7 +181,7 @@ def _local_file(store: str, name: str) -> Path:
 
 
 def _most_memory() -> int:
-    """Return the most bytes of RAM that this process had."""
+    """Return the peak RAM of this process, bytes."""
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

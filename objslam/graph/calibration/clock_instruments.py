@@ -17,7 +17,8 @@ class ClockInstruments:
     """The instruments of clocks as a linear function of the velocities of base at the K poses of a graph.
 
     The derivative of a motion by a clock is the difference of the velocities at its ends. The noise of measured velocities
-    is also in the residuals. The velocities of the solved path do not correlate with the residuals.
+    is also in the residuals, so it would bias the clock. The velocities of the solved path do not correlate with the
+    residuals, so they are the instruments.
 
     moved: for each clock, by the index of its parameter, the poses (K,) whose images have this clock. moves: (s,), (s,) the
     poses before and after the motions in the graph. motions: None without odometry. back: (s, 6, 6) from twists before a

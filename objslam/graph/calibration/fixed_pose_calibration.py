@@ -21,7 +21,8 @@ _ROUNDS = 12
 _CONVERGED = 0.01
 """An error has converged if its step is below this many posterior standard deviations. A larger number ends sooner."""
 _CAUCHY = 3.0
-"""The deviation at which a ray has half of its weight. A larger value gives stray rays more influence."""
+"""The deviation, in standard deviations, at which a ray has half of its weight. A larger value gives outliers more
+influence."""
 _STRETCHES = 50
 """The number of stretches of the drive that count as independent. Fewer and longer stretches also show errors that are
 correlated over a longer time, but the size of these errors is less exact then."""
@@ -103,7 +104,7 @@ def calibrate_at_poses(
 
 
 def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) -> Floats:
-    """Return the standard deviations (R,), rad, that the covariance of shared errors gives to ray directions in map."""
+    """Return the standard deviations (R,), rad, of ray directions in map that follow from `calibration.covariance`."""
     size, axes = np.linalg.eigh(calibration.covariance)
     variance = np.zeros(len(errors.rays))
     for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:

@@ -1,4 +1,8 @@
-"""Instruments for the scales of the odometry: the neighbours of a motion predict it without its own noise."""
+"""Instruments for the scales of the odometry: the neighbours of a motion predict it without its own noise.
+
+An instrument replaces a derivative whose noise is also in the residuals. It follows the derivative, but its own errors do
+not correlate with the residuals, so the estimate has no bias (instrumental variables).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

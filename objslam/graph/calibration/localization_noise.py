@@ -1,8 +1,9 @@
 """Estimate the noise of a localisation, and how long its errors last, from the rest of the log.
 
 Odometry and rays predict the path, up to a shift and a turn of the whole. The localisation differs from this prediction by
-the error of the prediction, whose covariance the graph knows, and by its own error. The size of its own error, the share of
-it that lasts, and for how long, are those of the largest restricted likelihood (Patterson and Thompson 1971).
+the error of the prediction, whose covariance the graph knows, and by its own error. Three values of its own error are
+estimated by restricted maximum likelihood (Patterson and Thompson 1971): its size, the share of it that lasts, and how long
+this share lasts.
 """
 
 from dataclasses import replace
@@ -24,9 +25,9 @@ _LOOSE = 1e4
 """The factor on the noise of the localisation in the graph that predicts it. With a larger factor, the prediction contains
 less of the localisation, and more rounding errors."""
 _FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
-"""A long log is seen at 18 times that are spread evenly, and at these numbers of keyframes after each. Near poses show
-errors that are new in each pose, far ones errors that last. More poses are more exact, and the time grows with their
-cube."""
+"""In a long log, the poses are compared at `_FIRST` times, spread evenly, and at the numbers `_LAGS` of keyframes after
+each. Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are
+more exact, and the time grows with the cube of their number."""
 
 
 def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:

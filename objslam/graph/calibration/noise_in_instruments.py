@@ -12,7 +12,7 @@ from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 
 _AXES_OF = {"odometry.scale": (3, 4), "odometry.turn_scale": (2,)}
-"""The parts of a twist that these parameters make longer."""
+"""The components of a twist that each scale parameter multiplies."""
 _PROBES = 4
 """The number of random probes. More probes are more exact and slower. With 4, the error of a product is a small part of the
 standard deviation of the gradient."""
@@ -29,10 +29,11 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     of the measured motions and by the residuals of the solution. Commanded motions are smooth: their residuals come from the
     robot and not from the measurement, so the sides have no noise.
 
-    Below ties, the solved path is the instrument of clocks. An interpolated pose has a mean of the noise of two poses of the
-    odometry, so clocks that move the ends of ties away from these poses seem better. For motions between keyframes this
-    cancels, because keyframes lie at all shares of a step. Ties end at about the same share if the rates of images and
-    odometry fit. On simulated wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
+    For motions below ties (`Instruments.tied`), the solved path is the instrument of clocks. An interpolated pose averages
+    the noise of two poses of the odometry. So a clock seems better if it moves the ends of ties away from these poses. For
+    motions between keyframes, this effect cancels, because keyframes lie at all shares of a step. Ties all end at about the
+    same share if the rates of images and odometry have a simple ratio. On simulated wheels that slip, with one pose in a
+    second, this moved a clock by 0.09 s.
     """
     names, clocks = errors.names, {} if system.clocks is None else system.clocks.moved
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}

@@ -155,8 +155,8 @@ def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
 
 
 def most_likely(data: ComparedPoses) -> PoseErrors:
-    """Return the simplest model that the data do not refute: the noise in the settings, more of it, the same part of both
-    errors that lasts, or a part of each.
+    """Return the simplest model that the data do not refute. The models, from the simplest on, are: the noise in the
+    settings, more noise, one lasting share for headings and places, and a lasting share for each of the two.
 
     If places err for seconds, headings probably do too, because both come from one filter. A short log may not show it.
     """

@@ -82,12 +82,12 @@ class _Rows:
 
     @cached_property
     def by_motion_window(self) -> sparse.csr_matrix:
-        """(W, s) sums what belongs to the motions of each window."""
+        """The matrix (W, s) that sums the values of motions in each window."""
         return _sums_in(self.motion_window)
 
     @cached_property
     def by_ray_window(self) -> sparse.csr_matrix:
-        """(W, n) sums what belongs to the rays of each window."""
+        """The matrix (W, n) that sums the values of rays in each window."""
         return _sums_in(self.ray_window)
 
     @property

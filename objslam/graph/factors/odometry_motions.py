@@ -25,9 +25,9 @@ _LEAST_TOLD = 0.1
 fewer ties are used, and the motions below them count as independent. With a smaller share, faster odometry has ties too.
 They hardly change the solution, but take time."""
 _NOTHING = 1e-6
-"""The least share of the information about a motion that a tie gives in each direction. It makes sure that the information
-matrix of a tie has an inverse. A tie has no information in directions in which the motions inside a step are not loose. A
-larger share adds more false information there."""
+"""In each direction, a tie gets at least this share of the information about a motion. So the information matrix of a tie
+has an inverse, although a tie has no information in directions in which the motions inside a step are not loose. A larger
+share adds more false information there."""
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,9 @@ from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
 
 _SLOW = 0.5
-"""Normal equations are made anew if a step promises more than this share of what the step before it promised. A larger share
-makes them anew more rarely, and takes more steps. With old equations, a step takes a fifth of the time."""
+"""The normal equations are computed again if the predicted decrease of the cost is more than this share of the decrease that
+the step before predicted. With a larger share, they are computed more rarely, and a solve takes more steps. With old
+equations, a step takes a fifth of the time."""
 
 OnStep = Callable[[float, Floats, Floats], None]
 """A function that is called after each step with the cost, the poses (P, 4, 4) and the positions (m, 3)."""
@@ -27,8 +28,8 @@ class Solution:
     """The values where a solve ended: map_T_camera (P, 4, 4) and landmarks (m, 3), m.
 
     cost_before, cost_after: half the sums of the squared residuals, with the robust losses. steps: the number of steps.
-    ended: whether the last step was as small as asked for. If not, no step lowered the cost, or the steps ran out, or the
-    linear system has no single solution. normal: the normal equations of the last steps, None if the first were singular.
+    ended: whether the solve converged. If not, a step did not lower the cost, or the steps ran out, or the normal equations
+    are singular. normal: the normal equations of the last steps, None if the first were singular.
     """
 
     map_T_camera: Floats
@@ -49,18 +50,21 @@ def gauss_newton(
     still: float,
     on_step: OnStep | None = None,
 ) -> Solution:
-    """Minimise the cost of a graph from poses (P, 4, 4) and the landmarks `graph.weak`.
+    """Minimise the cost of a graph. The landmarks start at the means `graph.weak` of their priors.
 
-    A step takes the normal equations of the step before (chord method), as long as the steps become short quickly. Only the
-    robust weights and the directions change between steps. The gradient is fresh, so the optimum is the same.
+    A step reuses the normal equations of the step before (chord method), as long as the cost decreases quickly. They are
+    still nearly right, because only robust weights and directions change between steps. Each step computes the gradient
+    again, so the optimum is the same.
 
     Args:
         graph: the measurements.
-        map_T_camera: (P, 4, 4) the first poses.
-        normal: the normal equations of a solve that ended nearby, with the same variables. None means those of the start.
-        most: the most steps.
-        tolerance: the solve ends after a step that promises to decrease the cost by less than this share.
-        still: it also ends after a step that promises a smaller decrease than this, for example `optimizers.STILL`.
+        map_T_camera: (P, 4, 4) the poses at the start.
+        normal: the normal equations of a solve that ended nearby, with the same variables. If None, they are computed at the
+            start.
+        most: the largest number of steps.
+        tolerance: the solve ends after a step whose predicted decrease of the cost is at most this share of the cost.
+        still: the solve also ends after a step whose predicted decrease is at most this cost, for example
+            `optimizers.STILL`.
         on_step: called after each step.
     """
     poses, landmarks = map_T_camera, graph.weak

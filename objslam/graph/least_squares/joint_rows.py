@@ -1,7 +1,7 @@
 """The graph of a joint solve as arrays: its whitened residuals and its sparse Jacobian, without an object for each factor.
 
-A calibration solves the same graph for many values of the shared errors. To make a GTSAM graph takes longer than to solve
-it, so these solves have arrays instead. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
+A calibration solves the same graph for many values of the shared errors. The construction of a GTSAM graph takes longer than
+its solution, so these solves use arrays. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
 """
 
 from collections.abc import Callable
@@ -53,7 +53,7 @@ class JointGraph:
     measured: all measurements. which: (n,) the rays of `measured` that are in the graph. rays: these n rays. landmarks: (m,)
     the landmarks in the graph. landmark: (n,) the row of each ray's landmark in `landmarks`. weak: (m, 3) m, the means of
     the landmarks' weak priors. pattern: the columns of all entries of the Jacobian, row by row, and the first entry of each
-    row. gaussian: whether bearings have no loss.
+    row. gaussian: whether the bearings have Gaussian noise, without a robust loss.
     """
 
     measured: Measurements

@@ -24,8 +24,8 @@ def load_libraries() -> None:
 def _import_later(name: str) -> None:
     """Let a module load at its first use. Its parent must be imported already.
 
-    Then a module that only copies the names of the parent does not load this one. Nothing happens if the module is imported
-    already, or does not exist.
+    Other libraries import such a module only to copy its names into another module. Then the module is not loaded. Nothing
+    happens if the module is imported already, or does not exist.
     """
     spec = None if name in sys.modules else find_spec(name)
     if spec is None or spec.loader is None:

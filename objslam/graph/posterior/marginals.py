@@ -55,7 +55,8 @@ class SolvedGraph:
 class SolvedMeasurements:
     """The measurements of a log without fiducials at their solution, with bearings of Gaussian noise.
 
-    To make a graph of GTSAM takes longer than to factor the normal equations, so they are made from arrays.
+    The construction of a GTSAM graph takes longer than the factorisation of the normal equations, so the normal equations
+    come from arrays.
 
     measured, association: the measurements, and the landmark of each ray. used: (R,) the rays in the graph. map_T_camera:
     (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. near: of a solve that may have had the same

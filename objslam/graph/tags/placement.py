@@ -19,8 +19,8 @@ better."""
 _STEPS, _STEPS_LAST = 6, 15
 """The iterations of a fit to one view, and of the last fit. More iterations are slower. Both usually converge in five."""
 _TOLD = 4.0
-"""The least information about the logarithm of an unknown side: 1 / 0.5^2. A larger value gives fewer fiducials of unknown
-size a pose."""
+"""A fiducial of unknown size gets a pose only if its views give more than this information about the logarithm of its side.
+The value is 1 / 0.5^2. With a larger value, fewer such fiducials get a pose."""
 _SAME = np.radians(3.0)
 """The largest angle (rad) between two poses that count as one. With a larger angle, more fiducials have a single pose."""
 _CLEARLY = 1.0

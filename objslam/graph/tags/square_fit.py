@@ -187,8 +187,11 @@ def _linearised(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, F
 
 
 def _jacobians(seen: Corners, squares: Squares, free: Bools) -> tuple[Floats, Floats, Floats, Bools]:
-    """Return four arrays: the derivatives (V, 8, 7) of the residuals of views by their squares, these derivatives times the
-    weights of Cauchy's loss, the residuals (V, 4, 2), and which corners (V, 4) are ahead of the camera."""
+    """Return the Jacobians of the residuals of V views of squares.
+
+    The four arrays are the derivatives (V, 8, 7) by the parameters of the squares, the same derivatives times the weights of
+    Cauchy's loss, the residuals (V, 4, 2), and a mask (V, 4) of the corners that are ahead of the camera.
+    """
     count, rotation = len(squares.side), squares.pose[:, :3, :3]
     residual, by_point, ahead = _residuals(seen, squares.corners)
     local = squares.shape * squares.side[:, None, None]

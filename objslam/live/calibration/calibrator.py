@@ -34,13 +34,15 @@ _CHANGED = 1.0
 """The map is corrected if an error has changed by more than this, in standard deviations. A larger value corrects more
 rarely."""
 _NO_DELAY = 1.0
-"""A session does not correct a camera clock that is behind by at most this multiple of its standard deviation. Each frame
-would wait that much longer for its pose, and the gain is small. A larger value maps sooner, but with larger errors."""
+"""A session does not correct a camera clock that is behind by at most this multiple of the standard deviation of the
+estimate. With a correction, each frame would wait longer for its pose, by the offset of the clock, and the gain is small. A
+larger value maps sooner, but with larger errors."""
 
 
 _LATE = frozenset(("turn_slip", *LENS))
-"""The kinds of errors that a session estimates at its end, if no calibration file has them. Early curves hardly tell a slip
-from wrong turns, and a short drive hardly tells a lens from a clock and a turn, so the other estimates are worse with them.
+"""The kinds of errors that a session estimates only at its end, if no calibration file has them. After a few curves, a slip
+looks like a wrong scale of turns. After a short drive, an error of the lens looks like an error of the clock together with a
+turn of the camera. So the other estimates would become worse.
 Because of the slip, three of four sessions of MRCLAM 6, robot 3, had up to five landmarks too many while the robot drove.
 Because of the lens, the map of a simulated drive with a late clock was 12 cm off after 100 frames instead of 3 cm."""
 

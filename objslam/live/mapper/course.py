@@ -54,8 +54,8 @@ class _Piece:
 class Course:
     """The paths of odometry and localisation, and the course that they form.
 
-    driven, localized: the whole odometry and localisation, as received. In a long session, not every pose stays. odometry,
-    localization: the poses of the last seconds. This odometry is corrected for its shared errors.
+    driven, localized: the odometry and the localisation since the start, as received. In a long session, some of their poses
+    are dropped. odometry, localization: the poses of the last seconds. `odometry` is corrected for its shared errors.
     """
 
     def __init__(self, settings: Settings, correction: OdometryCorrection | None = None) -> None:

@@ -183,9 +183,9 @@ def _some(edges: Edges, keep: Bools) -> Edges:
 def _with_sizes(edges: Edges, obs: Observations, usual: UsualSizes, to: Floats, spread: Floats) -> Edges:
     """Add the costs of sizes (`UsualSizes.costs`), where a box may belong to several landmarks with a size.
 
-    Sizes only decide between such landmarks, so each cost counts from the least one of the box. A candidate without a size
-    would otherwise win the box of a landmark that is badly placed, and become its duplicate. usual: the sizes of the m
-    candidates. to: (m, 3) m, from the camera to them. spread: (m, 3, 3) m^2, its covariance.
+    Sizes only decide between such landmarks, so the least cost of a box is subtracted from all costs of this box. A
+    candidate without a size would otherwise win the box of a landmark that is badly placed, and become its duplicate. usual:
+    the sizes of the m candidates. to: (m, 3) m, from the camera to them. spread: (m, 3, 3) m^2, its covariance.
     """
     sized = usual.number[edges.landmark] >= SIZED_BY
     several = np.bincount(edges.ray[sized], minlength=len(obs)) > 1

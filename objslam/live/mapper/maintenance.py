@@ -92,7 +92,8 @@ def _coming(m: MapState) -> Ints:
 def _polish_if_grown(m: MapState) -> None:
     """If the graph has grown by `_GROWTH`, solve it, and test which rays are outliers.
 
-    If the graph is large, it is rebuilt in slices instead of solved. If the test changes rays, it is also rebuilt.
+    A large graph is not solved here, but rebuilt in slices. A graph is also rebuilt if the test finds other outliers than
+    before.
     """
     if m.next_id.keyframe < max(_FIRST, _GROWTH * m.schedule.solved) or not len(m.landmarks):
         return

@@ -53,11 +53,11 @@ class LocalizationState:
 
 @dataclass
 class PairEvidence:
-    """Counts for pairs of landmarks of one label, by their ids, the smaller id first.
+    """What frames say about pairs of landmarks of one label. A key holds the two ids, the smaller one first.
 
-    together: the number of frames that showed both landmarks. apart: for each pair that was tested and not merged, the
-    number of frames that had shown the less seen landmark, divided by 5. Once this number has grown, the pair is tested
-    again.
+    together: the number of frames that showed both landmarks. apart: holds the pairs that were tested and not merged. Its
+    value is the frame count of the landmark with fewer frames, divided by 5 and rounded down, at the last test. A pair is
+    tested again when this value has changed.
     """
 
     together: Counter[tuple[int, int]] = field(default_factory=Counter)

@@ -268,8 +268,10 @@ class Intake:
         return self._hand_on(MountMessage(self._place(stamp), camera, pose))
 
     def _is_known(self, path: PathKind, at: float, pose: Floats) -> bool:
-        """Return whether this pose was accepted before at this stamp, in session time, s, and something came after it: a
-        newer pose, or the end of a session that this one resumes."""
+        """Return whether the session accepted the same pose before at the stamp `at` (s, session time).
+
+        The newest pose counts as not known, unless it is from an earlier session that this session resumes.
+        """
         known = self._heard[path].get(at) if path in self._heard else None
         if known is None or (at >= self._last[path].stamp and at > self._resumed_path.get(path, -math.inf)):
             return False

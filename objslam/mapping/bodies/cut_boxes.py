@@ -28,9 +28,9 @@ _CHI2 = 13.28
 """The largest squared deviation of a box from its predicted box, chi-squared of 4 degrees of freedom at 99 %. A larger value
 accepts boxes of other things."""
 _FEWEST = 2
-"""The least number of edges of a used box that are edges of its body. The body only reaches the other edges. With a larger
-number, fewer boxes are used. One edge alone agrees with too many bodies. In simulated drives, boxes with one such edge made
-centres a little worse."""
+"""A box is used if the body touches at least this number of its edges. The other edges are bounds: the body reaches at least
+to them. With a larger number, fewer boxes are used. One edge alone agrees with too many bodies. In simulated drives, boxes
+with one such edge made centres a little worse."""
 _WITHIN = 0.1
 """An edge is a bound if the body touches it outside the image. It is also a bound if the body touches it inside the image,
 but at most this share of the box away from the cut. A larger share makes more edges bounds. Shares from 0 to 0.1 hardly

@@ -158,7 +158,7 @@ def _behind_things(found: Bodies, views: _Views) -> Bools:
 
 
 def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
-    """Return the noise (B,), rad, of directions to the centres of bodies that hidden edges of boxes add to that of rays.
+    """Return the noise (B,), rad, that hidden edges of boxes add to the directions to the centres of bodies.
 
     The centre of a box is the mean of two edges. If one is hidden, the other tells the centre, with the noise of one edge
     and of half the size of the body. If both are hidden, the centre may be anywhere in the box.

@@ -20,24 +20,27 @@ from objslam.triangulation.bodies.solve import Bodies
 
 _UNLIKE = 0.3
 """The standard deviation of the difference between the surfaces of a thing and of its body, as a share of half the width.
-The surfaces of rendered rings, buttons and stands with open fronts were 0.3 behind those of their bodies, with a spread of
-0.3. Those of simulated boxes, cylinders and balls were there, to 0.07. A larger number trusts bodies less."""
+The surfaces of rendered rings, buttons and stands with open fronts were 0.3 behind the surfaces of their bodies, with a
+spread of 0.3. For simulated boxes, cylinders and balls, the two surfaces agreed to 0.07. A larger number trusts bodies
+less."""
 _UNSEEN = 0.5
 """The standard deviation of the distance from the surface to the centre of a body that was seen from one side, as a share of
 half the width. Such a body has only its prior. In simulated drives past things, it was 0.4 to 0.6. A larger number trusts
 the priors of bodies."""
 _OF_SURFACES = 0.4
-"""Ranges end on surfaces if a solve that does not know the bodies finds them at least this share of the way from the centres
-to the surfaces of the bodies. It was 0.47 to 1.0 in drives with depths of surfaces, 0 to 0.31 with depths of centres, and is
-about `depth.centre` if a log does not tell. With a larger share, bodies tell less often."""
+"""Ranges may end at the centre of a body (share 0) or on its surface (share 1). A solve without bodies estimates this share.
+From this value on, ranges count as ending on surfaces. In simulated drives, the share was 0.47 to 1.0 with depths of
+surfaces, and 0 to 0.31 with depths of centres. It is about `depth.centre` if a log does not show it. With a larger value,
+bodies correct the ranges of fewer logs."""
 
 
 def range_shift(found: Bodies, views: BoxViews, ray: Ints, count: int, settings: Settings, common: float) -> RangeShift:
-    """Return what takes ranges to the centres of bodies, for `count` rays.
+    """Return the corrections of `count` rays that make their ranges end at the centres of bodies.
 
-    It combines what a body tells of its surface with what the width of its box tells, by their variances. The rays of an
-    object share one such combination. If `depth.centre` is 0, ranges end at centres. ray: (B,) the ray of each box. common:
-    the standard deviation of the share that all things of a log have in common, 0 if it is estimated.
+    Two estimates tell how far the centre is behind the surface: the body, and the width of the box. They are weighted by
+    their variances, and all rays of an object have the same weights. If `depth.centre` is 0, ranges end at centres. ray:
+    (B,) the ray of each box. common: the standard deviation of the share that all things of a log have in common, 0 if this
+    share is estimated.
     """
     shift, edges, rays = RangeShift.none(count), views.edges(), views.rays
     half = half_widths_of_rays(rays, views.keyframes, views.cameras)

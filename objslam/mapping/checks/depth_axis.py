@@ -10,9 +10,10 @@ from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.residuals import held_rays
 
 _LEAST = 0.6
-"""The least power of the cosine for a finding. Depths along the axis have the power 0. If one is taken for the other, it is
-1 or -1, or a little less, because a joint solve bends the map towards the depths. On 11 real and simulated logs it was at
-most 0.05 for right depths, and 0.81 to 1.07 for wrong ones. A larger value finds less."""
+"""The least power of the cosine for a finding. Right depths have the power 0. If depths along the optical axis are taken for
+distances along the ray, or the reverse, the power is 1 or -1. It is a little less in a joint solve, which bends the map
+towards the depths. On 11 real and simulated logs it was at most 0.05 for right depths, and 0.81 to 1.07 for wrong ones. A
+larger value finds less."""
 _SIGMAS = 5.0
 """By how many standard deviations the power must differ from 0. With a larger number, more depths are needed."""
 _FEWEST = 30
@@ -33,8 +34,8 @@ def check_depth_axis(
 
     A depth image has the distance along the optical axis, a laser or a person has the distance along the ray. If one is
     taken for the other, depths near the edge of the image are wrong by the cosine there: 13 % at 30 degrees. The fit is
-    log(range / distance) = power log(cosine) + a constant for each object, so it does not depend on the size of the map, nor
-    on what the depths of an object have in common.
+    log(range / distance) = power log(cosine) + a constant for each object. The constant takes up the scale of the map, and
+    errors that all depths of an object share.
 
     map_T_camera: (K, 4, 4) the solved poses of the cameras at the keyframes.
     """

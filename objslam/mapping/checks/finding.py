@@ -12,10 +12,10 @@ class Finding:
     """One thing that is wrong with the input.
 
     name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the fault makes
-    the positions of a map unreliable, because the run does not correct it. basis: the evidence. "log" is the input itself.
-    The other values say which boxes do not agree at the given poses: all "boxes", those of the two "halves" of the log, or
-    those of single "frames". "ranges": the ranges do not agree with the way of the odometry. A joint solve may refute a
-    finding with such evidence.
+    the positions of a map unreliable, because the run does not correct it. basis: the evidence. "log": the input itself.
+    "boxes": all boxes do not agree at the given poses. "halves": the boxes of the two halves of the log do not agree with
+    each other. "frames": the boxes of single frames do not agree. "ranges": the ranges do not agree with the distances that
+    the odometry measured. A joint solve may refute a finding with any of these, but not with "log".
     """
 
     name: str

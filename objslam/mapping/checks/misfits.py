@@ -17,11 +17,12 @@ _LEAST = 1.5
 """The least misfit of an object whose rays do not agree. At 1.5, more than half of the variance of its rays is unexplained.
 A larger value finds fewer objects."""
 _TIMES = 3.0
-"""The same as a multiple of the median misfit of all objects. Association accepts rays of an object up to 3 times as noisy
-as nominal. If all rays of a log are noisy, the object is not the cause. A larger value finds fewer objects."""
+"""An object is odd only if its misfit is also at least this multiple of the median misfit of all objects. Association
+accepts rays of an object up to 3 times as noisy as nominal. If all rays of a log are noisy, the object is not the cause. A
+larger value finds fewer objects."""
 _SIGMAS = 3.0
-"""By how many standard deviations of chi-squared the rays of such an object exceed their noise. A larger number finds fewer
-objects with few rays."""
+"""An object is odd only if the chi-squared of its rays exceeds its expectation by this number of standard deviations. A
+larger number finds fewer objects with few rays."""
 _PLACE = 3
 """The degrees of freedom of a position. Each ray has two."""
 

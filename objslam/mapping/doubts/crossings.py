@@ -15,8 +15,9 @@ from objslam.mapping.doubts.evidence import Evidence
 _FEWEST = 3
 """The fewest rays of a group. Two rays nearly always pass closely somewhere. A larger number finds fewer groups."""
 _SCALES = (1.0, 3.0)
-"""The largest distance of a ray from its place, in gates. The first finds rays that meet, the second also rays that only
-pass nearby. Larger numbers find looser groups, and join different groups more often."""
+"""The two largest distances of a ray from its place, in gates. With the first distance, the search finds rays that meet.
+With the second, it also finds rays that only pass nearby. Larger numbers find looser groups, and join different groups more
+often."""
 _LOOSE = 2.0
 """The second scale finds more rays than the first. If it finds more than this multiple, the rays only pass nearby, and do
 not meet. With a larger number, more loose groups count as groups that meet."""

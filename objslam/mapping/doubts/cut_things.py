@@ -1,4 +1,4 @@
-"""Things whose boxes are all cut off by the image's edge: no ray shows them, so the map lacks them."""
+"""Things that the map lacks because the edge of the image cuts off all their boxes. Such boxes give no rays."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _FEWEST = 5
 """The fewest frames that show a thing. A cut off box has a wide cone, and few cones meet anywhere. A larger number names
 fewer things."""
 _SEEN = 0.5
-"""The least share of the frames with the place in the image, at the distances of the boxes, that show the thing. A thing at
-rest is in most of them, and cones of a thing that moves meet anywhere. A larger share names fewer things."""
+"""Of the frames that have the place in the image, at the distances of the boxes, at least this share must show the thing. A
+thing at rest is in most of them. The cones of a thing that moves meet anywhere. A larger share names fewer things."""
 _PAIRS = 1000
 """The number of pairs of boxes whose crossings are tried as the place of a thing. More pairs give a better place."""
 _PARALLAX = np.sin(np.radians(5.0)) ** 2
@@ -38,9 +38,12 @@ _SAMPLE = 2000
 
 @dataclass(frozen=True)
 class CutThing:
-    """A thing whose boxes are all cut off. label: index into the label names of the rays. position: (3,) m, roughly: where
-    the axes of its boxes meet best. boxes: how many show it. frames, expected: in how many frames it is, and in how many its
-    place is in the image at the distances of its boxes."""
+    """A thing whose boxes are all cut off.
+
+    label: index into the label names of the rays. position: (3,) m, about where the axes of its boxes meet best. boxes: the
+    number of its boxes. frames: the number of frames with a box of it. expected: the number of frames that have its place in
+    the image, at the distances at which its boxes are.
+    """
 
     label: int
     position: Floats

@@ -13,8 +13,8 @@ from objslam.mapping.doubts.evidence import Evidence
 _NAMED = 3
 """The most objects that the assessment names. A larger number makes the assessment longer."""
 _ONE_THING = 0.5
-"""An object whose rays may cross is doubted if it is one thing with less than this probability: then it more likely is not.
-With a larger value, fewer maps are good."""
+"""An object whose rays may cross is doubted if the probability that it is one thing is below this. With a larger value,
+fewer maps are good."""
 
 
 def misfits_of(result: RunResult) -> Misfits:
@@ -46,11 +46,10 @@ def disagreeing(result: RunResult, misfits: Misfits) -> list[Doubt]:
 
 
 def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
-    """Return a doubt for each object that is more likely not one thing at its place than one, the likeliest first.
-
-    Its rays come from two sides, and two things whose rays cross explain them too. The association divides such objects only
-    if they are clearly two, because to divide one thing may lose it. It also allows for more noise than the solved poses
-    have. And the object may be no thing at all, because frames that should show it do not (`existence`).
+    """Return a doubt for each object that is probably not one thing at its place, the most probable first. Its rays come
+    from two sides, and two things whose rays cross explain them too. The association divides such objects only if they are
+    clearly two, because to divide one thing may lose it. It also allows for more noise than the solved poses have. And the
+    object may be no thing at all, because frames that should show it do not (`existence`).
     """
     state = evidence.state
     sized = np.array([camera.sees_size for camera in result.cameras], dtype=bool)
@@ -68,9 +67,9 @@ def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
                 "split",
                 "crossing",
                 o.label,
-                f"{o.label} #{o.id} may be where the rays of two things cross: {number - second} of its rays and {second} "
-                f"others come from two sides. By its rays, the sizes of their boxes, and frames without a box, it is one "
-                f"thing with a probability of {one[s]:.2g}.",
+                f"{o.label} #{o.id} may be where the rays of two things cross: {number - second} of its rays come from one "
+                f"side, and {second} from another. The rays, the sizes of their boxes, and frames without a box give a "
+                f"probability of {one[s]:.2g} that it is one thing.",
                 (o.id,),
                 o.position,
                 evidence.ray[np.flatnonzero(mine)],

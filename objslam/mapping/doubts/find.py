@@ -28,11 +28,11 @@ maps are good."""
 
 
 _LOST = (0.1, 0.5)
-"""A group of boxes that became no object counts in the assessment if it has at least the first share of the boxes of its
-label, or the second share of the boxes of an object of its label (median). A detector's false boxes of one kind at one place
-are rarer. With larger shares, more maps are good."""
+"""Two shares. A group of boxes that became no object counts in the assessment if it has at least the first share of all
+boxes of its label. It also counts if it has at least the second share of the boxes that an object of its label has (median).
+False boxes of a detector at one place are rarer. With larger shares, more maps are good."""
 _FEWEST_LOST = 5
-"""The fewest boxes of such a group. With a larger number, more maps are good."""
+"""The fewest boxes of a group that counts in the assessment. With a larger number, more maps are good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
 """The reasons of groups whose boxes agree on one place at rest, and more closely than by chance."""
 _MOVED: tuple[Reason, ...] = ("moves",)
@@ -59,8 +59,9 @@ def with_doubts(result: RunResult) -> RunResult:
 
     A map is not called good in six cases: some objects are more likely doubles than not, a place is in the map twice, the
     rays of an object do not agree on one thing, an object has many sizes, most objects have a wide sigma, or many boxes of a
-    label meet where the map has no object. A label without an object is named, and so are a thing with cut off boxes only
-    and a thing that seems to move. Their boxes may be false, and no map has what moves, so the level stays.
+    label meet where the map has no object. A label without an object is named. So are a thing that has only cut off boxes,
+    and a thing that seems to move. They do not change the level of the assessment, because their boxes may be false, and
+    because no map contains things that move.
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)
@@ -140,8 +141,8 @@ def _of_moved_things(groups: BoxGroups, result: RunResult) -> list[str]:
 
 
 def _large_groups(groups: BoxGroups, result: RunResult, reasons: tuple[Reason, ...]) -> list[tuple[str, Floats]]:
-    """Return in words how many boxes of its label each group with one of the reasons has, and its place (3,), if these are
-    many."""
+    """Return a phrase and the place (3,) for each large group with one of the reasons. The phrase says how many boxes of its
+    label the group has."""
     if not len(groups):
         return []
     labels = result.rays.label_names

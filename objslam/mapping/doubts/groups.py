@@ -36,10 +36,10 @@ Reason = Literal[
     "unclear",
 ]
 REASONS: tuple[Reason, ...] = get_args(Reason)
-"""Why boxes are no object. The first three reasons belong to no place: the boxes stay at one place of the image, they lie on
-an object, or they follow one another and no place explains them. The others, in order: too few rays, no parallax, the rays
-do not meet, the ranges disagree, too few frames show the thing, its size is wrong, it moves a little, as many strays meet by
-chance, none of these reasons alone."""
+"""Why boxes became no object, in order. Three reasons belong to no place: the boxes stay at one place of the image, they lie
+on an object, or they follow one another and no place explains them. The others belong to a place: too few rays, no parallax,
+rays that do not meet, ranges that disagree, too few frames that show the thing, a wrong size, a thing that moves a little,
+as many rays as strays (boxes of no object) that meet by chance, and no single reason."""
 _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
 """The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger
@@ -193,9 +193,12 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
 
 
 def _nearest(evidence: Evidence, points: Points, owner: Ints) -> tuple[Ints, Floats, Ints]:
-    """Return the nearest object (G,) in the map or -1, its distance (G,), m, and the number (G,) of boxes in frames in which
-    this object has a box of its own. owner: (G,) the landmark on which the boxes lie, or -1 for the nearest to their
-    place."""
+    """Return the object of the map that is nearest to each group of boxes, and two numbers about it.
+
+    The three arrays are the object (G,) or -1, its distance (G,) m, and the number (G,) of the group's boxes that are in
+    frames in which the object has a box of its own. owner: (G,) the landmark on which the boxes lie. -1 asks for the nearest
+    object to the place of the group.
+    """
     state, count = evidence.state, len(owner)
     if not state.count:
         return owner, np.full(count, np.nan), np.zeros(count, dtype=np.int64)

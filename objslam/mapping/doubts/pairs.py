@@ -23,9 +23,9 @@ copies. A larger value reports more pairs."""
 _LEAST = 0.1
 """The least probability that a reported pair is one object. A larger value reports fewer pairs."""
 _BOTH = 0.5
-"""Of the frames that should show both of two independent objects, this share really shows both. One thing hides another, and
-a detector suppresses boxes that overlap. It is chosen, not measured. With a larger share, a frame without both is stronger
-evidence for one object."""
+"""Of the frames that should show both of two independent objects, this share really shows both. The others do not, because
+one thing hides another, or because a detector suppresses boxes that overlap. It is chosen, not measured. With a larger
+share, a frame without both is stronger evidence for one object."""
 _BESIDES = 0.2
 """The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
 number, few frames tell less."""

@@ -31,11 +31,12 @@ larger angle judges more objects of cameras that are not level."""
 def mixed_sizes(result: RunResult) -> list[Doubt]:
     """Return a doubt for each object whose boxes show sizes that scatter much more than those of other objects.
 
-    A box and the distance to its object tell the size of the thing in the box. The size of one thing stays the same, at
-    least its height in boxes that show the vertical alike, as those of a level camera do. So only such boxes count, and the
-    smaller scatter of width and height. It must exceed that of other objects, and what the noise of the boxes explains.
-    Boxes of two things have two sizes, also where their rays happen to meet. If a thing is put too far away, its boxes grow
-    faster than its distance falls.
+    A box and the distance to its object tell the size of the thing in the box. The size of one thing stays the same. At
+    least its height does, in boxes that show the vertical in the same direction, as those of a level camera do. So only such
+    boxes count. The scatter of the widths and the scatter of the heights are computed, and the smaller one counts. It must
+    exceed the scatter of other objects, and the scatter that the noise of the boxes explains. Boxes of two things have two
+    sizes, also where their rays happen to meet. If a thing is put too far away, its boxes grow faster than its distance
+    falls.
     """
     if len(result.map) < _OTHERS:
         return []

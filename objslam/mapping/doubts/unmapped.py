@@ -73,9 +73,8 @@ def _doubt(result: RunResult, evidence: Evidence, label: int, frames: int, cut: 
 
 
 def _why(result: RunResult, evidence: Evidence, mine: Ints, parallax: float, cut: int) -> tuple[str, str, Floats | None]:
-    """Return why the boxes `mine` (B,) of a label are no object: in short, and as a sentence's end; and their place (3,).
-
-    The place is None if the boxes have none. parallax: deg.
+    """Return why the boxes `mine` (B,) of a label are no object. The three values are the reason in short, the reason as the
+    end of a sentence, and the place (3,) of the boxes. The place is None if the boxes have none. parallax: deg.
     """
     settings, edge = result.settings, "the image's edge cuts off"
     least = settings.association.min_rays

@@ -40,7 +40,7 @@ def why_unresolved(result: RunResult, j: int) -> str:
         return f"its {o.rays} rays span {o.parallax_deg:.1f} deg ({least})"
     noise = _noise_deg(result, j)
     if o.rms_deg > _DISAGREE * noise:
-        return f"its {o.rays} rays disagree: they pass it {o.rms_deg:.2g} deg apart, where their noise is {noise:.2g} deg"
+        return f"its {o.rays} rays disagree: they miss it by {o.rms_deg:.2g} deg (RMS), but their noise is {noise:.2g} deg"
     most = f"its sigma exceeds {limits.max_rel_sigma:g} of its distance (triangulation.max_rel_sigma)"
     return f"its {o.rays} rays span {o.parallax_deg:.1f} deg, too little for their noise of {noise:.2g} deg: {most}"
 
@@ -90,7 +90,7 @@ def _splits(result: RunResult, splits: Splits) -> Iterator[Doubt]:
             "may be two",
             o.label,
             f"{_name(o)} may be two: {m} of its rays meet near {in_place(one)} and {n} near {in_place(two)}, "
-            f"{_length(splits.gap[i])} apart as seen, where 3 sigma of a ray are {_length(3 * splits.noise[i])}{both}.",
+            f"{_length(splits.gap[i])} apart across the rays; 3 sigma of a ray are {_length(3 * splits.noise[i])}{both}.",
             (o.id,),
             o.position,
             np.flatnonzero(result.association.object == j),

@@ -24,11 +24,12 @@ _CLEAR = 0.95
 larger share explores more logs twice. In simulation, maps that show objects twice explained at most 0.93 of the rays, but up
 to 0.96 with ranges. A good map can explain as few."""
 _SAME = 0.01
-"""The rounds of a second exploration are left out if at most this share of the rays belongs to other objects than in the
-map. Two explorations of one drive assign a few rays between neighbours in different ways. A larger share leaves out more."""
+"""If a second exploration gives at most this share of the rays to other objects than the map does, it is not continued. Two
+explorations of one drive always assign a few rays between neighbours in different ways. With a larger share, more second
+explorations end there."""
 _CLEARLY = 3.0
-"""A log is explored again with the shared errors of its odometry that the solve found, if one of them is this number of
-standard deviations from what the exploration assumed. A larger number explores fewer logs twice."""
+"""A solve estimates the shared errors of the odometry. If one of them is more than this number of standard deviations from
+the value that the exploration assumed, the log is explored again. A larger number explores fewer logs twice."""
 _LOOSE = 3.0
 """The factor on the noise of the odometry in the second exploration, if the solve found only the rays to be noisy. A larger
 factor suits worse odometry, and loses more objects of good odometry."""
@@ -37,13 +38,13 @@ factor suits worse odometry, and loses more objects of good odometry."""
 def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = False) -> JointState | None:
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
-    None if the noise is about nominal and the shared errors are about those `assumed` (P,) by the first exploration, if the
-    settings fix the noise, or if nearly all rays agree. The solve finds them, but the exploration needs them before. A wrong
-    map can hide the noise of the odometry in the noise of the rays.
+    None in three cases: noise and shared errors are about those that the first exploration assumed (`assumed` (P,), and the
+    nominal noise), the settings fix the noise, or nearly all rays agree. Noise and shared errors are known only after a
+    solve, but an exploration needs them before. A wrong map can hide the noise of the odometry in the noise of the rays.
 
-    The noise is at least nominal. A solve estimates the shared errors and the noise together, so the rest may be small. An
-    exploration has the shared errors fixed, and those of a wrong map are wrong by more than their sigma. With half the noise
-    it expects known objects within gates that they miss, and maps them again.
+    The noise of the attempt is at least nominal. A solve estimates shared errors and noise together, so the remaining noise
+    may be small. An exploration has the shared errors fixed, and shared errors from a wrong map are wrong by more than their
+    sigma. With too little noise, known objects would be outside their gates, and the exploration would map them twice.
 
     If nearly all rays agree, wrong distances of centres behind surfaces may still have misled the exploration: an object
     that is seen from another side then seems to be another object. If the distances differ by more than those of single
@@ -100,9 +101,9 @@ def _drives_otherwise(state: JointState, assumed: Floats | None) -> bool:
 
 
 def finds_same_objects(state: JointState, start: Association) -> bool:
-    """Return whether a start has the same objects as the map of a state, so that its rounds would lead to the same map.
+    """Return whether the association `start` has the same objects as `state`. Then it would lead to the same map.
 
-    Rays without an object in one of them do not count, because the rounds assign them again.
+    Rays that have no object in `start` or in `state` do not count, because later rounds assign them again.
     """
     assert state.association is not None
     before, after = state.association.object, start.object

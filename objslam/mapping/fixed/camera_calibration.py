@@ -25,16 +25,17 @@ if TYPE_CHECKING:
     from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
 _NARROWER = (0.3, 0.0)
-"""What narrower first associations allow for, as shares of the uncertainty of the errors. They are tried on logs that fit
-poorly. Each share more takes as long as an association."""
+"""Narrower first associations, which are tried on logs that fit poorly. Each allows for this share of the uncertainty of the
+shared errors. Each further share takes the time of one association."""
 _FITS = 2.0
 """The mean squared miss of a ray, in variances of its noise, up to which the widest association is taken without trying
 others. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take the time
 for others, and rows of equal things are confused more often."""
 _CLEARLY = 1.75
-"""By how much a narrower association must lower -2 ln of the probability of a mean ray, to be taken. The right one lowers it
-by 2.1 to 6.1 in simulated orchards and shelves. Noisy poses let one thing look like several. There, a wrong one lowers it by
-up to 1.4 (poses that err for seconds). With a smaller value, noisy poses split more things."""
+"""A narrower association is taken if it lowers the mean over all rays of -2 ln of their probability by at least this. In
+simulated orchards and shelves, the right association lowers it by 2.1 to 6.1. If the poses are noisy, one thing may look
+like several. Then a wrong association lowers it by up to 1.4 (poses that err for seconds). With a smaller value, noisy poses
+split more things."""
 
 
 def calibrate_fixed(

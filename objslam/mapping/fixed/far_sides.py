@@ -1,8 +1,9 @@
 """The far side of objects that were seen with little parallax.
 
-Rays from one stretch of the path measure the inverse of a depth (Civera, Davison and Montiel 2008). The same error of a ray
-moves an object far away, or a little nearer. So an object that errs is mostly too near, and there the same noise of rays
-gives a small covariance. Such an object would be far outside its ellipsoid.
+Rays from one stretch of the path measure the inverse of a depth (Civera, Davison and Montiel 2008). So an error of a ray to
+one side moves an object far away, and the same error to the other side moves it only a little nearer. Wrong positions are
+mostly too near, and near positions get a small covariance from the same noise of rays. The true position would then be far
+outside the ellipsoid.
 """
 
 from dataclasses import replace

@@ -29,11 +29,12 @@ _MOST_CELLS = 48
 """The most cells of an object. The cells of an object that was seen for long are longer. A larger number is finer and
 slower."""
 _LARGE = 1.0
-"""A run at given poses says that they err for seconds if they err by at least this multiple of `localization`. From this
-value on, the errors that last are as large as all errors should be. A larger value warns less often."""
+"""A run at given poses warns of errors of the poses that last for seconds, if they are at least this multiple of the noise
+`localization`. At 1, the lasting errors alone are as large as all errors together should be. A larger value warns less
+often."""
 _FEWEST = 3
-"""A run says this only if at least this number of objects show it. Boxes of one object lie beside it in the same way for
-seconds, so one object tells little of the poses. A larger number warns less often."""
+"""A run warns of such errors only if at least this number of objects show them. Boxes of one object lie beside it in the
+same way for seconds, so one object tells little of the poses. A larger number warns less often."""
 LASTING = "lasting localisation errors"
 """The name of the finding that given poses err for seconds."""
 _POOLED = 20.0
@@ -86,7 +87,7 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings) -> Finding | No
     return Finding(
         LASTING,
         f"all boxes of some seconds miss their objects together: the poses err by {np.degrees(noise.yaw):.2g} deg and "
-        f"{100 * noise.xy:.2g} cm for about {noise.seconds:.0f} s, and localization.yaw and localization.xy say "
+        f"{100 * noise.xy:.2g} cm for about {noise.seconds:.0f} s, but localization.yaw and localization.xy say "
         f"{np.degrees(said.yaw):.2g} deg and {100 * said.xy:.2g} cm. Something may be in the map twice. A joint solve "
         "corrects such poses (--mode joint)",
         spoils=False,

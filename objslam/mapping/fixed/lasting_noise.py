@@ -23,15 +23,18 @@ and slower."""
 _LOOSE = 1.0
 """The prior standard deviation (m) of the error of a solved position. With a larger value, the rays decide more."""
 _MOST = 400
-"""The most cells that count. Some hundred cells determine the factor to a few percent. The time grows with the cube."""
+"""The most cells that count. Some hundred cells determine the factor to a few percent. The time grows with the cube of this
+number."""
 _TOGETHER = 50
-"""If there are more cells, those that count come from stretches of this many cells that follow each other in time, because
-only cells of the same seconds share their errors. A longer stretch shows longer errors, and fewer parts of the drive."""
+"""If there are more than `_MOST` cells, a part of them counts. The part consists of stretches with this number of cells in
+the order of time, because only cells of the same seconds share their errors. Longer stretches show errors that last longer,
+but fewer parts of the drive."""
 
 
 @dataclass(frozen=True)
 class Cells:
-    """The misses of the rays of objects along one axis, in C cells of an object and a short time, in the order of objects.
+    """The misses of the rays of objects along one axis, in C cells. A cell holds the rays of one object in a short time. The
+    cells are in the order of their objects.
 
     owner: (C,) the object. times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left, or
     above it. white: (C,) rad, the standard deviation of the mean from noise that does not last. shift: (C, n) rad per m, the

@@ -33,10 +33,11 @@ def noise_of_residuals(searched: Searched, unknown: tuple[bool, bool, bool], pri
     """Return the noise of places, depths and boxes that agrees best with the residuals, by restricted likelihood (Patterson
     and Thompson 1971).
 
-    Seen from above, a ray misses its object across by the noise of the ray and of the place, and along by the noise of the
-    depth and of the place. The objects and the errors of the places are integrated out. unknown: which of the three are
-    estimated. prior: the weight of the noise in the settings, as a number of residuals. shared: whether all rays of one
-    moment have the same error of their place. If not, each ray has its own, and there are no outliers.
+    A place is the position of the robot at one moment. The residuals are seen from above. Across the ray, a residual comes
+    from the noise of the box and of the place. Along the ray, it comes from the noise of the depth and of the place. The
+    objects and the errors of the places are integrated out. unknown: which of the three kinds of noise are estimated. prior:
+    the weight of the noise in the settings, as a number of residuals. shared: whether all rays of one moment have the same
+    error of their place. If not, each ray has its own error, and there are no outliers.
     """
     residuals = _Residuals.of(searched)
     known, own = residuals.known, residuals.own

@@ -52,12 +52,12 @@ taken for noisy places."""
 _FEWEST = 20
 """The fewest boxes of a log that is searched. Fewer boxes agree with any noise by chance."""
 _NEAR = 30.0
-"""The log odds, below those of the likeliest noise, from which a noise is a start. With a larger number, more starts are
-tried, and each takes about a second."""
+"""A noise is tried as a start if its log odds are at most this below those of the likeliest noise. With a larger number,
+more starts are tried, and each takes about a second."""
 _NOISY = 3.0
-"""The least factor on `localization.xy` of noisy places. A noise with exact places counts only if each start leads to one.
-Boxes that err by far more explain few boxes as well, but they are rare, and the sigmas are then too small. With a larger
-factor, a good GPS is taken for a bad detector."""
+"""Places count as noisy from this factor on `localization.xy` on. If any start leads to noisy places, results with more
+exact places are left out. Large errors of boxes would explain few boxes as well, but they are rare, and the sigmas would
+then be too small. With a larger factor, a good GPS is taken for a bad detector."""
 _SETTLED = 2
 """How often the objects are searched with the noise of their residuals. A third time gave the same objects on 15 simulated
 streets. A larger number takes longer."""
@@ -131,7 +131,7 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
     if best.value == -np.inf or grown < _CLEAR or best.views > _MOST_VIEWS:
         return (), 0.0
     lead = np.inf
-    for corrected, turned in _what_ifs(part, lambda done, total: progress("what-ifs about the noise", done, total)):
+    for corrected, turned in _what_ifs(part, lambda done, total: progress("possible corrections of the input", done, total)):
         ahead = best.value - search_objects(corrected, settings, best.noise).value
         lead = min(lead, ahead) if turned else lead
         if ahead < (_LEAD if turned else -_BETTER):
@@ -152,11 +152,11 @@ def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tupl
 
 
 def _settled(part: Log, settings: Settings, searched: Searched, unknown: tuple[bool, bool, bool]) -> list[Searched]:
-    """Return the objects of a part of a log with the noise of their residuals. Search and noise are found in turns, and the
-    result of each turn is returned, because the noise of boxes may grow until it replaces the noise of places.
+    """Search the objects of a part of a log and estimate the noise from their residuals, in turns.
 
-    A search with too little noise leaves out the rays that miss by much. So the first estimate takes the errors of a place
-    as if each ray had its own. This estimate is rather too large, and the next search finds the errors of the places.
+    The result of each turn is returned, because the noise of boxes may grow until it replaces the noise of places. A search
+    with too little noise leaves out the rays that miss by much. So the first estimate treats the error of a place as if each
+    ray had its own error. This makes the noise rather too large. The next search then finds the errors of the places.
     unknown: whether the noise of places, depths and boxes is estimated.
     """
     prior = settings.noise.prior
@@ -178,7 +178,7 @@ def _turned_cameras(log: Log, settings: Settings, progress: Progress) -> Finding
     part, tried = middle(log), range(0, 360, _TURN)
     values = []
     for number, degrees in enumerate(tried):
-        progress("what-ifs about the cameras", number, len(tried))
+        progress("possible turns of the cameras", number, len(tried))
         searched = search_objects(_with_headings(part, degrees), settings, SparseNoise())
         if searched.views > _MOST_VIEWS:
             return None
@@ -209,10 +209,11 @@ def _unknown(log: Log, settings: Settings) -> tuple[bool, bool, bool]:
 
 
 def _what_ifs(log: Log, progress: Callable[[int, int], None]) -> Iterator[tuple[Log, bool]]:
-    """Yield the log with all cameras turned about the vertical axis, and with each usual mistake about directions corrected.
+    """Yield changed copies of a log: with all cameras turned about the vertical axis, or with one usual mistake corrected.
 
-    With each log comes whether its cameras are turned. Errors of the clock and of the size of images are left out. They move
-    rays by little, or all places by the same way.
+    Each copy comes with a flag, which says whether its cameras are turned. Only mistakes about directions are tried. Errors
+    of the clock and of the size of images are left out, because they move rays by little, or move all places in the same
+    way.
     """
     usual = [one for one in coarse_hypotheses(log) if one.usual]
     turns = range(_TURN, 360, _TURN)

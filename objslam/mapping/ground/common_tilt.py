@@ -1,8 +1,8 @@
 """The roll, pitch and height that planar poses lack, from the errors that all rays of a pose share.
 
-A robot that pitches lifts or lowers all rays of its pose, one that rolls lifts those on one side, and one that stands higher
-than its pose lowers near rays more than far ones. The noise of boxes does none of these. So poses that show several things
-tell how uneven the ground is.
+If the robot pitches, all rays of its pose go up or down. If it rolls, the rays on one side go up, and the rays on the other
+side go down. If it stands higher than its pose says, near rays go down more than far ones. The noise of boxes does not move
+rays together. So poses that show several things tell how uneven the ground is.
 """
 
 from dataclasses import dataclass, replace
@@ -177,9 +177,9 @@ class CommonTilt:
 def common_tilt(keyframes: Keyframes, rays: Rays, point: Ints, points: Floats, prior: float) -> CommonTilt | None:
     """Return how uneven the ground is below planar poses, None if no pose has several rays, or none shares an error.
 
-    A variance component model (Searle, Casella and McCulloch 1992): the elevation of a ray above its thing is a sum of the
-    noise of the ray, the errors of its pose (roll, pitch, height, x, y), the error of the height of the thing, and constant
-    errors of its camera (roll, tilt). The sizes are those of the largest restricted likelihood.
+    A variance component model (Searle, Casella and McCulloch 1992). The elevation of a ray above its thing is a sum of four
+    terms: the noise of the ray, the errors of its pose (roll, pitch, height, x, y), the error of the height of the thing,
+    and constant errors of its camera (roll, tilt). The variances maximise the restricted likelihood.
 
     point: (R,) the thing of each ray, -1 for none. points: (N, 3) m, the things. prior: the weight of the nominal noise of
     rays, as a number of residuals.
@@ -224,8 +224,11 @@ def common_tilt(keyframes: Keyframes, rays: Rays, point: Ints, points: Floats, p
 
 
 def _derivatives(keyframes: Keyframes, rays: Rays, held: Ints, point: Ints, points: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return by how much rays pass above their things (R,), rad, and its derivatives by roll, pitch, height, x and y of the
-    pose (R, 5), and by the heights of the things and the errors of the cameras (R, P)."""
+    """Return the angles (R,), rad, by which rays pass above their things, and two derivatives of these angles.
+
+    The first derivatives (R, 5) are by roll, pitch, height, x and y of the pose. The second (R, P) are by the heights of the
+    things and by the roll and tilt of the cameras, in their prior standard deviations.
+    """
     origin, direction = (values[held] for values in rays.in_map(keyframes.map_T_camera))
     to = points[point[held]] - origin
     level = np.maximum(np.hypot(to[:, 0], to[:, 1]), MIN_DEPTH)

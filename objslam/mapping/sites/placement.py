@@ -43,7 +43,7 @@ class Part:
 
 
 def place_sessions(sessions: Sequence[Session]) -> list[Part]:
-    """Return the groups of sessions that share objects. No two of them can be registered to each other.
+    """Return the groups of sessions that share objects. The maps of two groups cannot be registered to each other.
 
     The sessions with the most objects come first. So the result does not depend on the order in which they are given.
     """

@@ -18,7 +18,8 @@ from objslam.output.plot.page import render
 from objslam.output.plot.style import body_outline, frame_objects
 
 _LONG_SIDE, _SHORT_SIDE = 1200.0, 600.0
-"""The length of the map's longer side, and the least length of the other side, px. Larger values make a larger picture."""
+"""The longer side of the map has the length `_LONG_SIDE` (px), and the other side has at least `_SHORT_SIDE` (px). Larger
+values make a larger picture."""
 _MARGIN = 0.08
 """The margin around the objects, as a share of the longer side. A larger share leaves more room for labels at the edge."""
 _MARK, _ARROW = 15.0, 18.0

@@ -35,16 +35,16 @@ _CORE, _AROUND = 0.1, 1.5
 each side. A picture shows objects up to `_AROUND` times the box's diagonal away from the box. A larger share hides more far
 objects. A larger multiple hides fewer."""
 _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
-"""A cuboid has corners in a picture if the standard deviation of its yaw, rad, is below the first number, and if its length
-exceeds its width by more than the second number times the standard deviation of their difference. Three sigmas of 15 degrees
-reach the direction in which a square has its sides in place of its corners. Without the second number, a bottle of TUM
-fr3_office was a square. A larger first and a smaller second number draw more round things as turned squares."""
+"""A picture shows the corners of a cuboid under two conditions. The standard deviation of its yaw is below `_KNOWN_HEADING`
+(rad). Its length exceeds its width by more than `_LONGER` standard deviations of their difference. With 15 degrees, three
+sigmas turn the corners of a square to the middles of its sides. Without the second condition, a bottle of TUM fr3_office was
+a square. A larger `_KNOWN_HEADING` and a smaller `_LONGER` draw more round things as turned squares."""
 _OUTLINE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _MOST, _FENCE = 0.9, (2.0, 0.15, 1.0)
-"""A picture shows an object if its distance from the path is at most the largest of three distances: a multiple of the
-distance within which the first share of the objects lies, a share of the diagonal of the path's bounding box, and a length,
-m. At 0.15 of the diagonal, a lone object beside a square path adds a fifth to the area. Larger values show more far objects
-and shrink the rest of the map."""
+"""A picture shows an object if its distance from the path is at most the largest of three distances. The first is
+`_FENCE[0]` times the distance within which the share `_MOST` of the objects lies. The second is the share `_FENCE[1]` of the
+diagonal of the path's bounding box. The third is `_FENCE[2]` (m). At 0.15 of the diagonal, a lone object beside a square
+path adds a fifth to the area. Larger values show more far objects and shrink the rest of the map."""
 
 
 def ray_kinds(result: RunResult) -> dict[RayKind, Bools]:

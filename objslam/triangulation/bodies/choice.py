@@ -17,8 +17,9 @@ _EQUAL = 1.0
 """The prior of the shares of shapes weighs as much as this number of things of each shape. With a larger number, the other
 things of a log say less about the shape of one."""
 _MOST = 6.0
-"""The other things of a label, and those of a log, count as at most this number. If their true shape is not among those that
-are tried, all err alike, so a hundred tell little more than a few. With a larger number, the shape of one thing is surer."""
+"""The other things of a label count as at most this number of things, and so do the other things of a log. If their true
+shape is not among the tried shapes, all of them have the same error, so a hundred tell little more than a few. With a larger
+number, the shape of one thing is surer."""
 _REPEATS = 20
 """How often `with_shares_of_shapes` repeats its expectation. More are slower and change little."""
 
@@ -28,9 +29,10 @@ def log_evidence(
 ) -> Floats:
     """Return the logarithm of the evidence (N,) of a fit.
 
-    side: (B,) px, half the length of the image, the range of a measurement that the shape does not explain. free: (B, 4)
-    which shifts and sizes a point does not explain. None for other shapes, which explain all but the bounds that they reach
-    beyond. Boxes from one direction share an error, so together they count as one measurement.
+    side: (B,) px, half the length of the image. A measurement that the shape does not explain is uniform over this length.
+    free: (B, 4) the shifts and sizes that a point does not explain, None for other shapes. Other shapes explain all
+    measurements except bounds that the body reaches. Boxes from one direction share an error, so together they count as one
+    measurement.
     """
     now, spread, worth = fit.found, weights.spread[:, :4], np.minimum(weights.spread**2 / weights.variance, 1.0)[:, :4]
     unexplained = now.use[:, :4] == 0 if free is None else free
@@ -46,7 +48,7 @@ def log_evidence(
 
 
 def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
-    """Return the logarithm of the evidence (S, N), with that of how usual each shape is among the other things of the log.
+    """Return the logarithm of the evidence (S, N), plus the logarithm of the share of each shape among the other things.
 
     One thing often hardly tells an ellipsoid from a cylinder. But things of one label are alike, and so are the things of a
     room. The shares of the shapes are those of the other things of the label. Their prior is the shares in the whole log,
@@ -73,7 +75,8 @@ def _told(number: Floats) -> Floats:
 
 
 def shapes_disagree(evidence: Floats, axes: Floats, chosen: Ints) -> Floats:
-    """Return by how much the shapes that fit about as well differ from the chosen ones, as covariances (N, A, A).
+    """Return the covariances (N, A, A) that show how much bodies of other shapes, weighted by their evidence, differ from
+    the chosen bodies.
 
     evidence: (S, N) the logarithm of the evidence of each shape. axes: (S, N, A) centres and half axes, m, of the bodies of
     each shape, NaN for what a shape does not tell. chosen: (N,). The result is the second moment about the chosen shape: a

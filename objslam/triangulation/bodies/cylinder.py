@@ -19,7 +19,8 @@ _FLAT = 1e-12
 
 
 def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the support of cylinders (see `shapes.Kind`): that of the section and that of the height together.
+    """Return the support of cylinders (see `shapes.Kind`). It is the sum of the supports of the horizontal section and of
+    the vertical axis.
 
     The support of a sum of two sets is the sum of their supports (Schneider 2014, Convex Bodies, section 1.7).
     """

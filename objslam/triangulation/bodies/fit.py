@@ -16,10 +16,10 @@ from objslam.triangulation.bodies.shapes import PARAMETERS, Kind
 _ITERATIONS = 40
 """The most steps of a fit. Ten are usual. More steps are slower."""
 STILL = 1e-9
-"""The fit of a body goes on if a step decreases the cost by at least this. The cost is half the sum of squared deviations.
-The decrease is that of the linear model of a step. A larger value ends sooner."""
+"""The fit of a body goes on as long as the linear model of a step predicts a decrease of the cost by at least this. The cost
+is half the sum of squared deviations. A larger value ends sooner."""
 ENOUGH = 1e-3
-"""`STILL` for a fit that chooses a shape: it ends when a step would lower the cost by less. A larger value ends sooner."""
+"""This limit replaces `STILL` in a fit that only chooses a shape. A larger value ends sooner."""
 STEPS = 12
 """The most steps of a fit that chooses a shape. A fit of the right shape needs fewer. More steps are slower."""
 _UPHILL = 1e-3

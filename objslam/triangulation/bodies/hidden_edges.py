@@ -21,11 +21,12 @@ from objslam.triangulation.bodies.shapes import CUBOID, KINDS, Kind
 from objslam.triangulation.bodies.shared import effective_variance, sides_of, spread_of
 
 _OUTER = 0.05
-"""The weight of an edge that the outer body reaches beyond, as a share of its weight if the body does not reach it. With a
-smaller weight, the outer body goes around the noise of more edges. With a larger one, hidden edges make it smaller."""
+"""The outer body may reach beyond an edge. Then the edge counts with this share of its usual weight. With a smaller share,
+the outer body grows around the noise of more edges. With a larger share, hidden edges make the outer body too small."""
 _CLEAR = 2.0
 """An edge may be hidden if the body reaches beyond it by this number of standard deviations. The evidence decides whether it
-is. With a larger number, bodies still bend to hidden edges. With a smaller one, noise hides the others."""
+is. With a larger number, bodies still bend to some hidden edges. With a smaller number, noise makes more visible edges count
+as hidden."""
 _TURNS = 5
 """How often hidden edges and the body without them are found in turns. Two to four are usual. More are slower."""
 

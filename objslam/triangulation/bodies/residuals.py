@@ -21,8 +21,9 @@ ROWS = 5
 _LEAST = 1e-9
 """The least length (m) of a divisor. A larger length distorts small bodies."""
 _ALONG = np.linspace(0.125, 1.0, 8)[:, None]
-"""Where points lie on a straight side of a body, as shares of its length. More points find more exactly where a box touches
-the side in a distorted image. With these, the error is below 0.1 px for a side that is 60 degrees long."""
+"""The places of the points that are tried on a straight side of a body, as shares of its length. More points find more
+exactly where a box touches the side in a distorted image. With these 8 points, the error is below 0.1 px for a side that is
+60 degrees long."""
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,9 @@ WITHIN = 0.7
 """The correlation between the errors of two boxes from one side, whose directions differ by 10 degrees on average. So the
 mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
 _ALONG = 1.0
-"""The change of the error of a side over a distance that is larger by the factor e, in standard deviations of this error.
-With a larger change, the growth of boxes tells less about the distance."""
+"""The error of a side changes with the distance. This is the standard deviation of the change from a distance to e times
+this distance, in standard deviations of the error. With a larger change, the growth of boxes tells less about the
+distance."""
 _BEYOND = 0.5
 """The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. It is that of
 lengths between 0 and 0.9 of the size. A larger share makes objects that something hides less sure."""

@@ -55,9 +55,9 @@ class Bodies:
     is (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share: (2,) the standard deviations of the
     errors of shift and size that boxes of one side share, as shares of half their size. factors: (2,) on the nominal noise
     of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus that to the centre of its
-    predicted box, in map. It is 0 for a point. hidden: (B, 2) how many edges of each axis something hides a part beyond.
-    between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over
-    the shapes, about the chosen one. It is not in `covariance`.
+    predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on each axis, as in `hidden_edges`.
+    between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes, about the chosen one. It is not
+    in `covariance`.
     """
 
     values: Floats
@@ -135,8 +135,8 @@ def solve_bodies(
 
     names: the label of each object. side: (B,) px, half the length of the image. share: the prior of `Bodies.share`. learn:
     whether the share and the noise are estimated. sizes: known length, width and height, m, by label. bent: whether the
-    images are distorted, so that `measure` depends on the points. Edges that something hides a part beyond are found in each
-    round, and are bounds in the next one (`hidden_edges`).
+    images are distorted, so that `measure` depends on the points. Each round finds the edges beyond which a part of the body
+    is hidden. These edges are bounds in the next round (`hidden_edges`).
     """
     edges = measure(None)
     sides = sides_of(edges, points)

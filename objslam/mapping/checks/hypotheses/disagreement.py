@@ -45,8 +45,8 @@ def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | Non
     message = (
         f"only {100 * found.share:.0f} % of the boxes agree with the poses, hardly more than with a camera that is turned "
         "at random, and no usual mistake explains that: look at base_T_camera, at the frame of the poses and at the "
-        "stamps, and ask whether the poses are of this drive, or err by far more than localization.xy, or the depths by far "
-        "more than depth.sigma_per_m"
+        "stamps. Perhaps the poses are of another drive, or they err by far more than localization.xy, or the depths err by "
+        "far more than depth.sigma_per_m"
     )
     if unset(part.log):
         message += ". base_T_camera has no rotation, so the camera looks where z of the poses points"

@@ -19,10 +19,10 @@ take longer."""
 _SQUARES = (320, 416, 512, 640)
 """The sides (px) of square images that detectors often use. More sides take longer."""
 _CLIPPED, _AT_EDGE = 0.05, 1.0
-"""A detector clips boxes at the right and the lower edge of the image. So boxes are in px of the calibration's images if at
-least the share `_CLIPPED` of them ends within `_AT_EDGE` (px) of an edge, and hardly any box ends beyond it. In another
-unit, boxes end there by chance only. With a larger share, more wrong sizes are tried. With a larger distance, fewer are
-tried."""
+"""A detector clips boxes at the right and the lower edge of the image. Two facts show that boxes are in px of the
+calibration's images: at least the share `_CLIPPED` of the boxes ends within `_AT_EDGE` (px) of an edge, and hardly any box
+ends beyond it. In another unit, boxes end there only by chance. With a larger share, more wrong sizes are tried. With a
+larger distance, fewer are tried."""
 _CLOCK = np.concatenate([-np.arange(0.5, 6.1, 0.5), np.arange(0.5, 6.1, 0.5)])
 """The tried clock offsets (s). `small_errors` finds smaller offsets."""
 
@@ -88,7 +88,7 @@ def _boxed(change: Callable[[Floats, Camera], Floats]) -> Callable[[Log], Log]:
 
 
 def _images() -> Iterator[Hypothesis]:
-    """Yield the hypotheses that keep the unit of boxes: the images were turned before detection, or x and y are swapped."""
+    """Yield the hypotheses that boxes are mirrored, turned by 180 degrees, or have x and y swapped."""
     what, cause = "the boxes mirrored", "the images were mirrored before detection"
     yield Hypothesis("image mirrored", what, cause, _boxed(_mirrored))
     what, cause = "the boxes turned by 180 degrees", "the camera or its images are upside down"

@@ -20,7 +20,7 @@ _CROWD = 1.4
 """In a larger crowd (`Part.crowd`) than this, rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9. With a
 larger value, fewer logs need the larger limits below."""
 _CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
-"""`_TIMES` and `_MORE` in a crowd. Larger values name fewer causes."""
+"""In a crowd, these values replace `_TIMES` and `_MORE`. Larger values name fewer causes."""
 _MORE_BOXES = 25
 """The least number of additional boxes that must fit. A larger number needs longer logs."""
 _CROOKED, _STRAIGHT = 0.62, 0.85
@@ -71,7 +71,7 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
 
     def corrected() -> Iterator[Log]:
         for number, hypothesis in enumerate(every):
-            progress("what-ifs about the input", number, len(every))
+            progress("possible corrections of the input", number, len(every))
             logs.append(hypothesis.put_right(part.log))
             yield logs[-1]
 
@@ -160,8 +160,8 @@ def _shift(trial: Trial) -> float:
 def _of_another_drive(first: Trial, best: Trial) -> Finding:
     """Return the finding of a log whose boxes fit better at other times. best: the best trial with another clock."""
     message = (
-        f"only {100 * first.share:.0f} % of the boxes agree with the poses. With earlier stamps of the frames, and as well "
-        f"with later ones, up to {100 * best.share:.0f} % do, so no error of the clock explains it: the poses may be of "
+        f"only {100 * first.share:.0f} % of the boxes agree with the poses. Earlier and later stamps of the frames both "
+        f"raise this share, to up to {100 * best.share:.0f} %, so no error of the clock explains it: the poses may be of "
         "another drive than the boxes"
     )
     return Finding("boxes disagree", message, basis="boxes")

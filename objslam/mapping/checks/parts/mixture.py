@@ -7,7 +7,8 @@ from objslam.mapping.checks.agreement import Agreement, Part
 from objslam.mapping.checks.finding import Finding
 
 _RAYS, _FRAMES = 3, 40
-"""The fewest rays of a judged frame, and the fewest such frames. Fewer rays may all fit, or all miss, by chance."""
+"""A frame is judged if it has at least `_RAYS` rays, and a log if it has at least `_FRAMES` such frames. Fewer rays may all
+fit, or all miss, by chance. With larger numbers, fewer logs are judged."""
 _BAD, _GOOD = 0.34, 0.67
 """A frame is bad up to the first share of fitting rays, and good from the second on. Values farther apart find fewer mixed
 logs."""

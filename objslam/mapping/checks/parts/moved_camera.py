@@ -37,8 +37,9 @@ _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
 deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer
 turns."""
 _MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
-"""`_MOVED` for poses by odometry, and the least growth of the score (`Agreement.score`) by a turn. Drift looks like a
-rotation, and is not in the standard deviations. Larger values warn less often."""
+"""For poses by odometry, `_MOVED_BY_ODOMETRY` (rad) replaces `_MOVED`, and a turn must also let the score
+(`Agreement.score`) grow by `_GAIN_BY_ODOMETRY`. The reason is drift: it looks like a rotation of the camera, and the
+standard deviations do not contain it. Larger values warn less often."""
 
 
 def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Finding]:
