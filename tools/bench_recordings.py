@@ -4,7 +4,7 @@
 
 named: UTIAS MRCLAM 6 and 7 (15 landmarks, the odometry of wheels) and Lost in the Woods (17 posts, one observation a
 second), each landmark with a label of its own, from bearings and with ranges. short: parts of the MRCLAM drives of two to
-five minutes. poses: the MRCLAM drives at the poses of the motion capture, from bearings. cube: a cabinet of TUM fr3 at the
+five minutes. poses: whole drives at the poses of the motion capture. cube: a cabinet of TUM fr3 at the
 poses of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with
 ranges, and one label for all landmarks.
 
@@ -133,24 +133,25 @@ def short(data: Path, only: str, overrides: list[str]) -> None:
 
 
 def poses(data: Path, only: str, overrides: list[str]) -> None:
-    """Landmarks of the MRCLAM drives at the poses of the motion capture, without range and without an alignment."""
-    print("whole drives, fixed at the poses of the motion capture, bearings only")
+    """Landmarks of whole drives at the poses of the motion capture, without an alignment: fixed, and joint with odometry."""
+    print("whole drives at the poses of the motion capture")
     print(
-        f"{'drive':<7}{'right':>7}{'false':>7}{'missed':>8}{'RMSE m':>8}{'inside 95 %':>13}{'median Mahalanobis^2':>22}"
-        f"{'s':>7}"
+        f"{'drive':<7}{'mode':>6}{'range':>7}{'right':>7}{'false':>7}{'missed':>8}{'RMSE m':>8}{'inside 95 %':>13}"
+        f"{'median Mahalanobis^2':>22}{'s':>7}"
     )
-    for name, log in drives(data, only, False):
-        if name == "woods":
-            continue
-        assert log.truth is not None
-        result, seconds = solve(replace(log, localization=log.truth.trajectory, odometry=None), ["mode=fixed", *overrides])
-        found = judged(log, result, align="none")
-        inside = f"{round(found['inside_95_3d'] * found['matched'])} of {found['matched']}"
-        print(
-            f"{name:<7}{found['matched']:7d}{found['false']:7d}{found['missed']:8d}{found['position_rmse']:8.3f}{inside:>13}"
-            f"{found['mahalanobis_median']:22.2f}{seconds:7.1f}",
-            flush=True,
-        )
+    for mode, ranged in (("fixed", False), ("fixed", True), ("joint", False), ("joint", True)):
+        for name, log in drives(data, only, ranged):
+            assert log.truth is not None
+            odometry = log.odometry if mode == "joint" else None
+            localized = replace(log, localization=log.truth.trajectory, odometry=odometry)
+            result, seconds = solve(localized, [f"mode={mode}", *overrides])
+            found = judged(log, result, align="none")
+            inside = f"{round(found['inside_95_3d'] * found['matched'])} of {found['matched']}"
+            print(
+                f"{name:<7}{mode:>6}{'yes' if ranged else 'no':>7}{found['matched']:7d}{found['false']:7d}{found['missed']:8d}"
+                f"{found['position_rmse']:8.3f}{inside:>13}{found['mahalanobis_median']:22.2f}{seconds:7.1f}",
+                flush=True,
+            )
 
 
 def cube(data: Path, overrides: list[str]) -> None:
