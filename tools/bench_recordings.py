@@ -4,9 +4,9 @@
 
 named: UTIAS MRCLAM 6 and 7 (15 landmarks, the odometry of wheels) and Lost in the Woods (17 posts, one observation a
 second), each landmark with a label of its own, from bearings and with ranges. short: parts of the MRCLAM drives of two to
-five minutes. poses: whole drives at the poses of the motion capture. cube: a cabinet of TUM fr3 at the
-poses of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with
-ranges, and one label for all landmarks.
+five minutes. poses: whole drives at the poses of the motion capture. cube: a cabinet of TUM fr3 at the poses of the motion
+capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with ranges, and one label
+for all landmarks.
 
 Maps from odometry are compared after SE(2) alignment. The truth is inside a 95 % ellipsoid in 95 % of the cases, if the
 covariances are right. Times are of the processor, for the map alone.
@@ -148,8 +148,8 @@ def poses(data: Path, only: str, overrides: list[str]) -> None:
             found = judged(log, result, align="none")
             inside = f"{round(found['inside_95_3d'] * found['matched'])} of {found['matched']}"
             print(
-                f"{name:<7}{mode:>6}{'yes' if ranged else 'no':>7}{found['matched']:7d}{found['false']:7d}{found['missed']:8d}"
-                f"{found['position_rmse']:8.3f}{inside:>13}{found['mahalanobis_median']:22.2f}{seconds:7.1f}",
+                f"{name:<7}{mode:>6}{'yes' if ranged else 'no':>7}{found['matched']:7d}{found['false']:7d}"
+                f"{found['missed']:8d}{found['position_rmse']:8.3f}{inside:>13}{found['mahalanobis_median']:22.2f}{seconds:7.1f}",
                 flush=True,
             )
 
