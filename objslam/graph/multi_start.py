@@ -26,6 +26,9 @@ two with twice of it. Two of the three graphs may end in one wrong minimum, so b
 _SAME = 0.1
 """Two solutions are in one minimum if no landmark differs by more than this share of the size of the map. In wrong minima of
 real drives, some landmark differs by a third of it or more. A larger share compares fewer solutions."""
+_MOST_RAYS = 6000
+"""Logs with more rays begin at one graph only. They are drives of more than a quarter of an hour, which see landmarks again
+and again, and no wrong minimum was found in them. A larger number makes long logs slower."""
 _CLEARLY = 3.0
 """Another start is better than the first one if its misfit is smaller by this number, as twice a logarithm of odds. A larger
 value changes the start more rarely."""
@@ -48,11 +51,11 @@ class MultiStart:
         """Return the solution with the least misfit: `found`, or one that begins at another growing graph.
 
         Ranges determine a position at once. So if at least half of the objects have one, or if there are fiducials, the
-        first solution is returned.
+        first solution is returned. The same holds for a log with many rays (`_MOST_RAYS`).
         """
         rays, object_ = self.measured.rays, self.association.object
         ranged = np.unique(object_[np.isfinite(rays.range) & (object_ >= 0)])
-        if self.measured.tags is not None or 2 * len(ranged) >= self.association.count:
+        if self.measured.tags is not None or 2 * len(ranged) >= self.association.count or len(rays) > _MOST_RAYS:
             return found
         solutions, traces = [found], [trace]
         for factor in _PARALLAX:
