@@ -35,10 +35,10 @@ def without_phantoms(state: JointState) -> JointState:
     """Return the state without objects that make the rays worse `explained`, else the state itself.
 
     If headings err for seconds, a ray to one thing passes its neighbours. Rays to several things then meet at points without
-    a thing, and a solve bends the path until they agree. Each ray then fits, so no round of association frees it. Here one
-    object after the other is taken out of the map. The path that is most likely without the object gives its rays to other
-    objects. If the log is then explained better, the object was a phantom. The best such step is taken first, and the objects
-    that were not worse are tried again. The shared errors and the noise stay in these trials.
+    a thing, and a solve bends the path until they agree. Each ray then fits, so no round of association frees it. Here each
+    object is taken out of the map in turn. The most likely path without the object gives its rays to other objects. If this
+    explains the log better, the object is a phantom. The phantom whose loss explains the log best is dropped, and the other
+    phantoms are tried again. The shared errors and the noise stay in these trials.
     """
     assert state.association is not None
     best = replace(state.attempt(), hold=state.errors is not None)
