@@ -207,10 +207,10 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         residual_before=residual_before,
         views=with_given_stamps(solved_views(log, settings, path_after), given),
     )
-    wrong = "the localisation errs for seconds" if late is not None else ""
+    why = "the localisation errs for seconds" if late is not None else ""
     if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
-        wrong = "no object has a place at the localised poses"
-    return result, wrong
+        why = "no object has a place at the localised poses"
+    return result, why
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.mapping.moves.relocalization import relocalize
+from objslam.mapping.relocalization import relocalize
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Ints
@@ -59,8 +59,10 @@ def without_phantoms(state: JointState) -> JointState:
         return state
     assert best.association is not None
     assert best.estimate is not None
-    best = replace(best, hold=state.hold)
-    return state.better(best.alternated(best.estimate.map_T_base, (best.association, best.estimate.positions)))
+    guess = best.association, best.estimate.positions
+    # Without an association, the first round is solved also if it agrees with the guess, which still lists the phantoms.
+    rounds = replace(best, hold=state.hold, association=None).alternated(best.estimate.map_T_base, guess)
+    return state.better(rounds)
 
 
 def _candidates(state: JointState) -> Ints:
