@@ -36,6 +36,7 @@ from objslam.mapping.labels import (
     shows_second_object,
     warn_of_noise,
 )
+from objslam.mapping.moves.phantoms import has_lasting_errors, without_phantoms
 from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
@@ -84,6 +85,8 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     if start is not None or state.keyframes.localized_every:
         found = _improved(_from_start(state, start), JointState.relocalized)
         state = _or_as_in_fixed_mode(state, found) if start is None else found
+        if has_lasting_errors(state):
+            state = without_phantoms(_anew(state.split()))
     else:
         begin = _with_turns(state)
         start, sure = explored(begin)
@@ -189,6 +192,15 @@ def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
     attempt = begin.attempt().counted(found).solve("association", found)
     assert attempt.estimate is not None
     return state.better(attempt.alternated(attempt.estimate.map_T_base, (found, attempt.estimate.positions)))
+
+
+def _anew(state: JointState) -> JointState:
+    """Return the state after rounds that begin without an association, at the solved poses, if they explain the log better.
+
+    The first association was at poses that err. The rounds keep its objects as long as they have enough rays."""
+    assert state.estimate is not None
+    attempt = replace(state.attempt(), association=None)
+    return state.better(attempt.alternated(state.estimate.map_T_base, None))
 
 
 def _improved(state: JointState, step: Callable[[JointState], JointState]) -> JointState:

@@ -56,28 +56,28 @@ def run(
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
     With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
-    it has odometry too.
+    it has odometry too. So is a log with localised poses at which no object has a place.
     known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
     LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path.
     SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
-    result, poses_err = _run(log, settings, ledger, progress, known)
-    if settings.mode != "auto" or not poses_err or chosen_poses(log, settings).odometry is None:
+    result, wrong = _run(log, settings, ledger, progress, known)
+    if settings.mode != "auto" or not wrong or chosen_poses(log, settings).odometry is None:
         return result
     at_poses = ledger.copy()
     ledger.restore(before)  # What a run drops counts once.
-    ledger.warn("the localisation errs for seconds, so the poses are solved too (--mode fixed keeps them)")
+    ledger.warn(f"{wrong}, so the poses are solved too (--mode fixed keeps them)")
     try:
         return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known)[0]
     except SolveError as error:  # The map at the given poses is better than none.
         ledger.restore(at_poses)
-        ledger.warn(f"the localisation errs for seconds, but the poses cannot be solved too: {error}")
+        ledger.warn(f"{wrong}, but the poses cannot be solved too: {error}")
         return result
 
 
-def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known: PriorMap | None) -> tuple[RunResult, bool]:
-    """Map the objects of a log as `run` does, in one mode. Also return whether given poses err for seconds."""
+def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known: PriorMap | None) -> tuple[RunResult, str]:
+    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, else ""."""
     given = log = chosen_poses(log, settings)
     unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
@@ -207,7 +207,10 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         residual_before=residual_before,
         views=with_given_stamps(solved_views(log, settings, path_after), given),
     )
-    return result, late is not None
+    why = "the localisation errs for seconds" if late is not None else ""
+    if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
+        why = "no object has a place at the localised poses"
+    return result, why
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

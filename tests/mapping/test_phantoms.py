@@ -1,0 +1,70 @@
+"""Equal things in groups at a localisation whose headings err for seconds, so that rays of several things meet."""
+
+from dataclasses import replace
+
+import numpy as np
+from test_lasting_errors import with_lasting
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Log
+from objslam.evaluation.evaluate import evaluate
+from objslam.mapping import joint_solve, pipeline
+from objslam.simulation import DriveSettings, PoseNoise, simulate
+
+MIDDLES = ((-2.0, 1.5), (2.2, 1.2), (0.3, -2.2), (-0.5, 2.4))
+QUIET = ("mode=joint", "checks.use=false", "bodies.use=false", "output.recording=false")
+
+
+def drive(seed: int) -> Log:
+    """Five minutes between four pairs of equal things, each pair 0.25 m apart."""
+    rng, placed = np.random.default_rng(100 + seed), []
+    for x, y in MIDDLES:
+        angle = rng.uniform(0, np.pi)
+        placed += [("thing", (x + 0.25 * k * np.cos(angle), y + 0.25 * k * np.sin(angle), 0.3)) for k in range(2)]
+    settings = DriveSettings(
+        name="pairs",
+        room=(8.0, 8.0),
+        frames=300,
+        frame_rate=1.0,
+        speed=0.3,
+        objects=0,
+        placed=tuple(placed),
+        pixel_sigma=2.0,
+        missed=0.1,
+        odometry=Odometry(),
+        localization=PoseNoise(xy=0.01, yaw=0.002),
+        max_range=5.0,
+    )
+    return simulate(settings, seed)
+
+
+def turned(log: Log, seed: int) -> Log:
+    """The log with headings that err by 3 degrees for 20 s at a time. Places stay."""
+    path = log.localization
+    bad = with_lasting(log, np.radians(3.0) / 0.005, 20.0, seed).localization.poses
+    bad[:, :3, 3] = path.poses[:, :3, 3]
+    return replace(log, localization=replace(path, poses=bad))
+
+
+def mapped(log: Log) -> tuple[int, int, int]:
+    """The numbers of right, false and missed objects. A right one is within 0.3 m of its thing."""
+    found = evaluate(pipeline.run(log, load_settings(None, QUIET), Ledger()).map, log.truth, None, align="none", radius=0.3)
+    told = found.to_dict()
+    return told["matched"], told["false"], told["missed"]
+
+
+def test_no_objects_are_left_where_rays_of_several_things_meet(monkeypatch):
+    """Without the search for phantoms, the map of this drive has them, although each ray fits its object."""
+    log = turned(drive(4), 4)
+    assert mapped(log) == (8, 0, 0)
+    monkeypatch.setattr(joint_solve, "has_lasting_errors", lambda state: False)
+    assert mapped(log)[1] > 0
+
+
+def test_a_good_localisation_takes_no_time_for_phantoms(monkeypatch):
+    def searched(state):
+        raise AssertionError("phantoms were searched")
+
+    monkeypatch.setattr(joint_solve, "without_phantoms", searched)
+    assert mapped(drive(0)) == (8, 0, 0)
