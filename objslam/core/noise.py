@@ -65,6 +65,12 @@ class NoiseFactors:
         }
         return nominal.model_copy(update={"odometry": of.model_copy(update=odometry)})
 
+    @property
+    def lasting_factors(self) -> tuple[float, float]:
+        """The factors on `localization.yaw` and `localization.xy` of the errors that last for seconds."""
+        (turned, moved) = self.lasting
+        return self.heading * turned.share**0.5, self.place * moved.share**0.5
+
     def rays_with_noise(self, nominal: Rays) -> Rays:
         """Return rays whose noise of directions and ranges is multiplied by the factors."""
         if self.rays == self.ranges == self.range_bias == 1:

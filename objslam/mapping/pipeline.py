@@ -39,6 +39,7 @@ from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasti
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
+from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.progress import Progress
 from objslam.mapping.refuted import without_refuted
 from objslam.mapping.solution import seen_something, with_jumps
@@ -147,9 +148,12 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         calibrated, held = estimate.calibration is not None, (keyframes, solution.rays, solution.association)
         noisy = check_pose_noise(objects, *held, settings, calibrated=calibrated)
         missing = noisy or check_residuals(objects, *held, residual, settings, calibrated=calibrated)
-        late = None if lasting is None else check_lasting_noise(lasting, settings)
+        late = None if lasting is None else check_lasting_noise(lasting, settings, given)
         missing = missing or late
         diagnosis = diagnosis.with_findings([missing] if missing else [])
+        say(diagnosis, ledger)
+    if settings.checks.use and settings.mode == "joint" and (near := check_neighbours(solution, settings)) is not None:
+        diagnosis = diagnosis.with_findings([near])
         say(diagnosis, ledger)
     used = keyframes, solution.rays, solution.association
     solved = estimate.map_T_base @ keyframes.base_T_camera

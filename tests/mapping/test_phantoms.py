@@ -10,6 +10,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import joint_solve, pipeline
+from objslam.mapping.moves.phantoms import NEIGHBOURS
 from objslam.simulation import DriveSettings, PoseNoise, simulate
 
 MIDDLES = ((-2.0, 1.5), (2.2, 1.2), (0.3, -2.2), (-0.5, 2.4))
@@ -68,3 +69,12 @@ def test_a_good_localisation_takes_no_time_for_phantoms(monkeypatch):
 
     monkeypatch.setattr(joint_solve, "without_phantoms", searched)
     assert mapped(drive(0)) == (8, 0, 0)
+
+
+def test_equal_things_that_are_nearer_than_the_poses_err_are_named():
+    def names(log: Log) -> list[str]:
+        settings = load_settings(None, ("mode=joint", "bodies.use=false", "output.recording=false"))
+        return [one["name"] for one in pipeline.run(log, settings, Ledger()).summary["wrong_input"]]
+
+    assert NEIGHBOURS in names(turned(drive(4), 4))
+    assert names(drive(0)) == []

@@ -15,11 +15,13 @@ from objslam.core.geometry import is_planar
 from objslam.core.ground.flattening import flattened_lines, flattened_points, raised_points
 from objslam.core.ground.rise import rise_of
 from objslam.core.rotation import cross
+from objslam.core.types import Log
 from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, noise_up
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.fixed.lasting_noise import TIMES, Cells, LastingNoise, lasting_variances
+from objslam.mapping.fixed.odometry_witness import odometry_contradicts
 from objslam.mapping.solution import Solution
 
 _CELL = 1.0
@@ -32,6 +34,9 @@ _LARGE = 1.0
 """A run at given poses warns of errors of the poses that last for seconds, if they are at least this multiple of the noise
 `localization`. At 1, the lasting errors alone are as large as all errors together should be. A larger value warns less
 often."""
+_LARGE_WITH_ODOMETRY = 0.75
+"""The same multiple if the odometry also says that the poses err for seconds. Two witnesses need less each: false objects
+take up a part of the errors, so the boxes show too small errors. A larger value warns less often."""
 _FEWEST = 3
 """A run warns of such errors only if at least this number of objects show them. Boxes of one object lie beside it in the
 same way for seconds, so one object tells little of the poses. A larger number warns less often."""
@@ -75,14 +80,17 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> tuple[Solutio
     return replace(solution, estimate=wider), noise
 
 
-def check_lasting_noise(noise: LastingNoise, settings: Settings) -> Finding | None:
+def check_lasting_noise(noise: LastingNoise, settings: Settings, log: Log) -> Finding | None:
     """Return a finding if errors of given poses last for seconds, and are larger than the settings say.
 
     All rays of these seconds miss their objects to the same side, so an object can become two. The covariances of the map
-    contain these errors.
+    contain these errors. log: its odometry is a second witness.
     """
     said = settings.localization
-    if noise.objects < _FEWEST or (noise.yaw < _LARGE * said.yaw and noise.xy < _LARGE * said.xy):
+    size = max(noise.yaw / max(said.yaw, 1e-12), noise.xy / max(said.xy, 1e-12))
+    if noise.objects < _FEWEST or size < _LARGE_WITH_ODOMETRY:
+        return None
+    if size < _LARGE and not odometry_contradicts(log, settings):
         return None
     return Finding(
         LASTING,
