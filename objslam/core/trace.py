@@ -89,6 +89,10 @@ class Trace:
         """Add the iterations of an attempt that succeeded."""
         self._iterations += attempt._iterations
 
+    def replace(self, attempt: Trace) -> None:
+        """Take the iterations of an attempt instead of those since the end of the previous round."""
+        self._iterations = list(attempt._iterations)
+
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:
         """End a round. It gets all iterations since the end of the previous round."""
         iterations, self._iterations = tuple(self._iterations), []

@@ -76,7 +76,7 @@ class MultiStart:
             return found
         chosen = traces[best]
         if trace is not None and chosen is not None:
-            trace.take(chosen)
+            trace.replace(chosen)
         return solutions[best]
 
 

@@ -121,7 +121,7 @@ def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
     extent: (2,) m, width and height of the object. share: the standard deviation of an offset, as a share of the size.
     """
     by_side = np.einsum("cik,cd,djk->ij", sides.pull, sides.alike, sides.pull)
-    return np.asarray(share**2 * (by_side + np.nan_to_num(extent.prod()) * np.eye(3)))
+    return np.asarray(share**2 * ((by_side + by_side.T) / 2 + np.nan_to_num(extent.prod()) * np.eye(3)))
 
 
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:

@@ -36,7 +36,7 @@ from objslam.mapping.labels import (
     shows_second_object,
     warn_of_noise,
 )
-from objslam.mapping.moves.phantoms import has_lasting_errors, without_phantoms
+from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
 from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
@@ -83,9 +83,10 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
 def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve from a known start, or from an exploration of the log."""
     if start is not None or state.keyframes.localized_every:
+        doubtful = begins_with_lasting_errors(state)
         found = _improved(_from_start(state, start), JointState.relocalized)
         state = _or_as_in_fixed_mode(state, found) if start is None else found
-        if has_lasting_errors(state):
+        if doubtful or has_lasting_errors(state):
             state = without_phantoms(_anew(state.split()))
     else:
         begin = _with_turns(state)

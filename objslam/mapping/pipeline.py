@@ -118,6 +118,7 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.
         spoilt = diagnosis.spoilt and settings.mode == "fixed"
         errors = None if spoilt else shared_errors(log, *seen_something(frames, rays), settings)
+        before = None if spoilt else shared_errors(log, frames, rays, settings)
         try:
             solution = solve(frames, rays, cameras, settings, ledger, of_solve, errors=errors)
         except SolveError:
@@ -152,7 +153,11 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         missing = missing or late
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
-    if settings.checks.use and settings.mode == "joint" and (near := check_neighbours(solution, settings)) is not None:
+    if (
+        settings.checks.use
+        and settings.mode == "joint"
+        and (near := check_neighbours(solution, before, settings)) is not None
+    ):
         diagnosis = diagnosis.with_findings([near])
         say(diagnosis, ledger)
     used = keyframes, solution.rays, solution.association
@@ -174,14 +179,14 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
     assert path is not None  # Without a path, build_keyframes raises LogError.
     path_after = _path_after(log, path, keyframes, estimate.map_T_base, settings)
     residual_before = None if errors is None else uncorrected_residual(errors, solution, path_after)
-    surface, before = None, None
+    surface, surface_before = None, None
     if settings.reconstruction.use and any(c.depth is not None for c in log.cameras):
         from objslam.mapping.reconstruction import reconstruct  # Few logs have depth images.
 
         with _stage("reconstruction", seconds, progress):
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:
-                before = reconstruct(log, path, settings, Ledger(), progress)  # The first call counted the drops.
+                surface_before = reconstruct(log, path, settings, Ledger(), progress)  # The first call counted the drops.
     found = [c.detections for c in log.cameras if c.detections is not None]
     counts = {
         "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
@@ -207,7 +212,7 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         path_after=path_after,
         images=tuple(c.rgb for c in log.cameras),
         surface=surface,
-        surface_before=before,
+        surface_before=surface_before,
         residual_before=residual_before,
         views=with_given_stamps(solved_views(log, settings, path_after), given),
     )

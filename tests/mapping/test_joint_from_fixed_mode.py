@@ -44,9 +44,7 @@ def tables(seed: int, factor: float, seconds: float) -> Log:
 @pytest.mark.parametrize(
     ("seed", "factor", "seconds"),
     [
-        # Things 0.4 m apart exchange rays, and the largest error depends on chance: it was 0.34 m before the lens was
-        # estimated, and is 0.52 m now.
-        pytest.param(0, 4.0, 3.0, marks=pytest.mark.xfail(reason="an object is 0.52 m off", strict=False)),
+        (0, 4.0, 3.0),
         (10, 3.5, 2.5),
     ],
 )

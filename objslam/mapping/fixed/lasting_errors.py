@@ -21,7 +21,7 @@ from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, n
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.fixed.lasting_noise import TIMES, Cells, LastingNoise, lasting_variances
-from objslam.mapping.fixed.odometry_witness import odometry_contradicts
+from objslam.mapping.moves.odometry_witness import odometry_contradicts
 from objslam.mapping.solution import Solution
 
 _CELL = 1.0

@@ -1,4 +1,4 @@
-"""Changes to a solved map that rounds of association and solve do not find.
+"""Changes to a solved map that rounds of association and solve do not find, and the reasons to look for them.
 
-They drop objects where rays of several things meet, because the poses err.
+Objects where rays of several things meet, because the poses err, are dropped. The odometry tells whether the poses err.
 """

@@ -9,11 +9,13 @@ import numpy as np
 
 from objslam.core.statistics import grouped_median
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.moves.odometry_witness import lasting_by_odometry, lasting_long
 from objslam.mapping.relocalization import relocalize
 
 if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.arrays import Ints
+    from objslam.frontend.shared_errors import SharedErrors
     from objslam.mapping.joint_alternation import JointState
     from objslam.mapping.solution import Solution
 
@@ -33,39 +35,47 @@ and a solve. A larger number finds more phantoms in large maps, and takes longer
 
 
 def has_lasting_errors(state: JointState) -> bool:
-    """Return whether the last solve found that the localisation errs for seconds, while odometry tells the motions."""
+    """Return whether the noise of the state says that the localisation errs for seconds, and odometry tells the motions."""
     if state.errors is None or not state.keyframes.localized_every or state.keyframes.odom_T_base is None:
         return False
     return bool(max(state.errors.noise.lasting_factors) >= _LARGE)
 
 
-def check_neighbours(solution: Solution, settings: Settings) -> Finding | None:
+def begins_with_lasting_errors(state: JointState) -> bool:
+    """Return whether the odometry alone says so, before any ray has an object. False objects hide errors from a solve."""
+    return has_lasting_errors(state) and state.errors is not None and max(lasting_long(state.errors.noise)) >= _LARGE
+
+
+def check_neighbours(solution: Solution, errors: SharedErrors | None, settings: Settings) -> Finding | None:
     """Return a finding if a joint solve at a localisation that errs for seconds has equal things that it cannot tell apart.
 
     All rays of these seconds pass their things on the same side, so a ray to one thing may point at its neighbour. The solve
-    bends the path until such rays fit, so the residuals do not show it.
+    bends the path until such rays fit, so the residuals do not show it. The odometry may show it.
+    errors: of all frames, before the solve.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     noise = estimate.noise
-    if noise is None or not keyframes.localized_every or max(factors := noise.lasting_factors) < _LARGE:
+    number = np.bincount(association.label[np.isfinite(estimate.covariance[:, 0, 0])])
+    if noise is None or not keyframes.localized_every or number.max(initial=0) < 2:
         return None
-    yaw, place = factors[0] * settings.localization.yaw, factors[1] * settings.localization.xy
+    turned, moved = np.maximum(noise.lasting_factors, lasting_by_odometry(errors)).tolist()
+    if max(turned, moved) < _LARGE:
+        return None
+    yaw, place = turned * settings.localization.yaw, moved * settings.localization.xy
     held = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     owner, origins = association.object[held], estimate.map_T_base[solution.rays.keyframe[held], :3, 3]
     away = grouped_median(np.linalg.norm(estimate.positions[owner] - origins, axis=1), owner, association.count)
     shift = np.hypot(yaw * away, place)
     placed = np.flatnonzero(np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(shift))
-    if len(placed) < 2:
-        return None
     apart = np.linalg.norm(estimate.positions[placed, None, :2] - estimate.positions[None, placed, :2], axis=2)
     equal = association.label[placed][:, None] == association.label[placed]
     near = (apart < _APART * np.maximum(shift[placed][:, None], shift[placed])) & equal & ~np.eye(len(placed), dtype=bool)
     if not near.any():
         return None
-    number = int(near.any(axis=1).sum())
+    many = int(near.any(axis=1).sum())
     return Finding(
         NEIGHBOURS,
-        f"{number} of {len(placed)} objects have a neighbour of the same label that is nearer than the localisation errs "
+        f"{many} of {len(placed)} objects have a neighbour of the same label that is nearer than the localisation errs "
         f"for seconds: by {np.degrees(yaw):.2g} deg and {100 * place:.2g} cm. Their boxes may be exchanged, and objects may "
         "be missing or false",
         spoils=False,
