@@ -84,19 +84,24 @@ def minimise_distances(bundle: Bundle) -> PointSolution:
         iterations[0] = max(iterations[0], steps + more)
         point[objects] = (start + step * xp.where(solved, unit, 0.0)).T
         gradient[objects], guess[objects], left[objects] = rest, step.T, ~solved
-    for turn in range(1, _ROUNDS + 2):
+    turn, number = 1, int(left.sum())
+    while number:
+        before, last = number, turn > _ROUNDS
         for objects, rays, real in bundle.blocks(indices_of(left), _places(bundle)):
             origin, direction, weight = gather(bundle, rays, real)
             start, near = point[objects].T, guess[objects].T
             lines, unit, _ = _unit_lines(origin - start[:, None], direction, weight)
-            if turn <= _ROUNDS:
-                step, rest, solved, steps = off_nearest_line(lines, near)
-            else:
+            if last:
                 step, rest, steps = finish(lines)
                 solved = xp.ones_like(rest, dtype=xp.bool)
+            else:
+                step, rest, solved, steps = off_nearest_line(lines, near)
             iterations[turn] = max(iterations[turn], steps)
             point[objects] = (start + step * xp.where(solved, unit, 0.0)).T
             gradient[objects], guess[objects], left[objects] = rest, step.T, ~solved
+        number = int(left.sum())
+        # Lines in one plane cross in their solution. Then no round would solve any object.
+        turn = turn + 1 if number < before else _ROUNDS + 1
     return PointSolution(point, determined, gradient, sum(iterations))
 
 

@@ -38,19 +38,20 @@ def solution(made, shift):
     return JointSolution(made.keyframes.map_T_camera, points, np.ones(len(made.rays), dtype=bool), None, 0.0, 1)
 
 
-def best(begun, measured, misfits):
-    """The shift of the solution that is chosen. misfits: by shift."""
+def best(begun, measured, misfits, solved=None):
+    """The shift of the solution that is chosen. misfits: by shift. solved: gets the shift of each start that is solved."""
     made = begun[0]
 
     def shift_of(one):
         return round(float(one.positions[1, 0] - made.points[1, 0]), 6)
 
-    start = MultiStart(
-        measured,
-        made.association,
-        lambda poses, points, trace: solution(made, shift_of(solution(made, 0.0)) + float(points[1, 0] - made.points[1, 0])),
-        lambda one: misfits[shift_of(one)],
-    )
+    def solve(poses, points, trace):
+        shift = float(points[1, 0] - made.points[1, 0])
+        if solved is not None:
+            solved.append(shift)
+        return solution(made, shift)
+
+    start = MultiStart(measured, made.association, solve, lambda one: misfits[shift_of(one)])
     return shift_of(start.best(solution(made, 0.0)))
 
 
@@ -68,6 +69,23 @@ def test_a_start_that_ends_in_the_same_minimum_or_fails_is_no_other_start(begun)
     assert best(begun, measured, {}) == 0.0  # There is nothing to compare.
     shifts.update({4.0: None, 16.0: 0.01})
     assert best(begun, measured, {}) == 0.0
+
+
+def test_a_graph_that_grew_into_a_known_minimum_is_not_solved(begun):
+    _, measured, shifts = begun
+    shifts.update({4.0: 0.01, 16.0: 2.0})
+    solved = []
+    assert best(begun, measured, {0.0: 500.0, 2.0: 400.0}, solved) == 2.0
+    assert solved == pytest.approx([2.0])
+
+
+def test_a_long_log_begins_again_until_two_starts_agree(begun, monkeypatch):
+    _, measured, shifts = begun
+    monkeypatch.setattr(multi_start, "_FEW_RAYS", 10)
+    shifts.update({4.0: 0.01, 16.0: 2.0})
+    assert best(begun, measured, {}) == 0.0
+    shifts.update({4.0: 2.0, 16.0: -3.0})
+    assert best(begun, measured, {0.0: 500.0, 2.0: 450.0, -3.0: 400.0}) == -3.0
 
 
 def test_ranges_need_no_other_start(begun):
