@@ -19,6 +19,7 @@ from objslam.frontend.shared_errors import shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.paths_alone import noise_of_paths
+from objslam.graph.calibration.pose_errors import ComparedPoses, ErrorKind, PoseErrors
 from objslam.graph.calibration.shared_error_jacobian import linearise
 from objslam.graph.factors.localization import chain
 from objslam.graph.least_squares.joint_rows import JointGraph
@@ -139,6 +140,23 @@ def found_in(log: Log, *told: str):
     keyframes = build_keyframes(log, settings, ledger)
     errors = shared_errors(log, keyframes, build_rays(log, keyframes, settings, ledger), settings)
     return noise_of_paths(errors, errors.mean)
+
+
+def test_the_cost_of_a_model_is_that_of_its_whole_covariance():
+    """The search takes the places out first, and keeps them for all models of headings."""
+    rng, n = np.random.default_rng(0), 12
+    mixed, shared = rng.standard_normal((2, 3 * n, 3 * n))
+    of = 0.01 * rng.standard_normal(3 * n), 1e-4 * mixed @ mixed.T, 1e-5 * shared @ shared.T
+    data = ComparedPoses(*of, np.arange(n), 0.0, (0.005, 0.02), True, 3.0)
+    for heading in (ErrorKind(), ErrorKind(1.0, 5, 2)):
+        for place, predicted in ((ErrorKind(0.5), 0.0), (ErrorKind(-0.2, 8, 4), 0.3)):
+            model = PoseErrors(heading, place, predicted)
+            whole = data.expected(model)
+            own = 3.0 * (2 * predicted + np.exp(-2 * predicted))
+            cost = data.off @ np.linalg.solve(whole, data.off) + np.linalg.slogdet(whole)[1] + own
+            assert data.cost(model) == pytest.approx(cost, rel=1e-9)
+    singular = replace(data, shared=-2 * of[1])
+    assert singular.cost(PoseErrors(place=ErrorKind(-9.0))) == np.inf
 
 
 def test_a_localisation_that_errs_as_the_settings_say_has_no_more_noise():

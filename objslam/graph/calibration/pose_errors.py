@@ -56,6 +56,10 @@ class ErrorKind:
         return Lasting(_SHARES[self.share], _TIMES[self.time]) if self.share else WHITE
 
 
+_NO_ERROR = ErrorKind(factor=-np.inf)
+"""An error of variance 0."""
+
+
 @dataclass(frozen=True)
 class PoseErrors:
     """A hypothesis: the errors of headings and places, and the logarithm of the factor on the error of the prediction."""
@@ -113,34 +117,73 @@ class ComparedPoses:
         """Return the covariance (3 n, 3 n) of `off`."""
         n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance + self.shared
         for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
-            variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
-            own = variance * (1 - lasting.share) * self.white
-            if lasting.share:
-                own = own + variance * lasting.share * self.alike[kind.time]
+            own = self._own(kind, nominal)
             for part in (0,) if first == 0 else (1, 2):
                 found[part * n : (part + 1) * n, part * n : (part + 1) * n] += own
         return found
+
+    def _own(self, kind: ErrorKind, nominal: float) -> Floats:
+        """Return the covariance (n, n) of the error of headings or of places. nominal: its standard deviation, rad or m."""
+        variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
+        own = variance * (1 - lasting.share) * self.white
+        return own + variance * lasting.share * self.alike[kind.time] if lasting.share else own
 
     @cached_property
     def _costs(self) -> dict[PoseErrors, float]:
         return {}
 
+    @cached_property
+    def _placed(self) -> dict[tuple[ErrorKind, float], "_Placed | None"]:
+        return {}
+
     def cost(self, model: PoseErrors) -> float:
         """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction.
 
-        Values are kept, because the searches come back to the same models. This takes a quarter less time.
+        Values are kept, because the searches come back to the same models. This takes a quarter less time. So are those of
+        places alone (`_Placed`), because a third of the models differ in headings only. This takes another third less.
         """
         if model not in self._costs:
             self._costs[model] = self._cost(model)
         return self._costs[model]
 
     def _cost(self, model: PoseErrors) -> float:
-        root, failed = dpotrf(self.expected(model), lower=1, clean=0, overwrite_a=1)
+        key = model.place, model.predicted
+        if key not in self._placed:
+            self._placed[key] = _Placed.of(self.expected(replace(model, heading=_NO_ERROR)), self.off)
+        placed = self._placed[key]
+        if placed is None:
+            return np.inf
+        root, failed = dpotrf((placed.left + self._own(model.heading, self.nominal[0])).T, lower=1, clean=0, overwrite_a=1)
         if failed:
             return np.inf
-        white, _ = dtrtrs(root, self.off, lower=1)
+        white, _ = dtrtrs(root, placed.off, lower=1)
         prior = self.prior * (2 * model.predicted + np.exp(-2 * model.predicted))
-        return float(white @ white + 2 * np.log(np.diagonal(root)).sum() + prior)
+        return float(placed.cost + white @ white + 2 * np.log(np.diagonal(root)).sum() + prior)
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """The likelihood of the places of n poses, and what it leaves of the headings.
+
+    cost: -2 ln of the likelihood of the places. off: (n,) rad, the headings less what the places tell of them. left: (n, n)
+    the covariance of `off` without the error of the headings themselves.
+    """
+
+    cost: float
+    off: Floats
+    left: Floats
+
+    @classmethod
+    def of(cls, covariance: Floats, off: Floats) -> "_Placed | None":
+        """Take the places out of a covariance (3 n, 3 n) of `off` (3 n,), headings first. None if it is singular."""
+        n = len(off) // 3
+        root, failed = dpotrf(np.asfortranarray(covariance[n:, n:]), lower=1, clean=0, overwrite_a=1)
+        if failed:
+            return None
+        told, _ = dtrtrs(root, np.column_stack([off[n:], covariance[n:, :n]]), lower=1)
+        white, by_heading = told[:, 0], told[:, 1:]
+        cost = white @ white + 2 * np.log(np.diagonal(root)).sum()
+        return cls(float(cost), off[:n] - by_heading.T @ white, covariance[:n, :n] - by_heading.T @ by_heading)
 
 
 def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
@@ -257,16 +300,11 @@ def _moves(model: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...],
     """Return the neighbours of a model. most, lasting: as in `_searched`."""
     found = []
     for sign in (1, -1):
-        found.append(replace(model, predicted=float(np.clip(model.predicted + sign * step, *_PREDICTED))))
+        found.append(replace(model, predicted=_stepped(model.predicted, sign * step, *_PREDICTED)))
         for name in _BOTH:
             kind = getattr(model, name)
-            found.append(
-                _with(
-                    model,
-                    name,
-                    replace(kind, factor=float(np.clip(kind.factor + sign * step, _LEAST_FACTOR, most))),
-                )
-            )
+            factor = _stepped(kind.factor, sign * step, _LEAST_FACTOR, most)
+            found.append(_with(model, name, replace(kind, factor=factor)))
         for names in lasting:
             kind = getattr(model, names[0])
             share = int(np.clip(kind.share + sign, 0, len(_SHARES) - 1))
@@ -274,3 +312,8 @@ def _moves(model: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...],
             found.append(_with_lasting(model, names, share, kind.time))
             found.append(_with_lasting(model, names, kind.share, time))
     return [one for one in found if one != model]
+
+
+def _stepped(value: float, step: float, least: float, most: float) -> float:
+    """Return a value after a step, within bounds. It is rounded, so that a step back gives the same model."""
+    return round(float(np.clip(value + step, least, most)), 9)
