@@ -20,6 +20,7 @@ TURNS, PLACE, LENS = (
     dict.fromkeys("xyz", 0.05),
     dict.fromkeys(("focal", "cx", "cy"), 0.02),
 )
+QUIET = ("mode=joint", "output.recording=false", "checks.use=false", "bodies.use=false")
 PRIORS = {"clock": 0.1, **TURNS, **PLACE, **LENS}
 
 
@@ -31,9 +32,7 @@ def drive(seed: int, errors: dict[str, float]) -> Log:
 
 def mapped(log: Log, *changes: str) -> tuple[RunResult, Floats, Floats]:
     """The result in joint mode, and the errors (n, 3) m and covariances (n, 3, 3) of its objects."""
-    result = pipeline.run(
-        log, load_settings(None, ("mode=joint", "output.recording=false", "checks.use=false", *changes)), Ledger()
-    )
+    result = pipeline.run(log, load_settings(None, (*QUIET, *changes)), Ledger())
     assert log.truth is not None
     true = {one.label: one.position for one in log.truth.objects}
     found = result.map.resolved()
@@ -84,7 +83,7 @@ def test_a_lens_that_may_err_is_found_too() -> None:
 
 
 def test_a_calibration_that_fails_makes_the_verdict_check(monkeypatch) -> None:
-    log, settings = drive(0, {}), load_settings(None, ("mode=joint", "output.recording=false"))
+    log, settings = drive(0, {}), load_settings(None, QUIET)
     assert not assessed(pipeline.run(log, settings, Ledger())).uncalibrated
 
     def fails(*_: object) -> None:

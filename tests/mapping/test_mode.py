@@ -32,7 +32,7 @@ def drive() -> Log:
 def mapped(without: str, *more: str) -> RunResult:
     """The result of the drive without one of its paths, or with both."""
     log = replace(drive(), **{without: None}) if without else drive()
-    return pipeline.run(log, load_settings(None, ("output.recording=false", *more)), Ledger())
+    return pipeline.run(log, load_settings(None, ("output.recording=false", "bodies.use=false", *more)), Ledger())
 
 
 @pytest.mark.parametrize(

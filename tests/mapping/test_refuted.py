@@ -25,7 +25,7 @@ from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
 from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.wrong_inputs import MISTAKES, join
 
-SETTINGS = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false"))
+SETTINGS = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false", "bodies.use=false"))
 
 
 def nothing(stage, done, total):

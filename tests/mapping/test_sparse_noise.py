@@ -25,7 +25,7 @@ from objslam.mapping.fixed.few_box_search import Searched, SparseNoise, middle, 
 from objslam.mapping.fixed.residual_noise import noise_of_residuals
 from objslam.mapping.fixed.sparse_noise import sparse_noise, with_sparse_noise
 
-FIXED = Settings.model_validate({"mode": "fixed", "output": {"recording": False}})
+FIXED = Settings.model_validate({"mode": "fixed", "output": {"recording": False}, "bodies": {"use": False}})
 
 
 def accused() -> Diagnosis:
