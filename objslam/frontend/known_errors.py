@@ -12,9 +12,11 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
-from objslam.core.types import Log, Rays
+from objslam.core.types import Keyframes, Log, Rays
 from objslam.errors import ConfigError
 from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.frontend.surface_ranges import half_widths_of_rays, with_known_surfaces
 from objslam.io.calibration_yaml import load_calibration
 
 _PLACE = 0.05
@@ -165,3 +167,29 @@ def take_out_expected(log: Log, settings: Settings) -> Log:
 def _parts(log: Log) -> str:
     cameras = ", ".join(one.camera.name for one in log.cameras)
     return f"the log has {'no' if log.odometry is None else 'an'} odometry and these cameras: {cameras or 'none'}"
+
+
+def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
+    """Return the errors that are estimated from a log by the settings, None if there are none.
+
+    keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
+    """
+    names: tuple[str, ...] = ()
+    half = half_widths_of_rays(rays, keyframes, [one.camera for one in log.cameras])
+    if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):
+        cameras = {one.camera.name: (keyframes.camera == index).any() for index, one in enumerate(log.cameras)}
+        measured = {
+            **cameras,
+            "odometry": keyframes.odom_T_base is not None,
+            **measured_lengths(rays, half, settings),
+        }
+        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
+    rays = with_known_surfaces(rays, half, settings.calibration.surface if "surface" in names else 0.0)
+    mean, place = np.zeros(len(names)), usual_place(log, settings)
+    prior = np.diag([prior_sigma(name, settings, place) ** 2 for name in names]).reshape(len(names), len(names))
+    known = known_errors(settings) if names else None
+    if known is not None:
+        here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
+        mean[here], prior[np.ix_(here, here)] = known.values[there], known.covariance[np.ix_(there, there)]
+    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior, sized_tags=has_sized_tags(rays, settings))
+    return errors if names or errors.unknown_noise else None

@@ -24,18 +24,10 @@ from objslam.frontend.corrected_log import (
     refocused_noise,
     take_out,
 )
-from objslam.frontend.known_errors import (
-    estimates,
-    has_sized_tags,
-    known_errors,
-    measured_lengths,
-    possible,
-    prior_sigma,
-    usual_place,
-)
+from objslam.frontend.corrected_rays import corrected_rays
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
-from objslam.frontend.surface_ranges import corrected_lengths, half_widths_of_rays, weights_of, with_known_surfaces
+from objslam.frontend.surface_ranges import corrected_lengths, half_widths_of_rays, weights_of
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -130,7 +122,7 @@ class SharedErrors:
         half = half_widths_of_rays(self.rays, self.keyframes, [one.camera for one in self.log.cameras])
         return half * weights_of(self.rays)
 
-    @property
+    @cached_property
     def steps(self) -> Floats:
         """(P,) steps over which derivatives are taken.
 
@@ -145,7 +137,7 @@ class SharedErrors:
             steps["clock"] = float(np.clip(apart, _STEPS["clock"], longest))
         return np.array([steps.get(kind(name), _STEP) for name in self.names])
 
-    @property
+    @cached_property
     def bounds(self) -> Floats:
         """(P,) the largest absolute values of the parameters, in their units."""
         widest = np.abs(self.mean) + _MOST_SIGMAS * np.sqrt(np.diagonal(self.prior))
@@ -192,6 +184,25 @@ class SharedErrors:
             noise = self.noise
             moved = replace(moved, pose_noise=(noise.heading, noise.place), lasting=noise.lasting)
         return moved, ranged, settings if tags is settings.tags else settings.model_copy(update={"tags": tags})
+
+    def rays_in_map(self, values: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return origins (M, R, 3), m, and unit directions (M, R, 3) in map, and noise (M, R), rad, of the rays of `at`.
+
+        values: (M, P) the errors. Values with the same clocks and the same odometry are corrected together.
+        """
+        errors = [dict(zip(self.names, row, strict=True)) for row in values.tolist()]
+        rays = self.noise.rays_with_noise(self.rays)
+        same: dict[tuple[float, ...], list[int]] = {}
+        for number, error in enumerate(errors):
+            same.setdefault(self._poses_key(error), []).append(number)
+        origins = np.empty((len(values), len(rays), 3))
+        directions, sigma = np.empty_like(origins), np.empty(origins.shape[:2])
+        for some in same.values():
+            poses = self._poses(errors[some[0]])
+            moved = replace(self.keyframes, map_T_base=poses.map_T_base, base_T_camera=poses.base_T_camera)
+            together = corrected_rays(moved, rays, self.cameras, [errors[number] for number in some])
+            origins[some], directions[some], sigma[some] = together
+        return origins, directions, sigma
 
     def corrected_log(self, values: Floats) -> Log:
         """Return the log corrected by the errors (P,): odometry, cameras and the stamps of frames."""
@@ -244,8 +255,10 @@ class SharedErrors:
     def _poses(self, error: Mapping[str, float]) -> "_Poses":
         """The poses of the keyframes. Rotations of cameras and scales of ranges do not change the poses, so the poses are
         kept."""
-        key = *self._odometry_key(error), *(error.get(f"{one.camera.name}.clock", 0.0) for one in self.log.cameras)
-        return self._kept_poses.get(key, lambda: self._computed_poses(error))
+        return self._kept_poses.get(self._poses_key(error), lambda: self._computed_poses(error))
+
+    def _poses_key(self, error: Mapping[str, float]) -> tuple[float, ...]:
+        return *self._odometry_key(error), *(error.get(f"{one.camera.name}.clock", 0.0) for one in self.log.cameras)
 
     def _computed_poses(self, error: Mapping[str, float]) -> "_Poses":
         keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
@@ -319,29 +332,3 @@ class _Poses:
     base_T_camera: Floats
     map_T_base: Floats
     odom_T_base: Floats | None
-
-
-def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
-    """Return the errors that are estimated from a log by the settings, None if there are none.
-
-    keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
-    """
-    names: tuple[str, ...] = ()
-    half = half_widths_of_rays(rays, keyframes, [one.camera for one in log.cameras])
-    if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):
-        cameras = {one.camera.name: (keyframes.camera == index).any() for index, one in enumerate(log.cameras)}
-        measured = {
-            **cameras,
-            "odometry": keyframes.odom_T_base is not None,
-            **measured_lengths(rays, half, settings),
-        }
-        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
-    rays = with_known_surfaces(rays, half, settings.calibration.surface if "surface" in names else 0.0)
-    mean, place = np.zeros(len(names)), usual_place(log, settings)
-    prior = np.diag([prior_sigma(name, settings, place) ** 2 for name in names]).reshape(len(names), len(names))
-    known = known_errors(settings) if names else None
-    if known is not None:
-        here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
-        mean[here], prior[np.ix_(here, here)] = known.values[there], known.covariance[np.ix_(there, there)]
-    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior, sized_tags=has_sized_tags(rays, settings))
-    return errors if names or errors.unknown_noise else None

@@ -17,9 +17,8 @@ from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.corrected_log import refocused, refocused_noise, take_out
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.known_errors import take_out_known
+from objslam.frontend.known_errors import shared_errors, take_out_known
 from objslam.frontend.odometry_drift import gathered_drift
-from objslam.frontend.shared_errors import shared_errors
 from objslam.frontend.surface_ranges import measured_ranges
 from objslam.graph.factors.odometry import motions
 from objslam.io.calibration_yaml import dump_calibration

@@ -9,7 +9,8 @@ from objslam.core.noise import range_noise
 from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
 from objslam.errors import ObjslamError
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import measured_ranges, range_factors
 from objslam.live.mapper.state import MapState
 from objslam.mapping.solution import seen_something

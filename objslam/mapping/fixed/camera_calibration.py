@@ -15,7 +15,8 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Log
 from objslam.errors import SolveError
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.fixed.fixed_poses import MOST_ROUNDS, SAME, FixedPoses, placed_objects, with_noise_of
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution
@@ -66,13 +67,14 @@ def calibrate_fixed(
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[Floats, Floats]] = []
     in_rows = False
+    corrected = at.without(errors, calibration.values)
     for number in range(MOST_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
-        now = at.without(errors, calibration.values)
+        now = corrected
         if number:
             association = now.associate(told)
         else:
-            association, in_rows = _first_association(at, errors)
+            association, in_rows = _first_association(at, now, errors, told)
         rounds = (*rounds, {"objects": association.count})
         progress("solve", 0, 0)
         estimate = now.solve(association, trace, _parameters(calibration))
@@ -91,21 +93,22 @@ def calibrate_fixed(
         # Wide gates also hold the rays of poses whose errors last. In rows of equal things they hold those of neighbours.
         told = noise_beside_objects(errors, found, association, moved) if in_rows else noise_of_errors(every, calibration)
         corrected = at.without(errors, calibration.values)
-        at = at.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
-        allowed = np.hypot(_own(at), told)
+        corrected = corrected.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
+        allowed = np.hypot(_own(at.with_noise_of_poses(corrected.seen.pose_noise)), told)
+        turned = turned_by_errors(every, np.array([values for values, _ in earlier]), calibration.values)
         if any(
-            _rms(turned_by_errors(every, values, calibration.values) / before) < SAME and _rms(allowed / before - 1) < SAME
-            for values, before in earlier
+            _rms(angle / before) < SAME and _rms(allowed / before - 1) < SAME
+            for angle, (_, before) in zip(turned, earlier, strict=True)
         ):
             break
     else:
         ledger.warn(f"the shared errors still change after {MOST_ROUNDS} rounds of association")
-    now = at.without(errors, calibration.values)
+    now = corrected
     estimate = now.solve(association, trace, _parameters(calibration))
     centred = _calibrated_by_centres(now, errors, association, estimate, calibration.values)
     if centred is not None:
         found, calibration, rounds = centred, centred.calibration, (*rounds, {"objects": association.count})
-        now = at.without(errors, calibration.values)
+        now = at.without(errors, calibration.values).with_noise_of_poses(now.seen.pose_noise)
         estimate = now.solve(association, trace, _parameters(calibration))
     every_object = now.add_few(association, estimate, told)
     if every_object.count > association.count:
@@ -160,48 +163,46 @@ def _expected(errors: SharedErrors) -> Calibration:
     return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
 
 
-def _first_association(at: FixedPoses, errors: SharedErrors) -> tuple[Association, bool]:
+def _first_association(at: FixedPoses, now: FixedPoses, errors: SharedErrors, told: Floats) -> tuple[Association, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
     An association that allows for the uncertainty of ray directions because of the errors is right if things are far apart.
     In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong distance. Then a
     narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the associations are compared
     by how likely the rays are after a calibration. A narrower one has to be clearly better. Also return whether it is.
-    """
-    from objslam.graph.calibration.fixed_pose_calibration import noise_of_errors
 
-    calibration = _expected(errors)
-    told = noise_of_errors(errors.take(at.frames, at.rays), calibration)
-    now = at.without(errors, calibration.values)
+    at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
+    of the errors.
+    """
     wide = now.associate(told)
     best = wide
-    missed, least = _left_calibrated(at, errors, calibration, wide)
+    missed, least = _left_calibrated(at, now, errors, wide)
     if missed <= _FITS:
         return wide, False
     least -= _CLEARLY
     for share in _NARROWER:
         narrow = now.associate(share * told)
-        _, left = _left_calibrated(at, errors, calibration, narrow)
+        _, left = _left_calibrated(at, now, errors, narrow)
         if left < least:
             best, least = narrow, left
     return best, best is not wide
 
 
-def _left_calibrated(
-    at: FixedPoses, errors: SharedErrors, calibration: Calibration, association: Association
-) -> tuple[float, float]:
-    """Return what a calibration by an association leaves (`_left`). Infinities if the association does not allow it."""
+def _left_calibrated(at: FixedPoses, now: FixedPoses, errors: SharedErrors, association: Association) -> tuple[float, float]:
+    """Return what a calibration by an association leaves (`_left`). Infinities if the association does not allow it.
+
+    at, now: the input as measured, and at the expected errors.
+    """
     from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
     from objslam.graph.fixed_pose_triangulation import largest_noise
 
-    now = at.without(errors, calibration.values)
     estimate = now.solve(association, None)
     placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
     try:
-        found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
+        found = calibrate_at_poses(errors, association, placed, errors.mean, noise)
     except SolveError:
         return float("inf"), float("inf")
-    moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
+    moved = placed + found.sensitivity @ (found.calibration.values - errors.mean)
     then = at.without(errors, found.calibration.values)
     return _left(then.with_noise_of_poses(then.noise_of_poses(association, moved, estimate.weight)), association, moved)
 

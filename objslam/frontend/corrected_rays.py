@@ -1,0 +1,49 @@
+"""The rays of a log in map, corrected for many values of its shared errors at once.
+
+A derivative needs the rays at two values of each error. Most of these values change only the mounts and the lenses of the
+cameras. So one computation for all values takes far less time than one computation for each.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.rotation import rotation_from_vector
+from objslam.core.types import Keyframes, Rays
+from objslam.frontend.corrected_log import AXES, LENS
+
+PLACE = ("x", "y", "z")
+"""The moves of a camera on the robot, along the axes of base."""
+
+
+def corrected_rays(
+    keyframes: Keyframes, rays: Rays, cameras: Sequence[str], errors: Sequence[Mapping[str, float]]
+) -> tuple[Floats, Floats, Floats]:
+    """Return origins (M, R, 3), m, and unit directions (M, R, 3) of rays in map, and their noise (M, R), rad.
+
+    keyframes: with poses that do not depend on the errors of mounts and lenses. rays: not yet corrected. cameras: the names
+    of the cameras, in the order of `Keyframes.camera`. errors: M values of the shared errors by name. An absent name is 0.
+    """
+    turn = rotation_from_vector(_of_cameras(errors, cameras, AXES))[:, keyframes.camera]
+    move = _of_cameras(errors, cameras, PLACE)[:, keyframes.camera]
+    lens = _of_cameras(errors, cameras, LENS)[:, keyframes.camera[rays.keyframe]]
+    base, mount = keyframes.map_T_base, keyframes.base_T_camera
+    turned = (base[:, :3, :3] @ (turn @ mount[:, :3, :3]))[:, rays.keyframe]
+    places = np.einsum("kij,mkj->mki", base[:, :3, :3], mount[:, :3, 3] + move) + base[:, :3, 3]
+    origins = places[:, rays.keyframe]
+    if rays.offset is not None:
+        origins = origins + np.einsum("mrij,rj->mri", turned, rays.offset)
+    if not lens.any():
+        return origins, np.einsum("mrij,rj->mri", turned, rays.direction), np.broadcast_to(rays.sigma, lens.shape[:2])
+    # As in `refocused` and `refocused_noise`.
+    (focal, cx, cy), (x, y, z) = np.moveaxis(lens, -1, 0), rays.direction.T
+    longer = np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=-1)
+    length = np.linalg.norm(longer, axis=-1)
+    directions = np.einsum("mrij,mrj->mri", turned, longer / length[..., None])
+    return origins, directions, rays.sigma * np.sqrt((1 + focal) / length**3)
+
+
+def _of_cameras(errors: Sequence[Mapping[str, float]], cameras: Sequence[str], kinds: Sequence[str]) -> Floats:
+    """Return the errors (M, C, k) of each camera."""
+    return np.array([[[of.get(f"{name}.{one}", 0.0) for one in kinds] for name in cameras] for of in errors])
