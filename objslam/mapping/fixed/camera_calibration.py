@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,34 +67,31 @@ def calibrate_fixed(
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[Floats, Floats]] = []
     in_rows = False
-    corrected = at.without(errors, calibration.values)
+    now = at.without(errors, calibration.values)
     for number in range(MOST_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
-        now = corrected
         if number:
-            association = now.associate(told)
+            trial = _tried(at, now, errors, calibration, now.associate(told), trace)
         else:
-            association, in_rows = _first_association(at, now, errors, told)
+            trial, in_rows = _first_trial(at, now, errors, calibration, told, trace)
+        association, estimate, found = trial.association, trial.estimate, trial.found
         rounds = (*rounds, {"objects": association.count})
-        progress("solve", 0, 0)
-        estimate = now.solve(association, trace, _parameters(calibration))
-        placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
-        try:
-            found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
-        except SolveError as error:
-            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+        if trace is not None and trial.trace is not None:
+            trace.take(trial.trace)
+        if found is None:
+            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {trial.failure}")
             every_object = now.add_few(association, estimate, told)
             if every_object.count > association.count:
                 association, estimate = every_object, now.solve(every_object, trace, _parameters(calibration))
             return now, association, replace(estimate, calibration=calibration, uncalibrated=True), rounds
         earlier.append((calibration.values, np.hypot(_own(now), told)))
-        moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
-        calibration = found.calibration
+        calibration, now = found.calibration, trial.corrected
         # Wide gates also hold the rays of poses whose errors last. In rows of equal things they hold those of neighbours.
-        told = noise_beside_objects(errors, found, association, moved) if in_rows else noise_of_errors(every, calibration)
-        corrected = at.without(errors, calibration.values)
-        corrected = corrected.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
-        allowed = np.hypot(_own(at.with_noise_of_poses(corrected.seen.pose_noise)), told)
+        told = (
+            noise_beside_objects(errors, found, association, trial.moved) if in_rows else noise_of_errors(every, calibration)
+        )
+        at = at.with_noise_of_poses(now.seen.pose_noise)
+        allowed = np.hypot(_own(at), told)
         turned = turned_by_errors(every, np.array([values for values, _ in earlier]), calibration.values)
         if any(
             _rms(angle / before) < SAME and _rms(allowed / before - 1) < SAME
@@ -103,12 +100,12 @@ def calibrate_fixed(
             break
     else:
         ledger.warn(f"the shared errors still change after {MOST_ROUNDS} rounds of association")
-    now = corrected
+    progress("solve", 0, 0)
     estimate = now.solve(association, trace, _parameters(calibration))
     centred = _calibrated_by_centres(now, errors, association, estimate, calibration.values)
     if centred is not None:
         found, calibration, rounds = centred, centred.calibration, (*rounds, {"objects": association.count})
-        now = at.without(errors, calibration.values).with_noise_of_poses(now.seen.pose_noise)
+        now = at.without(errors, calibration.values)
         estimate = now.solve(association, trace, _parameters(calibration))
     every_object = now.add_few(association, estimate, told)
     if every_object.count > association.count:
@@ -163,7 +160,66 @@ def _expected(errors: SharedErrors) -> Calibration:
     return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
 
 
-def _first_association(at: FixedPoses, now: FixedPoses, errors: SharedErrors, told: Floats) -> tuple[Association, bool]:
+@dataclass(frozen=True)
+class _Trial:
+    """An association at some values of the errors, and what follows from it.
+
+    estimate: the objects at these values. found: the calibration by these objects, None if `failure` prevents it. moved:
+    (N, 3) m, the objects at the calibrated errors, NaN without a position. corrected: the input at the calibrated errors,
+    with the noise of the poses that it shows. trace: the record of the estimate, None if nothing is recorded.
+    """
+
+    association: Association
+    estimate: Estimate
+    found: FixedCalibration | None
+    failure: SolveError | None
+    moved: Floats
+    corrected: FixedPoses
+    trace: Trace | None
+
+    def left(self) -> tuple[float, float]:
+        """Return what the calibration leaves (`_left`), infinities without a calibration."""
+        if self.found is None:
+            return float("inf"), float("inf")
+        return _left(self.corrected, self.association, self.moved)
+
+
+def _tried(
+    at: FixedPoses,
+    now: FixedPoses,
+    errors: SharedErrors,
+    calibration: Calibration,
+    association: Association,
+    trace: Trace | None,
+) -> _Trial:
+    """Solve the objects of an association, and calibrate the errors by them.
+
+    at, now: the input as measured, and corrected for `calibration.values`.
+    """
+    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
+    from objslam.graph.fixed_pose_triangulation import largest_noise
+
+    attempt = None if trace is None else trace.aside()
+    estimate = now.solve(association, attempt, _parameters(calibration))
+    placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
+    try:
+        found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
+    except SolveError as error:
+        return _Trial(association, estimate, None, error, placed, now, attempt)
+    moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
+    then = at.without(errors, found.calibration.values)
+    then = then.with_noise_of_poses(then.noise_of_poses(association, moved, estimate.weight))
+    return _Trial(association, estimate, found, None, moved, then, attempt)
+
+
+def _first_trial(
+    at: FixedPoses,
+    now: FixedPoses,
+    errors: SharedErrors,
+    calibration: Calibration,
+    told: Floats,
+    trace: Trace | None,
+) -> tuple[_Trial, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
     An association that allows for the uncertainty of ray directions because of the errors is right if things are far apart.
@@ -174,37 +230,18 @@ def _first_association(at: FixedPoses, now: FixedPoses, errors: SharedErrors, to
     at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
     of the errors.
     """
-    wide = now.associate(told)
+    wide = _tried(at, now, errors, calibration, now.associate(told), trace)
     best = wide
-    missed, least = _left_calibrated(at, now, errors, wide)
+    missed, least = wide.left()
     if missed <= _FITS:
         return wide, False
     least -= _CLEARLY
     for share in _NARROWER:
-        narrow = now.associate(share * told)
-        _, left = _left_calibrated(at, now, errors, narrow)
+        narrow = _tried(at, now, errors, calibration, now.associate(share * told), trace)
+        _, left = narrow.left()
         if left < least:
             best, least = narrow, left
     return best, best is not wide
-
-
-def _left_calibrated(at: FixedPoses, now: FixedPoses, errors: SharedErrors, association: Association) -> tuple[float, float]:
-    """Return what a calibration by an association leaves (`_left`). Infinities if the association does not allow it.
-
-    at, now: the input as measured, and at the expected errors.
-    """
-    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
-    from objslam.graph.fixed_pose_triangulation import largest_noise
-
-    estimate = now.solve(association, None)
-    placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
-    try:
-        found = calibrate_at_poses(errors, association, placed, errors.mean, noise)
-    except SolveError:
-        return float("inf"), float("inf")
-    moved = placed + found.sensitivity @ (found.calibration.values - errors.mean)
-    then = at.without(errors, found.calibration.values)
-    return _left(then.with_noise_of_poses(then.noise_of_poses(association, moved, estimate.weight)), association, moved)
 
 
 def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:
