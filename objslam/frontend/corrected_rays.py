@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.types import Keyframes, Rays
+from objslam.core.types import Rays
 from objslam.frontend.corrected_log import AXES, LENS
 
 PLACE = ("x", "y", "z")
@@ -18,19 +18,24 @@ PLACE = ("x", "y", "z")
 
 
 def corrected_rays(
-    keyframes: Keyframes, rays: Rays, cameras: Sequence[str], errors: Sequence[Mapping[str, float]]
+    map_T_base: Floats,
+    base_T_camera: Floats,
+    camera: Ints,
+    rays: Rays,
+    names: Sequence[str],
+    errors: Sequence[Mapping[str, float]],
 ) -> tuple[Floats, Floats, Floats]:
     """Return origins (M, R, 3), m, and unit directions (M, R, 3) of rays in map, and their noise (M, R), rad.
 
-    keyframes: with poses that do not depend on the errors of mounts and lenses. rays: not yet corrected. cameras: the names
-    of the cameras, in the order of `Keyframes.camera`. errors: M values of the shared errors by name. An absent name is 0.
+    map_T_base, base_T_camera: (M, K, 4, 4) of each keyframe, not yet corrected for the errors of mounts. camera: (K,) the
+    camera of each keyframe, as an index into `names`. rays: not yet corrected. errors: M values of the shared errors by
+    name. An absent name is 0.
     """
-    turn = rotation_from_vector(_of_cameras(errors, cameras, AXES))[:, keyframes.camera]
-    move = _of_cameras(errors, cameras, PLACE)[:, keyframes.camera]
-    lens = _of_cameras(errors, cameras, LENS)[:, keyframes.camera[rays.keyframe]]
-    base, mount = keyframes.map_T_base, keyframes.base_T_camera
-    turned = (base[:, :3, :3] @ (turn @ mount[:, :3, :3]))[:, rays.keyframe]
-    places = np.einsum("kij,mkj->mki", base[:, :3, :3], mount[:, :3, 3] + move) + base[:, :3, 3]
+    turn = rotation_from_vector(_of_cameras(errors, names, AXES))[:, camera]
+    move = _of_cameras(errors, names, PLACE)[:, camera]
+    lens = _of_cameras(errors, names, LENS)[:, camera[rays.keyframe]]
+    turned = (map_T_base[..., :3, :3] @ turn @ base_T_camera[..., :3, :3])[:, rays.keyframe]
+    places = np.einsum("mkij,mkj->mki", map_T_base[..., :3, :3], base_T_camera[..., :3, 3] + move) + map_T_base[..., :3, 3]
     origins = places[:, rays.keyframe]
     if rays.offset is not None:
         origins = origins + np.einsum("mrij,rj->mri", turned, rays.offset)

@@ -1,6 +1,6 @@
 """The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
@@ -188,21 +188,15 @@ class SharedErrors:
     def rays_in_map(self, values: Floats) -> tuple[Floats, Floats, Floats]:
         """Return origins (M, R, 3), m, and unit directions (M, R, 3) in map, and noise (M, R), rad, of the rays of `at`.
 
-        values: (M, P) the errors. Values with the same clocks and the same odometry are corrected together.
+        values: (M, P) the errors. Values with the same clocks and the same odometry share their poses.
         """
         errors = [dict(zip(self.names, row, strict=True)) for row in values.tolist()]
+        keys = [self._poses_key(error) for error in errors]
+        distinct = dict(zip(keys, errors, strict=True))
+        which = [{key: number for number, key in enumerate(distinct)}[key] for key in keys]
+        _, map_T_base, base_T_camera = self._poses_at(list(distinct.values()))
         rays = self.noise.rays_with_noise(self.rays)
-        same: dict[tuple[float, ...], list[int]] = {}
-        for number, error in enumerate(errors):
-            same.setdefault(self._poses_key(error), []).append(number)
-        origins = np.empty((len(values), len(rays), 3))
-        directions, sigma = np.empty_like(origins), np.empty(origins.shape[:2])
-        for some in same.values():
-            poses = self._poses(errors[some[0]])
-            moved = replace(self.keyframes, map_T_base=poses.map_T_base, base_T_camera=poses.base_T_camera)
-            together = corrected_rays(moved, rays, self.cameras, [errors[number] for number in some])
-            origins[some], directions[some], sigma[some] = together
-        return origins, directions, sigma
+        return corrected_rays(map_T_base[which], base_T_camera[which], self.keyframes.camera, rays, self.cameras, errors)
 
     def corrected_log(self, values: Floats) -> Log:
         """Return the log corrected by the errors (P,): odometry, cameras and the stamps of frames."""
@@ -261,24 +255,35 @@ class SharedErrors:
         return *self._odometry_key(error), *(error.get(f"{one.camera.name}.clock", 0.0) for one in self.log.cameras)
 
     def _computed_poses(self, error: Mapping[str, float]) -> "_Poses":
-        keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
-        assert path is not None
-        stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # The stamps at which the poses are taken, all within the time of the path.
+        keyframes, path = self.keyframes, self.log.robot_path
+        (known,), (map_T_base,), (base_T_camera,) = self._poses_at([error])
+        stamps, odom_T_base = keyframes.stamps.copy(), keyframes.odom_T_base
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
-            clock = error.get(f"{one.camera.name}.clock", 0.0)
-            known[mine] = np.clip(stamps[mine] + clock, path.stamps[0], path.stamps[-1])
-            stamps[mine] = later(stamps[mine], clock, path)
-            if one.mount is not None:
-                base_T_camera[mine] = poses_near(one.mount, known[mine], max_gap)
-        localization, odom_T_base = self.log.localization, keyframes.odom_T_base
-        map_T_base = keyframes.map_T_base if localization is None else poses_near(localization, known, max_gap)
-        if self.log.odometry is not None and (localization is None or odom_T_base is not None):
-            at = self._odometry_at(known, error)
-            map_T_base = at if localization is None else map_T_base
-            odom_T_base = None if odom_T_base is None else inverse(self.log.odometry.poses[0]) @ at
+            stamps[mine] = later(stamps[mine], error.get(f"{one.camera.name}.clock", 0.0), path)
+        if self.log.odometry is not None and odom_T_base is not None:
+            at = map_T_base if self.log.localization is None else self._odometry_at(known, error)
+            odom_T_base = inverse(self.log.odometry.poses[0]) @ at
         return _Poses(stamps, known, base_T_camera, map_T_base, odom_T_base)
+
+    def _poses_at(self, errors: Sequence[Mapping[str, float]]) -> tuple[Floats, Floats, Floats]:
+        """The stamps (D, K) at which the poses are taken, all within the time of the path, map_T_base and base_T_camera
+        (D, K, 4, 4), for D values of the errors."""
+        keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
+        assert path is not None
+        clocks = np.array([[error.get(f"{name}.clock", 0.0) for name in self.cameras] for error in errors])
+        known = np.clip(keyframes.stamps + clocks[:, keyframes.camera], path.stamps[0], path.stamps[-1])
+        base_T_camera = np.repeat(keyframes.base_T_camera[None], len(errors), axis=0)
+        for index, one in enumerate(self.log.cameras):
+            if one.mount is not None:
+                mine = keyframes.camera == index
+                at = poses_near(one.mount, known[:, mine].ravel(), max_gap)
+                base_T_camera[:, mine] = at.reshape(len(errors), -1, 4, 4)
+        if self.log.localization is not None:
+            map_T_base = poses_near(self.log.localization, known.ravel(), max_gap).reshape(*known.shape, 4, 4)
+        else:
+            map_T_base = np.stack([self._odometry_at(stamps, error) for stamps, error in zip(known, errors, strict=True)])
+        return known, map_T_base, base_T_camera
 
     @cached_property
     def _kept_poses(self) -> RecentValues["_Poses"]:

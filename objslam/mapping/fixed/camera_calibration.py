@@ -237,7 +237,10 @@ def _first_trial(
         return wide, False
     least -= _CLEARLY
     for share in _NARROWER:
-        narrow = _tried(at, now, errors, calibration, now.associate(share * told), trace)
+        association = now.associate(share * told)
+        if np.array_equal(association.object, wide.association.object):
+            continue  # It leaves the same.
+        narrow = _tried(at, now, errors, calibration, association, trace)
         _, left = narrow.left()
         if left < least:
             best, least = narrow, left
