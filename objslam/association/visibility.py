@@ -165,7 +165,8 @@ def detection_history(
 
 
 def seen_from(position: Floats, origins: Floats) -> SeenFrom:
-    """Return from where an object at a position (3,) was detected by cameras at origins (n, 3), m."""
+    """Return the distances and directions from which cameras at origins (n, 3), m, detected an object at a position (3,),
+    m."""
     toward = origins - position
     distance = np.linalg.norm(toward, axis=1)
     sides = thinned(toward / np.maximum(distance, MIN_DEPTH)[:, None])

@@ -64,7 +64,7 @@ class Depth(Section):
 
 class Odometry(Section):
     """Configure odometry drift, a random walk whose standard deviations grow with the square root of the motion. On a path
-    that is not planar, the noise of x holds for all three axes, and the noise of the heading for all three rotations."""
+    that is not planar, all three axes have the noise of x, and all three rotations have the noise of the heading."""
 
     x_per_m: NotNegative = 0.02
     """Standard deviation along the driving direction in m after 1 m of driving."""

@@ -50,7 +50,7 @@ def usual_place(log: Log, settings: Settings) -> float:
     """Return the prior standard deviation, m, of the place of a camera on the base, if `calibration.translation` is auto.
 
     Against given poses, those of a localisation or of fixed mode, a wrong place of a camera moves all objects. A map from
-    odometry alone moves along.
+    odometry alone moves with the camera.
     """
     if settings.mode == "fixed":
         return _PLACE

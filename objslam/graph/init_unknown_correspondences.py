@@ -74,7 +74,7 @@ class InitialEstimate:
 def initialize_unknown(
     keyframes: Keyframes, rays: Rays, cameras: tuple[Camera, ...], settings: Settings, progress: Callable[[int, int], None]
 ) -> InitialEstimate:
-    """Return initial poses and landmarks. The function progress(done, total) is called with numbers of keyframes."""
+    """Return initial poses and landmarks. The function progress(done, total) gets numbers of keyframes."""
     measured = Measurements.of(keyframes, rays, settings)
     assert keyframes.drift is not None
     heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])  # variance, rad^2

@@ -51,7 +51,7 @@ class MultiStart:
         """Return the solution with the least misfit: `found`, or one that begins at another growing graph.
 
         Ranges determine a position at once. So if at least half of the objects have one, or if there are fiducials, the
-        first solution is returned. The same holds for a log with many rays (`_MOST_RAYS`).
+        first solution is returned. It is also returned for a log with many rays (`_MOST_RAYS`).
         """
         rays, object_ = self.measured.rays, self.association.object
         ranged = np.unique(object_[np.isfinite(rays.range) & (object_ >= 0)])

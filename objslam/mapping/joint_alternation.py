@@ -225,7 +225,7 @@ class JointState:
         return self.better(turns)
 
     def split(self) -> Self:
-        """Return the state after a split of objects that may be two, if the split makes the rays better `explained`.
+        """Return the state after a split of objects that may be two, if the rays then have a better value of `explained`.
 
         The rounds of `alternated` do not separate two things that share one object, because the path is bent until all rays
         agree. They also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles

@@ -52,7 +52,7 @@ class BearingExtractor:
         m.cameras[number : number + 1] = [corrected_camera(CameraLog(camera), m.errors).camera] if m.errors else [camera]
 
     def add_mount(self, message: MountMessage) -> None:
-        """Add a mount: the pose of a camera on the robot, which holds from its stamp."""
+        """Add a mount: a pose of a camera on the robot, valid from its stamp until the next mount."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
     def extract(self, frame: FrameMessage, stamp: float) -> FrameView:

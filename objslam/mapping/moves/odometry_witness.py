@@ -19,7 +19,8 @@ turn takes, 2 to 4 s in recorded drives. A larger value misses shorter errors.""
 
 
 def odometry_contradicts(log: Log, settings: Settings) -> bool:
-    """Return whether the odometry shows that the localisation errs for seconds, by at least what `localization` says.
+    """Return whether the odometry shows that the localisation errs for seconds, by at least the noise in the settings
+    `localization`.
 
     Both paths are compared at the clocks that the turns of the robot show. A localisation that agrees with its settings, and
     a log without odometry, give False.
