@@ -261,7 +261,7 @@ class Reconstruction(Section):
     stride: Count = 1
     """Step between the depth images that are used. 1 uses every depth image."""
     max_frames: Annotated[int, Field(ge=1, le=65535)] = 1000
-    """Maximum number of depth images. Above it, some images are skipped evenly."""
+    """Maximum number of depth images. If there are more, images at even intervals are used."""
     max_blocks: Annotated[int, Field(ge=2048)] = 80_000
     """Maximum number of blocks of 6^3 voxels in the grid. A block takes 4.3 kB."""
 

@@ -48,8 +48,7 @@ class JointState:
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
     (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
-    until the last solve. unsettled: as in `Solution`. doubted: the labels of which it is not clear whether they name one
-    object or several.
+    until the last solve. unsettled: as in `Solution`. doubted: the labels that may name one object or several.
     """
 
     frames: Keyframes

@@ -93,8 +93,8 @@ class Solution:
     a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
     the box. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
     object in the box of each ray. bodies, body_share, to_centre and hidden are None if no bodies were solved. doubted: the
-    labels of which it is not clear whether they name one object or several. unsettled: the objects that the last round
-    changed, as of `objects_changed`, although no further round was allowed.
+    labels that may name one object or several. unsettled: the objects that the last round changed, as of `objects_changed`,
+    although no further round was allowed.
     """
 
     keyframes: Keyframes
@@ -128,7 +128,8 @@ def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
 
 
 def with_jumps(solution: Solution, jumps: Jumps) -> Solution:
-    """Return the solution with the error of a map at poses of which `jumps` were taken out. All objects share it."""
+    """Return the solution with the error that a map has because `jumps` were removed from its poses. All objects share
+    it."""
     estimate, association, rays = solution.estimate, solution.association, solution.rays
     used = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     keyframe = rays.keyframe[used]

@@ -100,7 +100,7 @@ class RemoteStore:
         return found
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. StoreError if the store refuses."""
+        """Write a file, and replace an older one. StoreError if it cannot be written."""
         self._parent(name)
         self._try(name, lambda path: self._fs.pipe_file(path, data))
 

@@ -40,7 +40,8 @@ class KeyframeSelector:
         self._last[camera] = start_T_camera
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, the stop has ended."""
+        """Register a frame that is neither redundant nor a keyframe. If its camera has moved since its last keyframe, it no
+        longer counts as standing."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0
