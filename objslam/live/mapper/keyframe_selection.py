@@ -24,7 +24,7 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Return whether a frame adds nothing: its camera stands, and enough keyframes since the stop show its labels."""
+        """Return whether a frame adds nothing: its camera stands, and enough keyframes since it stopped show its labels."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 

@@ -73,7 +73,7 @@ class _Stream(Generic[T]):
         return self.pass_on([stamp for stamp, _ in self.waiting if stamp <= until])
 
     def empty(self) -> list[T]:
-        """Return the messages that wait. They wait no longer."""
+        """Remove all waiting messages, and return them."""
         waited, self.waiting = self.waiting, []
         return [message for _, message in waited]
 
