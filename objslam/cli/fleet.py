@@ -29,10 +29,7 @@ Sources = Annotated[
 OutUrl = Annotated[str, typer.Option("-o", "--out", help="Folder or URL for results, sites and tables.")]
 By = Annotated[
     str,
-    typer.Option(
-        "--by",
-        help="What names the site of a log: a field of --layout, `folder` for its folder, or `none` for one site for all logs.",
-    ),
+    typer.Option("--by", help="What a site is named by: a field of --layout, or `folder`. `none`: all logs are one site."),
 ]
 LayoutOption = Annotated[
     str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")
