@@ -132,8 +132,9 @@ def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
     """Return which landmarks (N,) may be objects that are detected more rarely than their class.
 
     The rays of a phantom belong to other things. So a landmark whose rays also pass other landmarks within the gate (a
-    squared deviation) must be detected as often as its class. From odometry alone, all landmarks must be. Where the path is
-    wrong, the rays of a known thing miss it and may meet elsewhere. Only misses then show that this landmark is a phantom.
+    squared deviation) must be detected as often as its class. With odometry alone, each landmark must be detected that
+    often. Where the path is wrong, the rays of a known thing miss it and may meet elsewhere. Only misses then show that this
+    landmark is a phantom.
     """
     if not state.view.localized:
         return np.zeros(state.count, dtype=bool)

@@ -172,8 +172,8 @@ class Log:
     """The log of a robot, with odometry, localisation or both.
 
     odometry: odom_T_base. localization: map_T_base. path: the file or folder that was read, absolute, None for a log from
-    memory. reading: the data dropped while the log was read, None if they were not counted. part: the limits of a log that
-    is a part of a longer one: its stamps are from the first to before the second, s. None is no limit.
+    memory. reading: the data dropped while the log was read, None if they were not counted. part: the begin and the end, s,
+    if the log is a part of a longer log. A stamp at the end is outside. None means no limit.
     """
 
     name: str

@@ -57,7 +57,7 @@ def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log
 
 
 def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Trajectory:
-    """Return the odometry with the lengths and the turns of its steps corrected. Its first pose stays."""
+    """Return the odometry with the lengths and the turns of its steps corrected. Its first pose does not change."""
     return CorrectablePath(odometry).path(error)
 
 
@@ -165,7 +165,8 @@ def gripping(slip: float, curvature: Floats) -> Floats:
 
 
 class OdometryCorrection:
-    """Corrects odometry pose by pose, as it arrives, like `corrected_odometry` does for a whole path. The first pose stays.
+    """Corrects odometry pose by pose, as it arrives, like `corrected_odometry` does for a whole path. The first pose does
+    not change.
 
     A session corrects every pose. This takes a fraction of the time of `corrected_odometry`, and avoids numpy, with which a
     pose takes four times as long.

@@ -96,7 +96,7 @@ def possible(log: Log, settings: Settings) -> list[str]:
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
     position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
-    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves: that in space comes
+    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves. Odometry in space comes
     from a camera or a scanner, not from wheels. With a localisation, odometry only leads from one pose to the next. Such
     short ways hardly show a slip, and a free slip would let wrong associations fit.
     """

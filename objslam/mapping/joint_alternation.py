@@ -126,7 +126,7 @@ class JointState:
 
         If an earlier association returns, a few rays could change for ever. Then the best `explained` state since then is
         returned. A few changed rays hardly change the shared errors, but their estimation takes most of the time of a solve.
-        So the shared errors stay as the first round found them. After the last round, they are estimated again.
+        So the shared errors keep the values of the first round. After the last round, they are estimated again.
         """
         state, before, earlier = self, self, dict[bytes, Self]()
         held = False  # Whether the last solve held the shared errors.
@@ -167,8 +167,8 @@ class JointState:
         return objects_changed((before.association, before.estimate), (self.association, self.estimate))
 
     def released(self, hold: bool) -> Self:
-        """Return the state after one more solve. hold: whether the shared errors stay. If not, the solve estimates them
-        again."""
+        """Return the state after one more solve. hold: whether the shared errors keep their values. If not, the solve
+        estimates them again."""
         assert self.association is not None
         state = replace(self, hold=hold)
         return state.solve("association", self.association, self.solved_poses).merged()

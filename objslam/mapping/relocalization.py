@@ -29,7 +29,7 @@ def relocalize(
 ) -> tuple[Floats, Association] | None:
     """Return the most likely path (K, 4, 4) map_T_base through a map, and the objects of the rays along it.
 
-    Objects stay as they are, but may lose all their rays. None if no label has two objects to confuse.
+    Objects do not change, but may lose all their rays. None if no label has two objects that could be confused.
     """
     position = estimate.positions
     if not len(position):

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RangeShift:
-    """What takes R ranges from the surfaces of bodies to their centres, where bodies tell more than the widths of boxes.
+    """The corrections of R ranges from the surfaces of bodies to their centres. A range is corrected if its body tells more
+    than the width of its box.
 
     factor: (R,) on the range. bias: (R,) on `Rays.range_bias`. Both are 1 where nothing is told. surface: (R, 2) the new
     `Rays.surface`, NaN where nothing is told.
@@ -61,11 +62,11 @@ class RangeShift:
 
 @dataclass(frozen=True)
 class CentreShift:
-    """What turns R rays to the centres of bodies.
+    """The corrections that turn R rays to the centres of bodies.
 
     direction: (R, 3), added to the direction of each ray, in the camera frame. sigma: (R,) rad, the noise that this adds. It
-    is 0 unless something hides a part of the object in the image. ranges: what takes the ranges to these centres, None if
-    they stay.
+    is 0 unless something hides a part of the object in the image. ranges: the corrections of the ranges to these centres,
+    None if there are none.
     """
 
     direction: Floats

@@ -45,7 +45,7 @@ far away enlarge it."""
 
 @dataclass(frozen=True)
 class UsualViews:
-    """What is usual for each of N landmarks by the other landmarks of its class.
+    """What is usual for each of N landmarks, according to the other landmarks of its class.
 
     state: the landmarks. distance: (N,) m, the distance within which most boxes are. log_density: (N,) of things of its
     class, ln m^-3. ln_size: (R,) of each box for a distance of 1 m, of the side whose sizes scatter less. It is NaN for a

@@ -29,7 +29,7 @@ _T = TypeVar("_T")
 def open_filesystem(url: str) -> tuple[Any, str]:
     """Return the file system of a URL, and the path of the URL in it.
 
-    ObjslamError if fsspec, or the package of the protocol, is not installed, or if nobody knows the protocol.
+    ObjslamError if fsspec, or the package of the protocol, is not installed, or if the protocol is unknown.
     """
     try:
         import fsspec

@@ -65,7 +65,7 @@ class Publications:
         return gone
 
     def add(self, handle: int, new: Publication) -> Publication | None:
-        """Keep a publisher. Returns the publisher that gives way, which may be the new one, or None if there is room."""
+        """Keep a publisher. Returns the publisher that is removed, which may be the new one, or None if there is room."""
         out = self.remove(handle)
         if out is None and len(self) >= MOST:
             worst = self._gives_way(new)

@@ -146,8 +146,9 @@ def associate_fixed(
     """Find the objects, and the noise of the poses if the settings allow it.
 
     With too narrow gates, one object becomes several, and their rays show hardly any noise. So the noise is first taken from
-    an association with wide gates. Then the association and the noise are found in turns until the noise stays. Returns the
-    input with this noise, the association, the estimate, and the number of objects in each round if there were several.
+    an association with wide gates. Then the association and the noise are found in turns until the noise no longer changes.
+    Returns the input with this noise, the association, the estimate, and the number of objects in each round if there were
+    several.
     """
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[float, float]] = []
