@@ -14,11 +14,11 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.triangulation.bodies.choice import log_evidence
 from objslam.triangulation.bodies.edges import BoxEdges
-from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Prior, Weights, fit
+from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Prior, fit
 from objslam.triangulation.bodies.prior import cuboid_prior
 from objslam.triangulation.bodies.residuals import residuals
 from objslam.triangulation.bodies.shapes import CUBOID, KINDS, Kind
-from objslam.triangulation.bodies.shared import effective_variance, sides_of, spread_of
+from objslam.triangulation.bodies.shared import sides_of, spread_of, weights_of
 
 _OUTER = 0.05
 """The outer body may reach beyond an edge. Then the edge counts with this share of its usual weight. With a smaller share,
@@ -115,8 +115,7 @@ def _of_bodies(edges: BoxEdges, boxes: Ints, bodies: Ints) -> BoxEdges:
 def _fitted(edges: BoxEdges, start: Floats, kind: Kind, prior: Prior, side: Floats, noise: Noise) -> tuple[Floats, Floats]:
     """Return the best bodies (N, 7) of one kind, and the logarithm of their evidence (N,)."""
     sides = sides_of(edges, start[:, :3])
-    variance = effective_variance(edges, sides, noise.factors, noise.share)
-    weights = Weights(variance, spread_of(edges, noise.factors, noise.share))
+    weights = weights_of(edges, sides, noise.factors, noise.share)
     found = fit(edges, start, prior, weights, kind, still=ENOUGH, most=STEPS)
     return found.values, log_evidence(edges, found, prior, weights, side)
 
