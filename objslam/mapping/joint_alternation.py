@@ -305,6 +305,7 @@ class JointState:
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
         from objslam.association.global_association import associate_globally
+        from objslam.association.observations import PosedRays
         from objslam.graph.fixed_pose_triangulation import noise_of_poses, noise_up
 
         frames, rays, map_T_camera = self.every_frame(map_T_base)
@@ -317,14 +318,8 @@ class JointState:
         if rough and mine.localized_every:  # A solve corrects tilt and height of the poses. Before it, rays have both.
             flat = flat_scale(rays, (yaw, place), self.settings) if any(noise_up(mine, self.settings)) else LEVEL
         return associate_globally(
-            rays,
-            frames,
-            self.cameras,
+            PosedRays(rays, frames, self.cameras, map_T_camera, sigma, place, flat),
             self.settings,
-            map_T_camera=map_T_camera,
-            sigma=sigma,
-            position_sigma=place,
-            flat_scale=flat,
             seed=self.settings.seed,
             guess=guess,
             # The landmarks of a solve hold the path together. Before the first solve, only the odometry does.

@@ -71,7 +71,9 @@ def calibrate_fixed(
     for number in range(MOST_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
         if number:
-            trial = _tried(at, now, errors, calibration, now.associate(told), trace)
+            association = now.associate(told)
+            progress("solve", 0, 0)
+            trial = _tried(at, now, errors, calibration, association, trace)
         else:
             trial, in_rows = _first_trial(at, now, errors, calibration, told, trace)
         association, estimate, found = trial.association, trial.estimate, trial.found
@@ -100,6 +102,7 @@ def calibrate_fixed(
             break
     else:
         ledger.warn(f"the shared errors still change after {MOST_ROUNDS} rounds of association")
+    assert found is not None  # There is at least one round.
     progress("solve", 0, 0)
     estimate = now.solve(association, trace, _parameters(calibration))
     centred = _calibrated_by_centres(now, errors, association, estimate, calibration.values)
