@@ -11,7 +11,7 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Rays
-from objslam.frontend.corrected_log import AXES, LENS
+from objslam.frontend.corrected_log import AXES, LENS, refocused
 
 PLACE = ("x", "y", "z")
 """The moves of a camera on the robot, along the axes of base."""
@@ -41,12 +41,8 @@ def corrected_rays(
         origins = origins + np.einsum("mrij,rj->mri", turned, rays.offset)
     if not lens.any():
         return origins, np.einsum("mrij,rj->mri", turned, rays.direction), np.broadcast_to(rays.sigma, lens.shape[:2])
-    # As in `refocused` and `refocused_noise`.
-    (focal, cx, cy), (x, y, z) = np.moveaxis(lens, -1, 0), rays.direction.T
-    longer = np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=-1)
-    length = np.linalg.norm(longer, axis=-1)
-    directions = np.einsum("mrij,mrj->mri", turned, longer / length[..., None])
-    return origins, directions, rays.sigma * np.sqrt((1 + focal) / length**3)
+    directions, factors = refocused(rays.direction, lens)
+    return origins, np.einsum("mrij,mrj->mri", turned, directions), rays.sigma * factors
 
 
 def _of_cameras(errors: Sequence[Mapping[str, float]], cameras: Sequence[str], kinds: Sequence[str]) -> Floats:

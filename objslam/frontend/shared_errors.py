@@ -21,7 +21,6 @@ from objslam.frontend.corrected_log import (
     later,
     lens_errors,
     refocused,
-    refocused_noise,
     take_out,
 )
 from objslam.frontend.corrected_rays import corrected_rays
@@ -158,15 +157,15 @@ class SharedErrors:
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
         settings, poses = self._scaled_noise(error), self._poses(error)
-        base_T_camera, direction, sigma = poses.base_T_camera.copy(), rays.direction, rays.sigma.copy()
+        base_T_camera, direction, sigma = poses.base_T_camera.copy(), rays.direction, rays.sigma
+        lens = np.array([lens_errors(error, name) for name in self.cameras])
+        if lens.any():
+            direction, factors = refocused(direction, lens[keyframes.camera[rays.keyframe]])
+            sigma = sigma * factors
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             mounts = base_T_camera[mine] if one.mount is not None else base_T_camera[mine][:1]
             base_T_camera[mine] = corrected_mount(mounts, error, one.camera.name)
-            lens = lens_errors(error, one.camera.name)
-            if any(lens):
-                sigma *= refocused_noise(direction, mine[rays.keyframe], lens)
-                direction = refocused(direction, mine[rays.keyframe], lens)
         gathered, step, wander = keyframes.drift, keyframes.step, keyframes.wander
         if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.

@@ -78,7 +78,7 @@ class BearingExtractor:
         reach = reach * to_centres(half, settings.depth.centre)
         lens, longer = lens_errors(errors, frame.camera), range_factors(errors, half)
         rays = FrameRays(
-            direction=refocused(direction, np.ones(len(direction), dtype=bool), lens),
+            direction=refocused(direction, lens)[0] if any(lens) else direction,
             sigma=sigma,
             range=corrected_ranges(errors, reach, direction, longer),
             range_sigma=range_noise(reach, half, same, [camera], settings)[0] * longer,
