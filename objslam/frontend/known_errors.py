@@ -105,8 +105,8 @@ def possible(log: Log, settings: Settings) -> list[str]:
     mounted = (*AXES, *LENS, "x", "y", "z")
     names = [n for n in error_names(log) if prior_sigma(n, settings, place) > 0]
     if log.localization is not None or (log.odometry is not None and not is_planar(log.odometry.poses)):
-        names = [n for n in names if kind(n) != "turn_slip"]
-    return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
+        names = [n for n in names if n != "odometry.turn_slip"]
+    return [n for n in names if not ((parts := n.rpartition("."))[0] in base and parts[2] in mounted)]
 
 
 def has_sized_tags(rays: Rays, settings: Settings) -> bool:
