@@ -34,7 +34,7 @@ class RangeShift:
 
     @classmethod
     def none(cls, count: int) -> RangeShift:
-        """Return the shift of `count` ranges that stay."""
+        """Return the corrections of `count` ranges that change nothing."""
         return cls(np.ones(count), np.ones(count), np.full((count, 2), np.nan))
 
     @property
@@ -43,7 +43,7 @@ class RangeShift:
         return np.isfinite(self.surface[:, 0])
 
     def only(self, rays: Bools) -> RangeShift:
-        """Return the shift of some ranges (R,). The others stay."""
+        """Return the corrections of some ranges (R,). The others do not change."""
         factor, bias = np.where(rays, self.factor, 1.0), np.where(rays, self.bias, 1.0)
         return RangeShift(factor, bias, np.where(rays[:, None], self.surface, np.nan))
 
@@ -74,12 +74,12 @@ class CentreShift:
     ranges: RangeShift | None = None
 
     def only(self, rays: Bools) -> CentreShift:
-        """Return the shift of some rays (R,). The others stay."""
+        """Return the corrections of some rays (R,). The others do not change."""
         ranges = None if self.ranges is None else self.ranges.only(rays)
         return CentreShift(np.where(rays[:, None], self.direction, 0.0), np.where(rays, self.sigma, 0.0), ranges)
 
     def apply(self, rays: Rays) -> Rays:
-        """Return the rays to the centres of bodies. Their ranges stay."""
+        """Return the rays to the centres of bodies. Their ranges do not change."""
         direction = rays.direction + self.direction
         direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         return replace(rays, direction=direction, sigma=np.hypot(rays.sigma, self.sigma))
