@@ -71,7 +71,7 @@ def run(
         map: the map of another day, as a `Result`, an `ObjectMap`, or its file or result folder. If the drive is found in
             this map, the result is in the frame of the map, and the objects of the map count as priors. `Result.localised`
             says whether it was found.
-        progress: is called with the stage's name, the work done, and the total work, 0 if the total is unknown.
+        progress: a function that gets the stage's name, the work done, and the total work, 0 if the total is unknown.
         changes: more changes, which override `settings`: `mode="joint"`, `rays={"pixel_sigma": 2}`.
     Raises:
         LogError: no frame lies on the path. SolveError: no box gives a usable ray. ConfigError: a setting is wrong.

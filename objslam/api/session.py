@@ -72,7 +72,7 @@ class Session(LiveSession):
         return super().push_localization(stamp, _pose(map_T_base), covariance)
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: ArrayLike) -> bool:
-        """Push base_T_camera of a camera that moves on the robot. It holds from the stamp, s, on.
+        """Push base_T_camera of a camera that moves on the robot. It is valid from the stamp, s, until the next one.
 
         The pose has one of the forms of `push_odometry`.
         """

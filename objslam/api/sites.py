@@ -39,9 +39,9 @@ def merge(sessions: Sequence[Given]) -> tuple[Island, ...]:
 def diff(a: Given, b: Given) -> Comparison:
     """Compare a map with the map of a later session: which objects are confirmed, moved, gone, new or unconfirmed.
 
-    The later session should be the result of a run. A map alone does not say what was in view, nor does the result of a live
-    session. So no object could be called gone or moved, see `Comparison.has_views`. If the registration is refused, there
-    are no changes, and `reason` says why. OutputError if a path cannot be read.
+    The later session should be the result of a run. A map alone does not say what was in view, and the result of a live
+    session does not say it either. Then no object counts as gone or moved (`Comparison.has_views`). If the registration is
+    refused, there are no changes, and `reason` says why. OutputError if a path cannot be read.
     """
     return compare(_session(a, "the first map"), _session(b, "the other map"))
 

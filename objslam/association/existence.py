@@ -65,12 +65,16 @@ class Rates:
         An object has a rate of its class or, with the probability `_UNUSUAL_SHARE`, a lower one. rarer: (N,) whether it may
         have a lower one.
         """
-        of, phantom = (history.seen, history.expected, label), self.mean * _PHANTOM_SHARE
+        phantom, (lower, rarer_concentration) = self.mean * _PHANTOM_SHARE, _UNUSUAL_RATE
         # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
-        as_phantom = _beta_binomial(*of, phantom, 1 / phantom)
-        usual = np.log1p(-_UNUSUAL_SHARE) + _beta_binomial(*of, self.mean, self.concentration)
-        lower, concentration = _UNUSUAL_RATE
-        unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + _beta_binomial(*of, lower * self.mean, concentration)
+        rates = np.stack([phantom, self.mean, lower * self.mean])
+        concentrations = np.stack(np.broadcast_arrays(1 / phantom, self.concentration, rarer_concentration))
+        if concentrations.ndim > rates.ndim:
+            rates = rates[:, None]
+        of = history.seen, history.expected, label
+        as_phantom, usual, unusual = _beta_binomial(*of, rates, concentrations)
+        usual = np.log1p(-_UNUSUAL_SHARE) + usual
+        unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + unusual
         return np.asarray(np.logaddexp(usual, unusual) - as_phantom)
 
 
@@ -89,10 +93,14 @@ def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rate
 
 
 def _beta_binomial(seen: Ints, expected: Ints, label: Ints, rate: Floats, concentration: float | Floats) -> Floats:
-    """Return ln of the probability (N,) of a sequence of detections and misses, if the rate has a beta distribution. label:
-    (N,) of the objects. rate, concentration: (L,) the mean rate of each class, and the sum of the two parameters."""
+    """Return ln of the probability (..., N) of a sequence of detections and misses, if the rate has a beta distribution.
+
+    label: (N,) of the objects. rate, concentration: (..., L) the mean rate of each class, and the sum of the two parameters.
+    """
     a, b = concentration * rate, concentration * (1 - rate)
-    return log_beta(a[..., label] + seen, b[..., label] + expected - seen) - log_beta(a, b)[..., label]
+    counted = [a[..., label] + seen, a], [b[..., label] + expected - seen, b]
+    both = log_beta(*(np.concatenate(parts, axis=-1) for parts in counted))
+    return both[..., : len(label)] - both[..., len(label) :][..., label]
 
 
 def _weighted_median(values: Floats, weight: Floats, group: Ints, count: int) -> Floats:
@@ -124,8 +132,9 @@ def rarer_objects(state: State, rates: Rates, gate: float) -> Bools:
     """Return which landmarks (N,) may be objects that are detected more rarely than their class.
 
     The rays of a phantom belong to other things. So a landmark whose rays also pass other landmarks within the gate (a
-    squared deviation) must be detected as often as its class. From odometry alone, all landmarks must be. Where the path is
-    wrong, the rays of a known thing miss it and may meet elsewhere. Only misses then show that this landmark is a phantom.
+    squared deviation) must be detected as often as its class. With odometry alone, each landmark must be detected that
+    often. Where the path is wrong, the rays of a known thing miss it and may meet elsewhere. Only misses then show that this
+    landmark is a phantom.
     """
     if not state.view.localized:
         return np.zeros(state.count, dtype=bool)

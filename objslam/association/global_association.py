@@ -18,14 +18,13 @@ from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
-from objslam.association.observations import observe
+from objslam.association.observations import PosedRays, observe
 from objslam.association.refinement import grouped_sums
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.camera import Camera
-from objslam.core.ground.flattening import LEVEL, flattened_points
+from objslam.core.ground.flattening import flattened_points
 from objslam.core.statistics import grouped_quantile
-from objslam.core.types import Association, Keyframes, Rays
+from objslam.core.types import Association
 
 _TURNS = 8
 """The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
@@ -67,15 +66,9 @@ class _Task:
 
 
 def associate_globally(
-    rays: Rays,
-    keyframes: Keyframes,
-    cameras: tuple[Camera, ...],
+    of: PosedRays,
     settings: config.Settings,
     *,
-    map_T_camera: Floats,
-    sigma: Floats,
-    position_sigma: float = 0.0,
-    flat_scale: float = LEVEL,
     seed: int = 0,
     guess: tuple[Association, Floats] | None = None,
     drifts: bool = False,
@@ -87,21 +80,20 @@ def associate_globally(
     rays and keyframes does not matter.
 
     Args:
-        keyframes: all observed frames. Frames without a box count as misses.
-        map_T_camera: (K, 4, 4) of the keyframes.
-        sigma: (R,) rad, position_sigma: m, the noise of rays and poses. flat_scale: as `Observations.scale`.
+        seed: the seed of the random pairs of rays.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
         solved: whether the poses are those of a joint solve. The rays of one thing meet there, as at localised poses.
     """
-    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, sigma, position_sigma, flat_scale)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, drifts=drifts, cut=rays.cut)
+    rays, keyframes, cameras = of.rays, of.keyframes, of.cameras
+    obs, ray, keyframe = observe(of)
+    view = frames_of(keyframes, keyframe, cameras, of.map_T_camera, settings, drifts=drifts, cut=rays.cut)
     nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
     if guess is not None:
         association, position = guess
-        known = flattened_points(position, flat_scale), np.ones(len(position)), association.label
+        known = flattened_points(position, of.scale), np.ones(len(position)), association.label
         state = replace(state, landmarks=Landmarks.new(*known, len(rays.label_names)), matched=association.object[ray])
         state = _alternate(task, _learned(state.keep(_plausible(task, state))))
     state, refuted, moving = _search(task, state, nothing)

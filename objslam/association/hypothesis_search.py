@@ -186,8 +186,8 @@ class _Scorer:
         return best.sum(axis=1)
 
     def refine(self, points: Tensor, support: Tensor) -> Tensor:
-        """Move points (H, 3) to the least-squares solution of the rays, with the weights `support` (H, R). A point stays in
-        directions that its rays do not fix."""
+        """Move points (H, 3) to the least-squares solution of the rays, with the weights `support` (H, R). A point does not
+        move in directions that its rays do not fix."""
         xp = module_of(points)
         information = (support @ self.across).reshape(-1, 3, 3)
         trace = information[:, 0, 0] + information[:, 1, 1] + information[:, 2, 2]

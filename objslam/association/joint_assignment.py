@@ -37,9 +37,9 @@ class Pairings:
 class JointAssignment:
     """The best hypothesis.
 
-    chosen: (n,) the indices of its pairings. odds: its log odds over "all measurements are of new things". margin, rival:
-    (n,) compare it, for each pairing, with the best hypothesis that lacks this pairing. margin: how much larger its log odds
-    are. rival: whether the other hypothesis pairs the same measurement with another landmark.
+    chosen: (n,) the indices of its pairings. odds: its log odds against the hypothesis that all measurements are of new
+    things. margin, rival: (n,) compare it, for each pairing, with the best hypothesis that lacks this pairing. margin: how
+    much larger its log odds are. rival: whether the other hypothesis pairs the same measurement with another landmark.
     """
 
     chosen: Ints

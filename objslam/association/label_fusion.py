@@ -20,8 +20,8 @@ _MOST_BY_CHANCE = 1e-3  # The most labels accepted by chance in a log, on averag
 def fused_labels(state: State, gate: float) -> Bools:
     """Return which labels (N, L) each landmark accepts: its own label, and labels whose unassigned boxes it explains.
 
-    An explained box lies on the landmark, in a frame in which the landmark has no box of its own. The explained boxes of a
-    label must have the landmark's size. There must be more explained boxes than by chance, and fewer than the landmark's own
+    An explained box lies on the landmark, in a frame in which no box belongs to the landmark. The explained boxes of a label
+    must have the landmark's size. There must be more explained boxes than by chance, and fewer than the landmark's own
     boxes.
     """
     obs, accepts = state.obs, state.landmarks.accepts

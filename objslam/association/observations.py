@@ -101,34 +101,42 @@ def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floa
     return along_first, along_second, (one + two) / 2, ((one - two) ** 2).sum(axis=1), sin2
 
 
-def observe(
-    rays: Rays,
-    keyframes: Keyframes,
-    cameras: tuple[Camera, ...],
-    map_T_camera: Floats,
-    sigma: Floats,
-    position_sigma: float,
-    scale: float = LEVEL,
-) -> tuple[Observations, Ints, Ints]:
+@dataclass(frozen=True)
+class PosedRays:
+    """The rays of K keyframes at given camera poses, with their noise.
+
+    rays, keyframes: all observed frames and their rays. Frames without a ray count as misses. map_T_camera: (K, 4, 4) of the
+    keyframes. sigma: (R,) rad, the noise of the directions. position_sigma: m, the noise of the origins along each axis.
+    scale: as in `Observations`.
+    """
+
+    rays: Rays
+    keyframes: Keyframes
+    cameras: tuple[Camera, ...]
+    map_T_camera: Floats
+    sigma: Floats
+    position_sigma: float = 0.0
+    scale: float = LEVEL
+
+
+def observe(of: PosedRays) -> tuple[Observations, Ints, Ints]:
     """Return the rays as observations, the ray (R,) of each observation, and the keyframe (K,) of each frame.
 
     Frames are sorted by time and camera. Boxes in a frame are sorted by label and coordinates. So the input order has no
     effect.
-
-    map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, noise of the directions. position_sigma: m, noise of the
-    origins. scale: as in `Observations`.
     """
+    keyframes, rays = of.keyframes, of.rays
     keyframe = np.lexsort((keyframes.frame, keyframes.camera, keyframes.stamps))
     frame = np.argsort(keyframe)[rays.keyframe]
     ray = np.lexsort((*rays.direction.T, rays.range, rays.score, *rays.box.T[::-1], rays.label, frame))
     rays, frame = rays.take(ray), frame[ray]
-    origin, direction, longer = flattened_lines(*rays.in_map(map_T_camera), scale)
+    origin, direction, longer = flattened_lines(*rays.in_map(of.map_T_camera), of.scale)
     known = np.isfinite(rays.range) & (rays.range > 0) & np.isfinite(rays.range_sigma) & (rays.range_sigma > 0)
     range_, range_sigma = (np.where(known, values * longer, np.nan) for values in (rays.range, rays.range_sigma))
-    lines = Observations.of_lines(origin, direction, sigma[ray], range_, range_sigma, rays.label)
-    size = size_per_metre(rays, keyframes, cameras)
-    obs = replace(lines, frame=frame, position_sigma=position_sigma, size=size, box=rays.box, track=rays.track_id)
-    obs = replace(obs, feature=rays.feature, feature_table=rays.feature_table, scale=scale)
+    lines = Observations.of_lines(origin, direction, of.sigma[ray], range_, range_sigma, rays.label)
+    size = size_per_metre(rays, keyframes, of.cameras)
+    obs = replace(lines, frame=frame, position_sigma=of.position_sigma, size=size, box=rays.box, track=rays.track_id)
+    obs = replace(obs, feature=rays.feature, feature_table=rays.feature_table, scale=of.scale)
     return obs, ray, keyframe
 
 

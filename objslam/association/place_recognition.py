@@ -1,7 +1,7 @@
 """Place recognition: find one constellation of landmarks in another by the landmarks' relative positions.
 
-If several landmarks fit under one shift and turn within the drift, this is evidence for the place. The evidence is the Bayes
-factor of "the landmarks here are the landmarks there" over "all landmarks here are new".
+If several landmarks fit under one shift and turn within the drift, this is evidence for the place. The evidence is a Bayes
+factor. It compares two hypotheses: the landmarks here are the landmarks there, or all landmarks here are new.
 """
 
 from dataclasses import dataclass
@@ -67,8 +67,8 @@ class Recognition:
     """One constellation found in another.
 
     correction: (4, 4) planar, from the first to the second. pairs: (P, 2) indices of common landmarks in the first and the
-    second. evidence: log Bayes factor over "all are new". lead: the evidence minus the evidence of the second-best place.
-    The evidence of the second-best place counts as at least 0.
+    second. evidence: the logarithm of the Bayes factor against the hypothesis that all landmarks are new. lead: the evidence
+    minus the evidence of the second-best place. The evidence of the second-best place counts as at least 0.
     """
 
     correction: Floats
@@ -239,7 +239,7 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
     """Return the gains (H, C) of pairs a, b (C,) under corrections (H, 3). A gain is -inf outside the gate.
 
-    It is the log likelihood ratio of "both are one landmark" over "the landmark here is new".
+    It is a log likelihood ratio: that the two are one landmark, against that the landmark here is new.
     """
     return _gain(problem, a, b, problem.target[b] - _moved(problem.offset, x)[0][:, a])
 

@@ -125,10 +125,10 @@ def detection_history(
 ) -> DetectionHistory:
     """Return in which frames the objects are or should be detected.
 
-    An object should be detected under four conditions. Its box lies in the image, where no cut off box of its label is. Its
-    distance is in the usual range of its class, extended to the median distance of its own boxes. No closer box hides it.
-    The camera sees its front, if it has one. matched: (R,) the object of each observation, -1 for none.
-    position, label: (N, 3) m and (N,), of the objects, in the world of the observations.
+    An object should be detected under four conditions. Its box lies in the image, and no cut off box of its label is there.
+    Its distance is in the usual range of its class, extended to the median distance of its own boxes. No closer box hides
+    it. The camera sees its front, if it has one. matched: (R,) the object of each observation, -1 for none. position, label:
+    (N, 3) m and (N,), of the objects, in the world of the observations.
     """
     position = raised_points(position, obs.scale)
     obs = replace(obs, origin=raised_points(obs.origin, obs.scale))
@@ -165,7 +165,8 @@ def detection_history(
 
 
 def seen_from(position: Floats, origins: Floats) -> SeenFrom:
-    """Return from where an object at a position (3,) was detected by cameras at origins (n, 3), m."""
+    """Return the distances and directions from which cameras at origins (n, 3), m, detected an object at a position (3,),
+    m."""
     toward = origins - position
     distance = np.linalg.norm(toward, axis=1)
     sides = thinned(toward / np.maximum(distance, MIN_DEPTH)[:, None])

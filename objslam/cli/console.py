@@ -149,7 +149,8 @@ def _now_and_then(ledger: SpeakingLedger | None, tell: Callable[[], None]) -> It
 
 
 def warn_of_neighbours(out: Path) -> None:
-    """Warn if the folder of a result holds other files and no result yet: the files of the result will stand among them."""
+    """Warn if the folder of a result contains other files and no result yet, because the files of the result will be among
+    them."""
     from objslam.output.result_folder import foreign_files
 
     if found := foreign_files(out):

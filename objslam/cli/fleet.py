@@ -28,7 +28,8 @@ Sources = Annotated[
 ]
 OutUrl = Annotated[str, typer.Option("-o", "--out", help="Folder or URL for results, sites and tables.")]
 By = Annotated[
-    str, typer.Option("--by", help="The site of a log: a field of --layout, `folder` (its folder), or `none` (one for all).")
+    str,
+    typer.Option("--by", help="What a site is named by: a field of --layout, or `folder`. `none`: all logs are one site."),
 ]
 LayoutOption = Annotated[
     str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")

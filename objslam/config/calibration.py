@@ -47,8 +47,8 @@ class CalibrationSettings(Section):
     """m by which all ranges are too short, along the optical axis. The zero of a depth sensor and the place of its camera,
     which was measured with a ruler, both err. It is estimated in joint mode only."""
     surface: NotNegative = 0.3
-    """share of half their width by which the centres of all things of a log are farther behind their visible surfaces than
-    depth.centre says. It is estimated in joint mode only."""
+    """error of depth.centre that all things of a log share, as a share of half their width. It is positive if the centres
+    are farther behind the visible surfaces. It is estimated in joint mode only."""
     tag_scale: NotNegative = 0.01
     """share by which all fiducials of a given size are smaller or larger than the settings say. A printer, a ruler, the lens
     and the detector of the corners each add to it. It is estimated in joint mode only."""
@@ -56,5 +56,5 @@ class CalibrationSettings(Section):
     """share by which the focal length of each camera is too long or too short. auto: 0.02 in fixed mode and with a
     localisation, 0 in joint mode with odometry alone."""
     centre: NotNegative = 0.02
-    """share of the focal length by which the image centre of each camera is off, along each axis. A centre that is assumed
-    in the middle of the image errs by as much, a calibrated camera by less."""
+    """share of the focal length by which the image centre of each camera is off, along each axis. The
+    default is usual for a centre that is assumed in the middle of the image. A calibrated centre errs by less."""

@@ -20,7 +20,7 @@ class Poses(Section):
     jumps: Literal["correct", "keep"] = "correct"
     """What happens to jumps of the localisation that are shorter than 1 m. correct: the poses on both sides of a jump are
     moved together unless the boxes refute it, and the map says that nobody knows which side was right. keep: the poses
-    stay as they are. They also do with checks.use=false."""
+    stay as they are. With checks.use=false, they always stay."""
 
 
 class RayNoise(Section):
@@ -32,8 +32,8 @@ class RayNoise(Section):
     """Box centre noise as a share of the box size (geometric mean of width and height), added in quadrature to
     pixel_sigma."""
     unknown_size: NotNegative = 0.2
-    """Width and height in m that an object is taken to have if its boxes do not show its size, as those of sensors that
-    measure a bearing only. box_sigma is a share of it. 0: such an object is a point."""
+    """Assumed width and height in m of an object whose boxes do not show its size, such as the boxes of a sensor that
+    measures only bearings. box_sigma is a share of it. 0: such an object is a point."""
     min_score: NotNegative = 0.0
     """Lowest score of a box that is used. A box with a lower score is dropped and counted."""
     border: Finite = 1.0
@@ -64,7 +64,7 @@ class Depth(Section):
 
 class Odometry(Section):
     """Configure odometry drift, a random walk whose standard deviations grow with the square root of the motion. On a path
-    that is not planar, the noise of x holds for all three axes, and the noise of the heading for all three rotations."""
+    that is not planar, all three axes have the noise of x, and all three rotations have the noise of the heading."""
 
     x_per_m: NotNegative = 0.02
     """Standard deviation along the driving direction in m after 1 m of driving."""
@@ -261,7 +261,7 @@ class Reconstruction(Section):
     stride: Count = 1
     """Step between the depth images that are used. 1 uses every depth image."""
     max_frames: Annotated[int, Field(ge=1, le=65535)] = 1000
-    """Maximum number of depth images. Above it, some images are skipped evenly."""
+    """Maximum number of depth images. If there are more, images at even intervals are used."""
     max_blocks: Annotated[int, Field(ge=2048)] = 80_000
     """Maximum number of blocks of 6^3 voxels in the grid. A block takes 4.3 kB."""
 

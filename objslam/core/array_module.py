@@ -132,4 +132,4 @@ def group_sum(values: Tensor, index: Tensor, count: int) -> Tensor:
 
 def length(vectors: Tensor, axis: int = -1) -> Tensor:
     """Return the Euclidean norms of vectors along one axis."""
-    return module_of(vectors).sqrt((vectors * vectors).sum(axis=axis))
+    return (vectors * vectors).sum(axis=axis) ** 0.5

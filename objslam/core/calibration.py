@@ -234,3 +234,9 @@ class CalibratedMeasurements(Protocol):
 
         drift: whether `Keyframes.drift` is needed. If not, the call is quicker, and the drift is not corrected.
         """
+
+    def rays_in_map(self, values: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return origins (M, R, 3), m, and unit directions (M, R, 3) in map, and noise (M, R), rad, of the rays of `at`.
+
+        values: (M, P) the errors. One call for many values takes far less time than a call of `at` for each.
+        """

@@ -86,7 +86,8 @@ class Trace:
         return Trace(self.base_T_camera, self.count)
 
     def take(self, attempt: Trace) -> None:
-        """Add the iterations of an attempt that succeeded."""
+        """Add the rounds and the iterations of an attempt that succeeded."""
+        self.rounds += attempt.rounds
         self._iterations += attempt._iterations
 
     def replace(self, attempt: Trace) -> None:

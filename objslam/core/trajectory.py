@@ -59,8 +59,9 @@ def poses_near(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:
 
     A stamp beyond an end of the path, or in a gap longer than `max_gap`, s, takes the nearest pose.
     """
-    known = np.clip(stamps, path.stamps[0], path.stamps[-1])
-    index = np.clip(np.searchsorted(path.stamps, known), 1, max(len(path) - 1, 1))
-    before, after = path.stamps[index - 1], path.stamps[np.minimum(index, len(path) - 1)]
+    at, last = path.stamps, len(path.stamps) - 1
+    known = np.clip(stamps, at[0], at[-1])
+    index = np.clip(np.searchsorted(at, known), 1, max(last, 1))
+    before, after = at[index - 1], at[np.minimum(index, last)]
     nearest = np.where(known - before < after - known, before, after)
-    return interpolate(path.stamps, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]
+    return interpolate(at, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]

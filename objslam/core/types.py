@@ -172,8 +172,8 @@ class Log:
     """The log of a robot, with odometry, localisation or both.
 
     odometry: odom_T_base. localization: map_T_base. path: the file or folder that was read, absolute, None for a log from
-    memory. reading: the data dropped while the log was read, None if they were not counted. part: the limits of a log that
-    is a part of a longer one: its stamps are from the first to before the second, s. None is no limit.
+    memory. reading: the data dropped while the log was read, None if they were not counted. part: the begin and the end, s,
+    if the log is a part of a longer log. A stamp at the end is outside. None means no limit.
     """
 
     name: str
@@ -195,20 +195,20 @@ class Log:
 class Keyframes:
     """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
-    stamps: (K,) s, non-decreasing. After a correction of the cameras' clocks, this holds for each camera alone. camera: (K,)
-    index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera. base_T_camera: (K, 4, 4).
-    map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation. localized_every: how many
-    keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. overlap: the
-    share of the keyframes of one moment that can show the same thing: 1 for one camera, or for cameras that look the same
-    way, and a quarter for four cameras that look to four sides. pose_noise: the factors on `localization.yaw` and
-    `localization.xy` that the log shows, 1 if they are not estimated. lasting: the parts of the errors of headings and of
-    places that last, in joint mode. odom_T_base: (K, 4, 4) in the coordinate frame of the first odometry pose, None without
-    odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error since its start, in the frame of
-    odom_T_base. stretch: (K,) the number of each keyframe's stretch of the odometry between two gaps, None means one stretch
-    for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step: (K,) the place of each
-    keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are those of `OdometryBridge.at`
-    in `frontend`, and None if the odometry is exact between its poses. given_stamps: (K,) s, as the frames have them in the
-    log or came from the robot, None if they are `stamps`.
+    stamps: (K,) s, non-decreasing. After a correction of the cameras' clocks, only the stamps of each camera are
+    non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera.
+    base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation.
+    localized_every: how many keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base
+    is odometry. overlap: the share of the keyframes of one moment that can show the same thing: 1 for one camera, or for
+    cameras that look the same way, and a quarter for four cameras that look to four sides. pose_noise: the factors on
+    `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. lasting: the parts of the
+    errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the coordinate frame of the first
+    odometry pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error since its
+    start, in the frame of odom_T_base. stretch: (K,) the number of each keyframe's stretch of the odometry between two gaps,
+    None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step:
+    (K,) the place of each keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are those
+    of `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses. given_stamps: (K,) s, as the
+    frames have them in the log or came from the robot, None if they are `stamps`.
     """
 
     stamps: Floats

@@ -97,7 +97,7 @@ def run_fleet(
     Args:
         price: of an hour of one core, for the column cost; NaN if unknown.
         again: whether logs that failed before because of their content are tried once more.
-        tell: is called at the start of the mapping, and when a task ends.
+        tell: a function that is called at the start of the mapping, and when a task ends.
         merge_engine: the engine of the merges, if they need other resources than the mapping. The default is `engine`.
     Raises:
         StoreError: the output cannot be read or written.

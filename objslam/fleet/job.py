@@ -23,7 +23,7 @@ def make_job(store: str, settings: Settings, options: SourceOptions, detector: P
 
     The key of the results depends on the content of the files that settings and options name, and not on their paths. store:
     the path or URL of the output. detector: the file of a model. report: whether each log gets a report.html. ConfigError if
-    a file cannot be read, StoreError if the store refuses.
+    a file cannot be read, StoreError if the store cannot be read or written.
     """
     files: dict[str, Path] = {}
     if settings.calibration.file is not None:

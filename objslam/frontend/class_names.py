@@ -94,8 +94,8 @@ def named(label: str, names: Mapping[int, str]) -> str | None:
 def with_names(log: Log, given: str, ledger: Ledger) -> Log:
     """Return the log with names in place of labels that are numbers. given: as for `load_names`.
 
-    Numbers without a name stay, and one warning counts their boxes. Labels of the truth become names too. ConfigError as
-    `load_names`.
+    Labels whose number has no name do not change, and one warning counts their boxes. Labels of the truth become names too.
+    ConfigError as `load_names`.
     """
     names, unnamed = load_names(given), Counter[str]()
     cameras = tuple(_named_camera(one, names, unnamed) for one in log.cameras)

@@ -8,7 +8,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import make_pose, motion_between
 from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import CameraLog, Images, Log, Trajectory
@@ -57,7 +57,7 @@ def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log
 
 
 def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Trajectory:
-    """Return the odometry with the lengths and the turns of its steps corrected. Its first pose stays."""
+    """Return the odometry with the lengths and the turns of its steps corrected. Its first pose does not change."""
     return CorrectablePath(odometry).path(error)
 
 
@@ -165,7 +165,8 @@ def gripping(slip: float, curvature: Floats) -> Floats:
 
 
 class OdometryCorrection:
-    """Corrects odometry pose by pose, as it arrives, like `corrected_odometry` does for a whole path. The first pose stays.
+    """Corrects odometry pose by pose, as it arrives, like `corrected_odometry` does for a whole path. The first pose does
+    not change.
 
     A session corrects every pose. This takes a fraction of the time of `corrected_odometry`, and avoids numpy, with which a
     pose takes four times as long.
@@ -266,31 +267,20 @@ def inverse_lens(errors: tuple[float, float, float]) -> tuple[float, float, floa
     return 1 / longer - 1, -errors[1] / longer, -errors[2] / longer
 
 
-def refocused(directions: Floats, mine: Bools, errors: tuple[float, float, float]) -> Floats:
-    """Return unit directions (R, 3), corrected by the errors `LENS` of a camera matrix.
+def refocused(directions: Floats, errors: Floats | tuple[float, float, float]) -> tuple[Floats, Floats]:
+    """Return unit directions (..., R, 3), corrected by the errors `LENS` of a camera matrix, and their factors (..., R).
 
-    Only directions in the mask `mine` (R,) change.
+    The factors are on the standard deviations of the directions. The correction is a linear map M and a projection onto the
+    unit sphere. It multiplies areas on the sphere by det M / |M d|^3 at direction d, and standard deviations by the root.
+    Towards the edge of an image, angles change by less than in its middle. With one factor for all directions, noise at the
+    edge would ask for a shorter focal length.
+
+    directions: (R, 3) unit. errors: (..., R, 3) of each direction, or (3,) of all.
     """
-    if not any(errors):
-        return directions
-    longer = np.where(mine[:, None], _refocused(directions, errors), directions)
-    return np.asarray(longer / np.linalg.norm(longer, axis=1, keepdims=True))
-
-
-def refocused_noise(directions: Floats, mine: Bools, errors: tuple[float, float, float]) -> Floats:
-    """Return factors (R,) on the standard deviations of unit directions (R, 3), which `refocused` corrects.
-
-    The correction is a linear map M and a projection onto the unit sphere. It multiplies areas on the sphere by det M / |M
-    d|^3 at direction d, and standard deviations by the root. Towards the edge of an image, angles change by less than in its
-    middle. With one factor for all directions, noise at the edge would ask for a shorter focal length.
-    """
-    return np.where(mine, np.sqrt((1 + errors[0]) / np.linalg.norm(_refocused(directions, errors), axis=1) ** 3), 1.0)
-
-
-def _refocused(directions: Floats, errors: tuple[float, float, float]) -> Floats:
-    """Return unit directions (R, 3), corrected by the errors `LENS`, with other lengths."""
-    (focal, cx, cy), (x, y, z) = errors, directions.T
-    return np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=1)
+    (focal, cx, cy), (x, y, z) = np.moveaxis(np.asarray(errors), -1, 0), directions.T
+    longer = np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=-1)
+    length = np.linalg.norm(longer, axis=-1)
+    return longer / length[..., None], np.sqrt((1 + focal) / length**3)
 
 
 def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:

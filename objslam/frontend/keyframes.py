@@ -23,8 +23,9 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
 
     The path is the localisation if the log has one, else the odometry. In joint mode a frame must also lie on the odometry,
     because the odometry gives the motion between keyframes. Nothing is extrapolated. The ledger counts the frames and boxes
-    that are outside the path or in one of its gaps longer than poses.max_gap. If a camera moves on the robot, the same holds
-    for its mount. LogError if the log has no path, no detection frame, or no frame on the path.
+    that are outside the path or in one of its gaps longer than poses.max_gap. If a camera moves on the robot, the ledger
+    also counts frames outside of the stamps of its mount. LogError if the log has no path, no detection frame, or no frame
+    on the path.
     """
     path = log.robot_path
     if path is None:
@@ -122,7 +123,7 @@ def _overlap(log: Log, camera: Ints) -> float:
 
 
 def with_mounts(frames: Keyframes, log: Log) -> Keyframes:
-    """Return frames with the camera poses on the robot of another log, which differs from theirs in nothing else. No camera
+    """Return frames with the mounts (base_T_camera) of another log. The two logs differ in their mounts only. No camera
     moves on the robot."""
     mounts = np.array([one.camera.base_T_camera for one in log.cameras])
     return replace(frames, base_T_camera=mounts[frames.camera], overlap=_overlap(log, frames.camera))

@@ -12,9 +12,11 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
-from objslam.core.types import Log, Rays
+from objslam.core.types import Keyframes, Log, Rays
 from objslam.errors import ConfigError
 from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.frontend.surface_ranges import half_widths_of_rays, with_known_surfaces
 from objslam.io.calibration_yaml import load_calibration
 
 _PLACE = 0.05
@@ -48,7 +50,7 @@ def usual_place(log: Log, settings: Settings) -> float:
     """Return the prior standard deviation, m, of the place of a camera on the base, if `calibration.translation` is auto.
 
     Against given poses, those of a localisation or of fixed mode, a wrong place of a camera moves all objects. A map from
-    odometry alone moves along.
+    odometry alone moves with the camera.
     """
     if settings.mode == "fixed":
         return _PLACE
@@ -94,7 +96,7 @@ def possible(log: Log, settings: Settings) -> list[str]:
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
     position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
-    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves: that in space comes
+    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves. Odometry in space comes
     from a camera or a scanner, not from wheels. With a localisation, odometry only leads from one pose to the next. Such
     short ways hardly show a slip, and a free slip would let wrong associations fit.
     """
@@ -103,8 +105,8 @@ def possible(log: Log, settings: Settings) -> list[str]:
     mounted = (*AXES, *LENS, "x", "y", "z")
     names = [n for n in error_names(log) if prior_sigma(n, settings, place) > 0]
     if log.localization is not None or (log.odometry is not None and not is_planar(log.odometry.poses)):
-        names = [n for n in names if kind(n) != "turn_slip"]
-    return [n for n in names if not (n.rpartition(".")[0] in base and kind(n) in mounted)]
+        names = [n for n in names if n != "odometry.turn_slip"]
+    return [n for n in names if not ((parts := n.rpartition("."))[0] in base and parts[2] in mounted)]
 
 
 def has_sized_tags(rays: Rays, settings: Settings) -> bool:
@@ -165,3 +167,29 @@ def take_out_expected(log: Log, settings: Settings) -> Log:
 def _parts(log: Log) -> str:
     cameras = ", ".join(one.camera.name for one in log.cameras)
     return f"the log has {'no' if log.odometry is None else 'an'} odometry and these cameras: {cameras or 'none'}"
+
+
+def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
+    """Return the errors that are estimated from a log by the settings, None if there are none.
+
+    keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
+    """
+    names: tuple[str, ...] = ()
+    half = half_widths_of_rays(rays, keyframes, [one.camera for one in log.cameras])
+    if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):
+        cameras = {one.camera.name: (keyframes.camera == index).any() for index, one in enumerate(log.cameras)}
+        measured = {
+            **cameras,
+            "odometry": keyframes.odom_T_base is not None,
+            **measured_lengths(rays, half, settings),
+        }
+        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
+    rays = with_known_surfaces(rays, half, settings.calibration.surface if "surface" in names else 0.0)
+    mean, place = np.zeros(len(names)), usual_place(log, settings)
+    prior = np.diag([prior_sigma(name, settings, place) ** 2 for name in names]).reshape(len(names), len(names))
+    known = known_errors(settings) if names else None
+    if known is not None:
+        here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
+        mean[here], prior[np.ix_(here, here)] = known.values[there], known.covariance[np.ix_(there, there)]
+    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior, sized_tags=has_sized_tags(rays, settings))
+    return errors if names or errors.unknown_noise else None

@@ -104,7 +104,7 @@ class Jumps:
         return np.searchsorted(self.stamps, stamps, side="right")
 
     def taken_out(self, path: Trajectory) -> Trajectory:
-        """Return the path without its jumps. The mean of its places stays. Each pose turns about its own place."""
+        """Return the path without its jumps. The mean of its places does not change. Each pose turns about its own place."""
         part, (place, rotation) = self.part(path.stamps), self.middle
         poses = path.poses.copy()
         poses[:, :3, 3] -= (self.offsets - place)[part]

@@ -114,7 +114,7 @@ class PlanarSteps:
         return cls(cos, sin, x, y, way, turn)
 
     def sums(self) -> Floats:
-        """Return the sums (14, N) up to each pose from which `_weights` makes the six elements of the drift.
+        """Return the sums (14, N) up to each pose. `_weights` makes the six elements of the drift from them.
 
         The variances of a step are linear in its way and its turn, so one set of sums serves any noise.
         """

@@ -18,8 +18,8 @@ _COMPARED = 32  # The most boxes of a label and frame that each box is compared 
 def parts_of_boxes(boxes: Floats, frame: Ints, label: Ints, scores: Floats, cut: Bools) -> Bools:
     """Return which boxes (M, 4) px show the thing of another box of their frame and label, so that they do not count.
 
-    Of two boxes of which one lies in the other, the one with the higher score counts, or the outer one if the scores are
-    equal. If the image's edge cuts off the outer box, the thing is cut off, so the inner box does not count.
+    If one box lies inside another, the box with the higher score counts. If the scores are equal, the outer box counts. If
+    the image's edge cuts off the outer box, the thing is cut off, so the inner box does not count.
 
     frame, label, scores: (M,) of the boxes. cut: (M,) whether the image's edge cuts off each box.
     """

@@ -1,6 +1,6 @@
 """The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
@@ -21,21 +21,12 @@ from objslam.frontend.corrected_log import (
     later,
     lens_errors,
     refocused,
-    refocused_noise,
     take_out,
 )
-from objslam.frontend.known_errors import (
-    estimates,
-    has_sized_tags,
-    known_errors,
-    measured_lengths,
-    possible,
-    prior_sigma,
-    usual_place,
-)
+from objslam.frontend.corrected_rays import corrected_rays
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
-from objslam.frontend.surface_ranges import corrected_lengths, half_widths_of_rays, weights_of, with_known_surfaces
+from objslam.frontend.surface_ranges import corrected_lengths, half_widths_of_rays, weights_of
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -130,7 +121,7 @@ class SharedErrors:
         half = half_widths_of_rays(self.rays, self.keyframes, [one.camera for one in self.log.cameras])
         return half * weights_of(self.rays)
 
-    @property
+    @cached_property
     def steps(self) -> Floats:
         """(P,) steps over which derivatives are taken.
 
@@ -145,7 +136,7 @@ class SharedErrors:
             steps["clock"] = float(np.clip(apart, _STEPS["clock"], longest))
         return np.array([steps.get(kind(name), _STEP) for name in self.names])
 
-    @property
+    @cached_property
     def bounds(self) -> Floats:
         """(P,) the largest absolute values of the parameters, in their units."""
         widest = np.abs(self.mean) + _MOST_SIGMAS * np.sqrt(np.diagonal(self.prior))
@@ -166,15 +157,15 @@ class SharedErrors:
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
         settings, poses = self._scaled_noise(error), self._poses(error)
-        base_T_camera, direction, sigma = poses.base_T_camera.copy(), rays.direction, rays.sigma.copy()
+        base_T_camera, direction, sigma = poses.base_T_camera.copy(), rays.direction, rays.sigma
+        lens = np.array([lens_errors(error, name) for name in self.cameras])
+        if lens.any():
+            direction, factors = refocused(direction, lens[keyframes.camera[rays.keyframe]])
+            sigma = sigma * factors
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             mounts = base_T_camera[mine] if one.mount is not None else base_T_camera[mine][:1]
             base_T_camera[mine] = corrected_mount(mounts, error, one.camera.name)
-            lens = lens_errors(error, one.camera.name)
-            if any(lens):
-                sigma *= refocused_noise(direction, mine[rays.keyframe], lens)
-                direction = refocused(direction, mine[rays.keyframe], lens)
         gathered, step, wander = keyframes.drift, keyframes.step, keyframes.wander
         if drift and self.log.odometry is not None and keyframes.odom_T_base is not None:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
@@ -192,6 +183,19 @@ class SharedErrors:
             noise = self.noise
             moved = replace(moved, pose_noise=(noise.heading, noise.place), lasting=noise.lasting)
         return moved, ranged, settings if tags is settings.tags else settings.model_copy(update={"tags": tags})
+
+    def rays_in_map(self, values: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return origins (M, R, 3), m, and unit directions (M, R, 3) in map, and noise (M, R), rad, of the rays of `at`.
+
+        values: (M, P) the errors. Values with the same clocks and the same odometry share their poses.
+        """
+        errors = [dict(zip(self.names, row, strict=True)) for row in values.tolist()]
+        keys = [self._poses_key(error) for error in errors]
+        distinct = dict(zip(keys, errors, strict=True))
+        which = [{key: number for number, key in enumerate(distinct)}[key] for key in keys]
+        _, map_T_base, base_T_camera = self._poses_at(list(distinct.values()))
+        rays = self.noise.rays_with_noise(self.rays)
+        return corrected_rays(map_T_base[which], base_T_camera[which], self.keyframes.camera, rays, self.cameras, errors)
 
     def corrected_log(self, values: Floats) -> Log:
         """Return the log corrected by the errors (P,): odometry, cameras and the stamps of frames."""
@@ -244,28 +248,41 @@ class SharedErrors:
     def _poses(self, error: Mapping[str, float]) -> "_Poses":
         """The poses of the keyframes. Rotations of cameras and scales of ranges do not change the poses, so the poses are
         kept."""
-        key = *self._odometry_key(error), *(error.get(f"{one.camera.name}.clock", 0.0) for one in self.log.cameras)
-        return self._kept_poses.get(key, lambda: self._computed_poses(error))
+        return self._kept_poses.get(self._poses_key(error), lambda: self._computed_poses(error))
+
+    def _poses_key(self, error: Mapping[str, float]) -> tuple[float, ...]:
+        return *self._odometry_key(error), *(error.get(f"{one.camera.name}.clock", 0.0) for one in self.log.cameras)
 
     def _computed_poses(self, error: Mapping[str, float]) -> "_Poses":
-        keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
-        assert path is not None
-        stamps, base_T_camera = keyframes.stamps.copy(), keyframes.base_T_camera.copy()
-        known = stamps.copy()  # The stamps at which the poses are taken, all within the time of the path.
+        keyframes, path = self.keyframes, self.log.robot_path
+        (known,), (map_T_base,), (base_T_camera,) = self._poses_at([error])
+        stamps, odom_T_base = keyframes.stamps.copy(), keyframes.odom_T_base
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
-            clock = error.get(f"{one.camera.name}.clock", 0.0)
-            known[mine] = np.clip(stamps[mine] + clock, path.stamps[0], path.stamps[-1])
-            stamps[mine] = later(stamps[mine], clock, path)
-            if one.mount is not None:
-                base_T_camera[mine] = poses_near(one.mount, known[mine], max_gap)
-        localization, odom_T_base = self.log.localization, keyframes.odom_T_base
-        map_T_base = keyframes.map_T_base if localization is None else poses_near(localization, known, max_gap)
-        if self.log.odometry is not None and (localization is None or odom_T_base is not None):
-            at = self._odometry_at(known, error)
-            map_T_base = at if localization is None else map_T_base
-            odom_T_base = None if odom_T_base is None else inverse(self.log.odometry.poses[0]) @ at
+            stamps[mine] = later(stamps[mine], error.get(f"{one.camera.name}.clock", 0.0), path)
+        if self.log.odometry is not None and odom_T_base is not None:
+            at = map_T_base if self.log.localization is None else self._odometry_at(known, error)
+            odom_T_base = inverse(self.log.odometry.poses[0]) @ at
         return _Poses(stamps, known, base_T_camera, map_T_base, odom_T_base)
+
+    def _poses_at(self, errors: Sequence[Mapping[str, float]]) -> tuple[Floats, Floats, Floats]:
+        """The stamps (D, K) at which the poses are taken, all within the time of the path, map_T_base and base_T_camera
+        (D, K, 4, 4), for D values of the errors."""
+        keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
+        assert path is not None
+        clocks = np.array([[error.get(f"{name}.clock", 0.0) for name in self.cameras] for error in errors])
+        known = np.clip(keyframes.stamps + clocks[:, keyframes.camera], path.stamps[0], path.stamps[-1])
+        base_T_camera = np.repeat(keyframes.base_T_camera[None], len(errors), axis=0)
+        for index, one in enumerate(self.log.cameras):
+            if one.mount is not None:
+                mine = keyframes.camera == index
+                at = poses_near(one.mount, known[:, mine].ravel(), max_gap)
+                base_T_camera[:, mine] = at.reshape(len(errors), -1, 4, 4)
+        if self.log.localization is not None:
+            map_T_base = poses_near(self.log.localization, known.ravel(), max_gap).reshape(*known.shape, 4, 4)
+        else:
+            map_T_base = np.stack([self._odometry_at(stamps, error) for stamps, error in zip(known, errors, strict=True)])
+        return known, map_T_base, base_T_camera
 
     @cached_property
     def _kept_poses(self) -> RecentValues["_Poses"]:
@@ -319,29 +336,3 @@ class _Poses:
     base_T_camera: Floats
     map_T_base: Floats
     odom_T_base: Floats | None
-
-
-def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
-    """Return the errors that are estimated from a log by the settings, None if there are none.
-
-    keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
-    """
-    names: tuple[str, ...] = ()
-    half = half_widths_of_rays(rays, keyframes, [one.camera for one in log.cameras])
-    if estimates(settings, keyframes.odom_T_base is not None, keyframes.localized_every > 0):
-        cameras = {one.camera.name: (keyframes.camera == index).any() for index, one in enumerate(log.cameras)}
-        measured = {
-            **cameras,
-            "odometry": keyframes.odom_T_base is not None,
-            **measured_lengths(rays, half, settings),
-        }
-        names = tuple(n for n in possible(log, settings) if measured[n.rpartition(".")[0] or n])
-    rays = with_known_surfaces(rays, half, settings.calibration.surface if "surface" in names else 0.0)
-    mean, place = np.zeros(len(names)), usual_place(log, settings)
-    prior = np.diag([prior_sigma(name, settings, place) ** 2 for name in names]).reshape(len(names), len(names))
-    known = known_errors(settings) if names else None
-    if known is not None:
-        here, there = np.array([(names.index(n), i) for i, n in enumerate(known.names) if n in names], int).reshape(-1, 2).T
-        mean[here], prior[np.ix_(here, here)] = known.values[there], known.covariance[np.ix_(there, there)]
-    errors = SharedErrors(log, keyframes, rays, settings, names, mean, prior, sized_tags=has_sized_tags(rays, settings))
-    return errors if names or errors.unknown_noise else None

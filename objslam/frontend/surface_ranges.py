@@ -59,7 +59,7 @@ def corrected_ranges(errors: Mapping[str, float], ranges: Floats, direction: Flo
 def corrected_lengths(errors: Mapping[str, float], rays: Rays, half: Floats, larger: float) -> tuple[Floats, Floats]:
     """Return the ranges (R,) of rays and their standard deviations (R,), m, corrected for the shared errors.
 
-    half: as `half_widths`. larger: the factor by which the map is larger, and its noise with it.
+    half: as `half_widths`. larger: the factor by which the map and its noise are larger.
     """
     factors = range_factors(errors, half) * larger
     return corrected_ranges(errors, rays.range, rays.direction, factors), rays.range_sigma * factors

@@ -68,8 +68,8 @@ def explore(
     The exploration ends as soon as it cannot be sure any more (`is_sure`). The rays that are left have no landmark then.
 
     errors: gives the keyframes and rays for any values of the shared errors. The filter estimates these errors, starting
-    from their mean. surface: the value of the shared error of this name, which the filter does not estimate.
-    progress(done, total) is called with numbers of keyframes.
+    from their mean. surface: the value of the shared error of this name, which the filter does not estimate. The function
+    progress(done, total) gets numbers of keyframes.
     """
     if errors is not None:
         of_surface = np.array([name == "surface" for name in errors.names], dtype=bool)

@@ -17,6 +17,7 @@ from objslam.association.appearance.evidence import Looks, learn_ratio
 from objslam.association.correlative_alignment import align
 from objslam.association.global_association import associate_globally
 from objslam.association.nearest_neighbour import assign
+from objslam.association.observations import PosedRays
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera
@@ -74,7 +75,7 @@ class InitialEstimate:
 def initialize_unknown(
     keyframes: Keyframes, rays: Rays, cameras: tuple[Camera, ...], settings: Settings, progress: Callable[[int, int], None]
 ) -> InitialEstimate:
-    """Return initial poses and landmarks. The function progress(done, total) is called with numbers of keyframes."""
+    """Return initial poses and landmarks. The function progress(done, total) gets numbers of keyframes."""
     measured = Measurements.of(keyframes, rays, settings)
     assert keyframes.drift is not None
     heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])  # variance, rad^2
@@ -239,7 +240,7 @@ def _discover(
         return none
     some = rays.take(free)
     frames, poses = keyframes.take(np.arange(end)), map_T_camera[:end]
-    found = associate_globally(some, frames, cameras, settings, map_T_camera=poses, sigma=some.sigma)
+    found = associate_globally(PosedRays(some, frames, cameras, poses, some.sigma), settings)
     if found.count == 0:
         return none
     placed, ready = triangulate_landmarks(map_T_camera, some, found, fewest, settings)

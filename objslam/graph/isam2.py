@@ -146,7 +146,7 @@ class IncrementalGraph(GrowingGraph):
     def iterate(self) -> float:
         """Optimise all variables by one iteration of Levenberg-Marquardt, and return by which share the cost fell.
 
-        iSAM2 stays as it was until a `rebuild`, which must follow before the next update. SolveError as in `solve`.
+        iSAM2 does not change until a `rebuild`, which must follow before the next update. SolveError as in `solve`.
         """
         self.refresh()
         found = levenberg_marquardt(self._store.graph(), self._at.values(), 1)

@@ -59,7 +59,7 @@ class MultiStart:
         """Return the solution with the least misfit: `found`, or one that begins at another growing graph.
 
         Ranges determine a position at once. So if at least half of the objects have one, or if there are fiducials, the
-        first solution is returned. The same holds for a log with many rays (`_MOST_RAYS`). In a log with more than few rays
+        first solution is returned. It is also returned for a log with many rays (`_MOST_RAYS`). In a log with more than few rays
         (`_FEW_RAYS`), the first start that ends in a known minimum is the last one.
         """
         rays, object_ = self.measured.rays, self.association.object

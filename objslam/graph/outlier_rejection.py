@@ -200,10 +200,10 @@ def second_opinion(
 ) -> tuple[Floats, Bools, Ints]:
     """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
-    Corners of fiducials stay, because four corners of one square are better known than four separate points. An object also
-    stays if at least `enough` (N,) of its rays agree. `enough` is the number of agreeing rays at which an earlier new
-    position was not better. Return the positions (N, 3) m, whether each ray (R,) agrees with its object, and `enough` for
-    the next call.
+    Corners of fiducials keep their positions, because four corners of one square are better known than four separate points.
+    An object also keeps its position if at least `enough` (N,) of its rays agree. `enough` is the number of agreeing rays at
+    which an earlier new position was not better. Return the positions (N, 3) m, whether each ray (R,) agrees with its
+    object, and `enough` for the next call.
     """
     keyframes, rays = measured.keyframes, measured.rays
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)

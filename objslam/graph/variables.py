@@ -103,7 +103,8 @@ class Variables:
         return values
 
     def read(self, values: gtsam.Values) -> None:
-        """Set the variables from the values. A variable that the values lack stays. Other values are ignored."""
+        """Set the variables from the values. A variable without a value in them does not change. Values of other variables
+        are ignored."""
         poses, points = (
             dict(zip(number.tolist(), found, strict=True)) for number, found in (keyframes_in(values), landmarks_in(values))
         )

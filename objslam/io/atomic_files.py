@@ -33,7 +33,7 @@ class FileSet:
 
 
 def try_folder(folder: Path, files: FileSet) -> None:
-    """Create a folder and test writing to it. Temporary files of the set that killed processes left are deleted.
+    """Create a folder and test writing to it. The temporary files of this set that killed processes left behind are deleted.
 
     Raises OutputError if `replace_files` would fail.
     """
@@ -72,7 +72,8 @@ def has_staging(folder: Path) -> bool:
 
 
 def write_file(file: Path, data: bytes, *, tidy: bool = True) -> None:
-    """Write one file under a temporary name and rename it. Temporary files that killed processes left are deleted first.
+    """Write one file under a temporary name and rename it. The temporary files that killed processes left behind are deleted
+    first.
 
     tidy: whether to look for such files. This lists the folder, so it takes longer if there are more files. Raises
     OutputError with the final file name for a disk error.

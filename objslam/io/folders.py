@@ -38,7 +38,7 @@ def remove_leftovers(path: Path) -> None:
 
     A process that was killed while it replaced the folder `path` may have left the old folder in a temporary folder. If
     nothing is at `path` now, the old folder is moved back first. Files of other machines stay, because their processes may
-    be alive. Raises OSError if the disk refuses.
+    be alive. Raises OSError if the folder cannot be changed.
     """
     ours = re.compile(rf"\.{re.escape(path.name)}\.{_machine()}-([0-9]{{1,9}})(?:\..*)?", re.DOTALL)
     for entry in list(path.parent.iterdir()) if path.parent.is_dir() else []:

@@ -17,7 +17,7 @@ class Sink(Protocol):
     """
 
     def push_camera(self, camera: Camera) -> bool:
-        """Push a calibrated camera. Its base_T_camera holds until `push_mount` replaces it."""
+        """Push a calibrated camera. Its base_T_camera is valid until `push_mount` replaces it."""
 
     def push_odometry(self, stamp: float, odom_T_base: Floats, covariance: Floats | None = None) -> bool:
         """Push odom_T_base (4, 4) at a stamp, s. covariance: (6, 6), as in ROS, of x, y, z, roll, pitch, yaw."""
@@ -26,7 +26,8 @@ class Sink(Protocol):
         """Push map_T_base (4, 4) of a localisation at a stamp, s. covariance: as in `push_odometry`."""
 
     def push_mount(self, stamp: float, camera: str, base_T_camera: Floats) -> bool:
-        """Push base_T_camera (4, 4) of a camera that moves on the robot. It holds from the stamp, s, to the next mount."""
+        """Push base_T_camera (4, 4) of a camera that moves on the robot. It is valid from the stamp, s, until the next
+        mount."""
 
     def push_detections(
         self,

@@ -82,10 +82,10 @@ def needs_noisy_boxes(named: JointState, other: JointState) -> bool:
 def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, estimate: Estimate) -> Ints:
     """Return the labels that may name several objects, though the rays agree with a map of one object for each label.
 
-    With a localisation no label is doubted, because it holds the path. If the map needs noisy odometry and noisy boxes, all
-    labels with enough rays for two objects are doubted. If it needs noisy odometry alone, the labels that too few others
-    check (`unchecked_labels`) are doubted. If it needs neither, an unchecked label is doubted only if the map rejects many
-    of its rays.
+    With a localisation no label is doubted, because the localisation keeps the path from bending. If the map needs noisy
+    odometry and noisy boxes, all labels with enough rays for two objects are doubted. If it needs noisy odometry alone, the
+    labels that too few others check (`unchecked_labels`) are doubted. If it needs neither, an unchecked label is doubted
+    only if the map rejects many of its rays.
 
     Args:
         rays: the rays, with their labels.

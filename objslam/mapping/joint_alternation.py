@@ -48,8 +48,7 @@ class JointState:
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
     (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
-    until the last solve. unsettled: as in `Solution`. doubted: the labels of which it is not clear whether they name one
-    object or several.
+    until the last solve. unsettled: as in `Solution`. doubted: the labels that may name one object or several.
     """
 
     frames: Keyframes
@@ -127,7 +126,7 @@ class JointState:
 
         If an earlier association returns, a few rays could change for ever. Then the best `explained` state since then is
         returned. A few changed rays hardly change the shared errors, but their estimation takes most of the time of a solve.
-        So the shared errors stay as the first round found them. After the last round, they are estimated again.
+        So the shared errors keep the values of the first round. After the last round, they are estimated again.
         """
         state, before, earlier = self, self, dict[bytes, Self]()
         held = False  # Whether the last solve held the shared errors.
@@ -168,8 +167,8 @@ class JointState:
         return objects_changed((before.association, before.estimate), (self.association, self.estimate))
 
     def released(self, hold: bool) -> Self:
-        """Return the state after one more solve. hold: whether the shared errors stay. If not, the solve estimates them
-        again."""
+        """Return the state after one more solve. hold: whether the shared errors keep their values. If not, the solve
+        estimates them again."""
         assert self.association is not None
         state = replace(self, hold=hold)
         return state.solve("association", self.association, self.solved_poses).merged()
@@ -225,7 +224,7 @@ class JointState:
         return self.better(turns)
 
     def split(self) -> Self:
-        """Return the state after a split of objects that may be two, if the split makes the rays better `explained`.
+        """Return the state after a split of objects that may be two, if the rays then have a better value of `explained`.
 
         The rounds of `alternated` do not separate two things that share one object, because the path is bent until all rays
         agree. They also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles
@@ -306,6 +305,7 @@ class JointState:
 
     def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
         from objslam.association.global_association import associate_globally
+        from objslam.association.observations import PosedRays
         from objslam.graph.fixed_pose_triangulation import noise_of_poses, noise_up
 
         frames, rays, map_T_camera = self.every_frame(map_T_base)
@@ -318,14 +318,8 @@ class JointState:
         if rough and mine.localized_every:  # A solve corrects tilt and height of the poses. Before it, rays have both.
             flat = flat_scale(rays, (yaw, place), self.settings) if any(noise_up(mine, self.settings)) else LEVEL
         return associate_globally(
-            rays,
-            frames,
-            self.cameras,
+            PosedRays(rays, frames, self.cameras, map_T_camera, sigma, place, flat),
             self.settings,
-            map_T_camera=map_T_camera,
-            sigma=sigma,
-            position_sigma=place,
-            flat_scale=flat,
             seed=self.settings.seed,
             guess=guess,
             # The landmarks of a solve hold the path together. Before the first solve, only the odometry does.

@@ -115,6 +115,7 @@ def _with_few_rays(state: JointState) -> JointState:
     Few rays hardly correct the poses before these objects are known. So the search allows for all the noise that the
     localisation had."""
     from objslam.association.few_rays.additional_objects import add_few_ray_objects
+    from objslam.association.observations import PosedRays
     from objslam.graph.fixed_pose_triangulation import flat_noise
 
     association, estimate = state.association, state.estimate
@@ -123,17 +124,11 @@ def _with_few_rays(state: JointState) -> JointState:
     frames, rays, map_T_camera = state.every_frame(estimate.map_T_base)
     sigma, place, scale = flat_noise(rays, frames, state.settings)
     found = add_few_ray_objects(
-        rays,
-        frames,
-        state.cameras,
+        PosedRays(rays, frames, state.cameras, map_T_camera, sigma, place, scale),
         state.settings,
         association,
         np.where(estimate.solved[:, None], estimate.positions, np.nan),
-        map_T_camera=map_T_camera,
-        sigma=sigma,
-        position_sigma=place,
         seed=state.settings.seed,
-        flat_scale=scale,
     )
     return state if found.count == association.count else state.counted(found).solve("few rays", found, state.solved_poses)
 

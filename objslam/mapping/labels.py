@@ -45,7 +45,7 @@ noise."""
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:
     """Return whether to try one object for each label.
 
-    association.method decides: `by_label` is yes. `auto` is yes if hardly any keyframe has two rays of one label.
+    association.method decides. `by_label` means yes. `auto` means yes if hardly any keyframe has two rays of one label.
     """
     if settings.association.method != "auto":
         return settings.association.method == "by_label"

@@ -80,7 +80,8 @@ def reconstruct(
 def choose_shots(log: Log, path: Trajectory, settings: Settings, ledger: Ledger) -> list[Shot]:
     """Choose depth images that have a pose, in the order of time. If all cameras have colour, they also need a colour image.
 
-    Of these images, one in reconstruction.stride is taken. More than reconstruction.max_frames are thinned evenly.
+    Of these images, one in reconstruction.stride is taken. If these are more than reconstruction.max_frames, images at even
+    intervals are used.
     """
     chosen = settings.reconstruction
     colour = all(c.rgb is not None for c in log.cameras if c.depth is not None)

@@ -17,7 +17,7 @@ from objslam.errors import ObjslamError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.corrected_log import take_out
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.agreement import agreement, bounded_part
 from objslam.mapping.checks.diagnosis import Diagnosis

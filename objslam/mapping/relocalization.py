@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.association.nearest_neighbour import assign
-from objslam.association.observations import observe
+from objslam.association.observations import PosedRays, observe
 from objslam.association.path_search.most_likely_path import most_likely_path
 from objslam.association.visibility import detection_history, frames_of
 from objslam.config import Settings
@@ -29,14 +29,14 @@ def relocalize(
 ) -> tuple[Floats, Association] | None:
     """Return the most likely path (K, 4, 4) map_T_base through a map, and the objects of the rays along it.
 
-    Objects stay as they are, but may lose all their rays. None if no label has two objects to confuse.
+    Objects do not change, but may lose all their rays. None if no label has two objects that could be confused.
     """
     position = estimate.positions
     if not len(position):
         return None
     held = np.where((estimate.weight > 0) & np.isfinite(position[:, 0])[association.object], association.object, -1)
     map_T_camera = estimate.map_T_base @ keyframes.base_T_camera
-    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, rays.sigma, 0.0)
+    obs, ray, keyframe = observe(PosedRays(rays, keyframes, cameras, map_T_camera, rays.sigma))
     view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, cut=rays.cut)
     history = detection_history(obs, held[ray], np.nan_to_num(position), association.label, view)
     rate = history.seen / np.maximum(history.expected, 1)

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RangeShift:
-    """What takes R ranges from the surfaces of bodies to their centres, where bodies tell more than the widths of boxes.
+    """The corrections of R ranges from the surfaces of bodies to their centres. A range is corrected if its body tells more
+    than the width of its box.
 
     factor: (R,) on the range. bias: (R,) on `Rays.range_bias`. Both are 1 where nothing is told. surface: (R, 2) the new
     `Rays.surface`, NaN where nothing is told.
@@ -33,7 +34,7 @@ class RangeShift:
 
     @classmethod
     def none(cls, count: int) -> RangeShift:
-        """Return the shift of `count` ranges that stay."""
+        """Return the corrections of `count` ranges that change nothing."""
         return cls(np.ones(count), np.ones(count), np.full((count, 2), np.nan))
 
     @property
@@ -42,7 +43,7 @@ class RangeShift:
         return np.isfinite(self.surface[:, 0])
 
     def only(self, rays: Bools) -> RangeShift:
-        """Return the shift of some ranges (R,). The others stay."""
+        """Return the corrections of some ranges (R,). The others do not change."""
         factor, bias = np.where(rays, self.factor, 1.0), np.where(rays, self.bias, 1.0)
         return RangeShift(factor, bias, np.where(rays[:, None], self.surface, np.nan))
 
@@ -61,11 +62,11 @@ class RangeShift:
 
 @dataclass(frozen=True)
 class CentreShift:
-    """What turns R rays to the centres of bodies.
+    """The corrections that turn R rays to the centres of bodies.
 
     direction: (R, 3), added to the direction of each ray, in the camera frame. sigma: (R,) rad, the noise that this adds. It
-    is 0 unless something hides a part of the object in the image. ranges: what takes the ranges to these centres, None if
-    they stay.
+    is 0 unless something hides a part of the object in the image. ranges: the corrections of the ranges to these centres,
+    None if there are none.
     """
 
     direction: Floats
@@ -73,12 +74,12 @@ class CentreShift:
     ranges: RangeShift | None = None
 
     def only(self, rays: Bools) -> CentreShift:
-        """Return the shift of some rays (R,). The others stay."""
+        """Return the corrections of some rays (R,). The others do not change."""
         ranges = None if self.ranges is None else self.ranges.only(rays)
         return CentreShift(np.where(rays[:, None], self.direction, 0.0), np.where(rays, self.sigma, 0.0), ranges)
 
     def apply(self, rays: Rays) -> Rays:
-        """Return the rays to the centres of bodies. Their ranges stay."""
+        """Return the rays to the centres of bodies. Their ranges do not change."""
         direction = rays.direction + self.direction
         direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
         return replace(rays, direction=direction, sigma=np.hypot(rays.sigma, self.sigma))
@@ -93,8 +94,8 @@ class Solution:
     a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
     the box. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
     object in the box of each ray. bodies, body_share, to_centre and hidden are None if no bodies were solved. doubted: the
-    labels of which it is not clear whether they name one object or several. unsettled: the objects that the last round
-    changed, as of `objects_changed`, although no further round was allowed.
+    labels that may name one object or several. unsettled: the objects that the last round changed, as of `objects_changed`,
+    although no further round was allowed.
     """
 
     keyframes: Keyframes
@@ -128,7 +129,8 @@ def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
 
 
 def with_jumps(solution: Solution, jumps: Jumps) -> Solution:
-    """Return the solution with the error of a map at poses of which `jumps` were taken out. All objects share it."""
+    """Return the solution with the error that a map has because `jumps` were removed from its poses. All objects share
+    it."""
     estimate, association, rays = solution.estimate, solution.association, solution.rays
     used = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     keyframe = rays.keyframe[used]

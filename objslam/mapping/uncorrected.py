@@ -12,8 +12,8 @@ from objslam.mapping.solution import Solution
 def uncorrected_residual(errors: SharedErrors, solution: Solution, path: Trajectory) -> Floats | None:
     """Return the angles (R,), rad, between the rays as measured and their objects, NaN without an object.
 
-    A ray as measured has the shared errors at the mean of their prior. The objects and the solved path stay, so the angles
-    show what the correction improved. path: map_T_base at its full rate. None if no shared errors were estimated.
+    A ray as measured has the shared errors at the mean of their prior. The objects and the solved path are the same, so the
+    angles show what the correction improved. path: map_T_base at its full rate. None if no shared errors were estimated.
     """
     if solution.estimate.calibration is None:
         return None

@@ -57,13 +57,14 @@ def prepare_output(out: Path) -> None:
             raise OutputError(what, where=str(out), hint="name another folder with -o, or move these files")
         for name in RESULT_FILES.names(out):
             if (out / name).is_dir() and not (out / name).is_symlink():
-                raise OutputError("a folder stands where a file of the result goes: move it", where=str(out / name))
+                what = "a file of the result cannot be written, because a folder has its name: move the folder"
+                raise OutputError(what, where=str(out / name))
     try_folder(out, RESULT_FILES)
 
 
 def foreign_files(out: Path) -> list[str]:
-    """Return the names of what stands in a folder without a result, in order, but for hidden files. A result would go among
-    them."""
+    """Return the names of the files and folders in a folder without a result, in order, without hidden ones. They would be
+    beside the files of a result."""
     if not out.is_dir() or (out / files.SUMMARY).is_file() or (out / files.OBJECTS).is_file():
         return []
     return sorted({one.name for one in out.iterdir() if not one.name.startswith(".")} - set(RESULT_FILES.names(out)))

@@ -125,9 +125,8 @@ def render_drive(
 
     The same settings and seed give the same log for any number of workers (threads, by default one per core and at most 4).
     groundtruth/ holds the path, the centres of the objects' bounding boxes, the objects' sizes and yaws, and the true boxes
-    (`TRUTH_BOXES`).
-    progress: a function that is called with the number of images rendered so far and the number of all images.
-    Raises ConfigError if no room shows every object well enough, and OutputError if `check_target` refuses `out`.
+    (`TRUTH_BOXES`). progress: a function that gets the number of images rendered so far and the number of all images. Raises
+    ConfigError if no room shows every object well enough, and OutputError if `check_target` refuses `out`.
     """
     import cv2
 

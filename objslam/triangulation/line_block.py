@@ -76,7 +76,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 def norm(vectors: Tensor) -> Tensor:
     """Return the lengths (...) of vectors (3, ...)."""
-    return module_of(vectors).sqrt(dot(vectors, vectors))
+    return dot(vectors, vectors) ** 0.5
 
 
 def outer(a: Tensor, b: Tensor) -> Tensor:

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from objslam.association.global_association import associate_globally
+from objslam.association.observations import PosedRays
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, widest_angle
+from objslam.core.ground.flattening import LEVEL
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.evaluation.alignment import match_points
 from objslam.frontend.bearings import build_rays
@@ -36,15 +38,16 @@ class Scene:
     def associate(self, settings: Settings | None = None, **changes: Any) -> Association:
         rays = changes.pop("rays", self.rays)
         keyframes = changes.pop("keyframes", self.keyframes)
-        return associate_globally(
+        posed = PosedRays(
             rays,
             keyframes,
             self.cameras,
-            settings or Settings(),
-            map_T_camera=keyframes.map_T_camera,
-            sigma=rays.sigma,
-            **changes,
+            changes.pop("map_T_camera", keyframes.map_T_camera),
+            changes.pop("sigma", rays.sigma),
+            changes.pop("position_sigma", 0.0),
+            changes.pop("flat_scale", LEVEL),
         )
+        return associate_globally(posed, settings or Settings(), **changes)
 
     def well_seen(self) -> Bools:
         """(N,) the objects that 10 rays see under 10 degrees of parallax."""

@@ -10,7 +10,7 @@ from objslam.association.crossings.bundles import second_bundle
 from objslam.association.crossings.one_or_two import excess_of, find_crossings
 from objslam.association.crossings.usual_views import UsualViews
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.observations import observe
+from objslam.association.observations import PosedRays, observe
 from objslam.association.visibility import frames_of
 from objslam.config import Settings
 from objslam.core.arrays import Floats
@@ -43,9 +43,8 @@ def hall(seed: int, points: Floats, step: float = 0.12) -> Scene:
 def true_state(scene: Scene, joined: dict[int, int]) -> State:
     """The association of a scene by its truth, with landmarks at the points where their rays meet best. joined: things whose
     rays belong to another one."""
-    obs, ray, order = observe(
-        scene.rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, scene.rays.sigma, 0.0
-    )
+    of = PosedRays(scene.rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, scene.rays.sigma)
+    obs, ray, order = observe(of)
     whose = scene.whose.copy()
     for thing, other in joined.items():
         whose[whose == thing] = other

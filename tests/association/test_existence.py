@@ -22,7 +22,7 @@ from objslam.association.existence import (
 )
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.nearest_neighbour import associate_by_label
-from objslam.association.observations import extents, observe, overlap
+from objslam.association.observations import PosedRays, extents, observe, overlap
 from objslam.association.refinement import refine
 from objslam.association.visibility import CameraFrames, DetectionHistory, _hidden, detection_history, frames_of
 from objslam.config import Settings
@@ -43,7 +43,7 @@ def state_of(scene, rays=None, whose=None):
     rays = scene.rays if rays is None else rays
     whose = scene.whose if whose is None else whose
     poses = scene.keyframes.map_T_camera
-    obs, ray, _ = observe(rays, scene.keyframes, scene.cameras, poses, rays.sigma, 0.0)
+    obs, ray, _ = observe(PosedRays(rays, scene.keyframes, scene.cameras, poses, rays.sigma))
     landmarks = Landmarks.new(scene.points, np.ones(len(scene.points)), scene.label, len(rays.label_names))
     view = CameraFrames(scene.keyframes.stamps, scene.cameras, scene.keyframes.camera, poses, 0.0, 0.0)
     return State(obs, view, landmarks, whose[ray])
@@ -119,7 +119,7 @@ def test_boxes_hide_alike_in_frames_of_few_and_of_many():
     boxes = rays_of_boxes(
         frame, np.hstack([corner, corner + 100]), np.zeros(900, dtype=np.int64), scene.cameras[0], ("cup",)
     )
-    s, _, _ = observe(boxes, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, boxes.sigma, 0.0)
+    s, _, _ = observe(PosedRays(boxes, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, boxes.sigma))
     reach = np.where(rng.random(900) < 0.1, np.nan, rng.uniform(0.5, 4.0, 900))
     place, pixel, away = np.repeat(np.arange(80), 3), rng.uniform(50, 380, (240, 2)), rng.uniform(0.5, 4.0, 240)
     middle, half = (s.box[:, :2] + s.box[:, 2:]) / 2, 0.3 * (s.box[:, 2:] - s.box[:, :2])
@@ -246,7 +246,7 @@ def test_small_things_hide_each_other_where_large_ones_do_not():
     near = rays_of_boxes(
         np.zeros(1, dtype=int), np.array([[270.0, 190, 370, 290]]), np.zeros(1, dtype=int), scene.cameras[0], ("cup",)
     )
-    s, _, _ = observe(near, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, near.sigma, 0.0)
+    s, _, _ = observe(PosedRays(near, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, near.sigma))
     at, pixel = np.zeros(1, dtype=np.int64), np.array([[320.0, 240.0]])
     for size, hides in ((0.1, True), (0.3, False), (0.0, False)):
         sized = replace(s, size=np.full((1, 2), 0.1 / 0.85))
@@ -266,7 +266,7 @@ def test_more_rays_and_fewer_strays_are_less_like_chance():
     frame, centre = np.sort(rng.integers(0, 80, 4000)), rng.uniform(30, 450, (4000, 2))
     box, label = np.column_stack([centre - 9, centre + 9]), np.zeros(4000, dtype=np.int64)
     strays = rays_of_boxes(frame, box, label, scene.cameras[0], ("cup",), 4.0)
-    many, ray, _ = observe(strays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, strays.sigma, 0.0)
+    many, ray, _ = observe(PosedRays(strays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, strays.sigma))
     to = points[0] - many.origin
     near = np.linalg.norm(np.cross(to, many.direction), axis=1) < 3.7 * many.sigma * np.linalg.norm(to, axis=1)
     chance = replace(state, obs=many, matched=np.where(near, 0, -1))

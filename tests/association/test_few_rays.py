@@ -11,7 +11,7 @@ from objslam.association.existence import detection_rates
 from objslam.association.few_rays.additional_objects import add_few_ray_objects, few_ray_evidence
 from objslam.association.few_rays.chance import Strays, _Density, _looks, _smoothed, chance_odds, log_volume, ray_odds
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.observations import observe
+from objslam.association.observations import PosedRays, observe
 from objslam.association.visibility import frames_of
 from objslam.config import Settings
 from objslam.core.geometry import lift_se2
@@ -31,18 +31,17 @@ def nothing(rays):
     return Association(np.full(len(rays), -1), np.zeros(0, dtype=np.int64), existence=np.zeros(0))
 
 
+def posed(scene, rays):
+    return PosedRays(rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, rays.sigma)
+
+
 def search(scene, association=None, positions=None, rays=None, settings=None):
     rays = scene.rays if rays is None else rays
     return add_few_ray_objects(
-        rays,
-        scene.keyframes,
-        scene.cameras,
+        posed(scene, rays),
         settings or Settings(),
         nothing(rays) if association is None else association,
         np.zeros((0, 3)) if positions is None else positions,
-        map_T_camera=scene.keyframes.map_T_camera,
-        sigma=rays.sigma,
-        position_sigma=0.0,
     )
 
 
@@ -55,7 +54,7 @@ def stray(scene, count, frames, seed=0):
 
 
 def state_of(scene, points=POINT):
-    obs, _, order = observe(scene.rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, scene.rays.sigma, 0.0)
+    obs, _, order = observe(posed(scene, scene.rays))
     view = frames_of(scene.keyframes, order, scene.cameras, scene.keyframes.map_T_camera, Settings())
     landmarks = Landmarks.new(points, np.ones(len(points)), np.zeros(len(points), dtype=np.int64), 1)
     return State(obs, view, landmarks, scene.whose)
@@ -75,8 +74,7 @@ def test_two_rays_are_an_object_where_strays_are_rare_and_none_where_they_are_de
 
 def test_the_evidence_counts_the_rays_that_meet_and_the_frames_that_miss():
     def found(scene, rays):
-        of = {"map_T_camera": scene.keyframes.map_T_camera, "sigma": rays.sigma, "position_sigma": 0.0}
-        return few_ray_evidence(rays, scene.keyframes, scene.cameras, Settings(), **of)
+        return few_ray_evidence(posed(scene, rays), Settings())
 
     two, five = (watch(POINT, around(np.arange(n) * 60)) for n in (2, 5))
     few, more = found(two, two.rays), found(five, five.rays)
@@ -192,7 +190,7 @@ def test_more_looks_and_fewer_strays_are_less_like_chance():
     for count, strays in ((2, 0), (4, 0), (4, 400)):
         some = np.isin(scene.rays.keyframe, np.arange(count))
         rays = scene.rays.take(some) if not strays else join(scene.rays.take(some), stray(scene, strays, 12))
-        obs, _, _ = observe(rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, rays.sigma, 0.0)
+        obs, _, _ = observe(posed(scene, rays))
         state = state_of(scene)
         true = np.linalg.norm(np.cross(POINT - obs.origin, obs.direction), axis=1) < 0.02
         state = replace(state, obs=obs, matched=np.where(true & (obs.frame < count), 0, -1))

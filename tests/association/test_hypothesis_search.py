@@ -7,7 +7,7 @@ from association_scenes import rays_of_boxes, watch
 from scipy.optimize import least_squares
 
 from objslam.association.hypothesis_search import Search, _Scorer, discover
-from objslam.association.observations import closest_approach, observe
+from objslam.association.observations import PosedRays, closest_approach, observe
 from objslam.association.refinement import refine
 from objslam.core.array_module import as_numpy
 from objslam.core.geometry import lift_se2
@@ -22,7 +22,9 @@ def circle(count, radius=2.0):
 
 def observed(scene, rays=None, position_sigma=0.0):
     rays = scene.rays if rays is None else rays
-    return observe(rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, rays.sigma, position_sigma)[0]
+    return observe(
+        PosedRays(rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, rays.sigma, position_sigma)
+    )[0]
 
 
 THREE = np.array([[0.3, 0.2, 0.4], [-0.4, 0.3, 0.3], [0.1, -0.5, 0.5]])

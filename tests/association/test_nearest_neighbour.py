@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from objslam.association.gating import Edges, best_assignment, gate_limit, gated_edges, tangent_basis, track_bonus
 from objslam.association.landmarks import Landmarks
 from objslam.association.nearest_neighbour import assign
-from objslam.association.observations import MIN_DEPTH, Observations, observe
+from objslam.association.observations import MIN_DEPTH, Observations, PosedRays, observe
 from objslam.core.geometry import exp_se3, lift_se2
 
 EVERY = np.ones((2, 1), dtype=bool)
@@ -177,7 +177,7 @@ def test_the_innovation_is_what_sampling_says():
     pose = np.diag(np.array([0.01, 0.02, 0.015, 0.02, 0.03, 0.01]) ** 2)
     twist = rng.multivariate_normal(np.zeros(6), pose, count)
     frames = replace(scene.keyframes, base_T_camera=scene.keyframes.base_T_camera @ exp_se3(twist))
-    obs, ray, _ = observe(scene.rays, frames, scene.cameras, frames.map_T_camera, scene.rays.sigma, 0.0)
+    obs, ray, _ = observe(PosedRays(scene.rays, frames, scene.cameras, frames.map_T_camera, scene.rays.sigma))
     place = scene.points[0] + rng.multivariate_normal(np.zeros(3), covariance)
     turn = np.zeros((count, 6, 6))
     turn[:, :3, :3] = turn[:, 3:, 3:] = frames.map_T_camera[:, :3, :3]

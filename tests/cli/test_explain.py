@@ -20,7 +20,7 @@ from objslam.core.result import Doubt
 from objslam.io.results.read import load_doubts
 from objslam.output.result_folder import write_result
 
-TEXT = "191 cup boxes near (0.24, -0.07, 1.94): their rays pass 6 cm apart, 3 sigma are 2 cm."
+TEXT = "191 cup boxes near (0.24, -0.07, 1.94): their rays miss a common point by 6 cm, and 3 sigma are 2 cm."
 CUPS = Doubt("boxes", "apart", "cup", TEXT, (), np.array([0.24, -0.07, 1.94]), np.arange(191), {"miss_m": 0.0612345678})
 PAIR = Doubt("pair", "may be one", "mug", "mug #1 and mug #4 may be one.", (1, 4), None, np.arange(7), {"sigmas": np.nan})
 
@@ -46,7 +46,7 @@ def test_the_doubts_of_a_result_are_said_in_sentences(explain: Any) -> None:
     assert code == 0
     words = " ".join(out.split())
     assert "objects that may be one" in words
-    assert "191 cup boxes near (0.24, -0.07, 1.94): their rays pass 6 cm apart, 3 sigma are 2 cm." in words
+    assert "191 cup boxes near (0.24, -0.07, 1.94): their rays miss a common point by 6 cm, and 3 sigma are 2 cm." in words
     _, out, _ = explain("out", "--label", "mug")
     assert "cup" not in out
     assert "mug #1 and mug #4 may be one." in out

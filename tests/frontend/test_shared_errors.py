@@ -15,11 +15,10 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Images, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.corrected_log import refocused, refocused_noise, take_out
+from objslam.frontend.corrected_log import refocused, take_out
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.known_errors import take_out_known
+from objslam.frontend.known_errors import shared_errors, take_out_known
 from objslam.frontend.odometry_drift import gathered_drift
-from objslam.frontend.shared_errors import shared_errors
 from objslam.frontend.surface_ranges import measured_ranges
 from objslam.graph.factors.odometry import motions
 from objslam.io.calibration_yaml import dump_calibration
@@ -303,8 +302,9 @@ def test_another_lens_does_not_fit_noise_better(lens, off):
     noise = sigma * rng.normal(size=true.shape)
     seen = true + noise - true * (noise * true).sum(axis=1, keepdims=True)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    every = np.ones(len(true), dtype=bool)
-    angle = np.linalg.norm(np.cross(refocused(true, every, lens), refocused(seen, every, lens)), axis=1)
-    after = angle / (sigma * refocused_noise(true, every, lens))
+    (moved, factors), (moved_seen, _) = refocused(true, lens), refocused(seen, lens)
+    after = np.linalg.norm(np.cross(moved, moved_seen), axis=1) / (sigma * factors)
     assert np.mean(after**2) / 2 == pytest.approx(1.0, abs=0.012)
-    assert (refocused_noise(true, ~every, lens) == 1).all()
+    each = np.where(np.arange(len(true))[:, None] % 2 == 0, lens, 0.0)
+    assert refocused(true, each)[1][1::2] == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(refocused(true, each)[0][::2], moved[::2], rtol=1e-12)

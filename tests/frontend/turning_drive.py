@@ -9,7 +9,8 @@ from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.types import CameraLog, Detections, Log, Trajectory
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 
 BASE_T_CAMERA = make_pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 0.5]))
 

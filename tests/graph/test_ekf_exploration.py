@@ -9,7 +9,7 @@ from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.graph.ekf_exploration import explore, is_sure
 from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate

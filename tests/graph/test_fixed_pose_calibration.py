@@ -18,7 +18,8 @@ from objslam.core.types import Association, CameraLog, Detections, Log, Trajecto
 from objslam.errors import SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.graph.calibration.fixed_pose_calibration import (
     calibrate_at_poses,
     linearise_points,

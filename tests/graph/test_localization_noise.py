@@ -15,7 +15,7 @@ from objslam.core.statistics import WHITE, Lasting
 from objslam.core.types import Log
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.paths_alone import noise_of_paths

@@ -13,7 +13,7 @@ from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
 from objslam.core.types import Keyframes
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
 from objslam.graph.calibration.linearised_graph import Linearised

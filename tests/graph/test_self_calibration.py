@@ -12,7 +12,8 @@ from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
 from objslam.core.types import Trajectory
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
 from objslam.graph.calibration import correlated_errors

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.graph.batch_solver import solve_joint
 from objslam.graph.calibration.variance_components import _azimuth_elevation, correlation_time
 from objslam.simulation import DepthNoise, preset, simulate

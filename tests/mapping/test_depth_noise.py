@@ -13,7 +13,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.live.adapters.replay import events
 from objslam.live.session.session import Session
 from objslam.mapping import pipeline

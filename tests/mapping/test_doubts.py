@@ -144,7 +144,7 @@ def test_rays_that_pass_a_place_apart(rooms):
     assert len(found.rays) > 0.8 * wasp.sum()
     # Of a normal distribution in the plane across a ray, half are within 1.18 standard deviations.
     assert found.numbers["miss_m"] == pytest.approx(1.18 * 0.15, rel=0.2)
-    assert "their rays pass 1" in found.text
+    assert "their rays miss a common point by 1" in found.text
     assert found.numbers["miss_m"] > 3 * found.numbers["sigma_m"]
 
 

@@ -12,7 +12,7 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.rotation import rotation_from_vector
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.mapping import pipeline, refuted
 from objslam.mapping.alternation import solve
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose

@@ -13,7 +13,7 @@ from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.types import Association, CameraLog, Detections, Log, Trajectory
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import shared_errors
+from objslam.frontend.known_errors import shared_errors
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.merge_and_split import split_at_gaps
 from objslam.mapping.solution import seen_something

@@ -382,7 +382,7 @@ def test_places_where_no_result_can_go(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot write or read"):
         prepare_output(Path("/proc/objslam/out"))
     (tmp_path / "out" / "objects.json").mkdir(parents=True)
-    with pytest.raises(OutputError, match="a folder stands where a file of the result goes"):
+    with pytest.raises(OutputError, match="because a folder has its name"):
         prepare_output(tmp_path / "out")
 
 
@@ -390,7 +390,7 @@ def test_a_folder_in_the_way_of_any_file_leaves_the_old_result(tmp_path: Path) -
     write_result(small(), tmp_path)
     (tmp_path / "front.detections.jsonl").mkdir()
     before = contents(tmp_path)
-    with pytest.raises(OutputError, match="a folder stands where a file of the result goes"):
+    with pytest.raises(OutputError, match="because a folder has its name"):
         write_result(small(seed=1), tmp_path)
     assert contents(tmp_path) == before
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam.association.global_association import associate_globally
+from objslam.association.observations import PosedRays
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
@@ -63,15 +64,8 @@ def solve(scene: Scene, exact_poses: bool = True) -> Association:
     sigma, place = scene.rays.sigma, 0.0
     if not exact_poses:
         sigma, place = np.hypot(sigma, LOCALIZATION["yaw"]), LOCALIZATION["xy"]
-    return associate_globally(
-        scene.rays,
-        scene.keyframes,
-        scene.cameras,
-        Settings(),
-        map_T_camera=scene.keyframes.map_T_camera,
-        sigma=sigma,
-        position_sigma=place,
-    )
+    posed = PosedRays(scene.rays, scene.keyframes, scene.cameras, scene.keyframes.map_T_camera, sigma, place)
+    return associate_globally(posed, Settings())
 
 
 def score(scene: Scene, association: Association, radius: float) -> tuple[int, int, float, Floats]:

@@ -76,8 +76,8 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     """Compare one thing and two things as explanations of each landmark whose rays come in two bundles.
 
     Things of a class lie anywhere in the mapped space, as dense as its landmarks. The second thing of a landmark may also be
-    another landmark that fits the bundle's rays. Both bundles have boxes with sizes: without sizes, nothing but the bearings
-    tells how far away a bundle's thing is, and rays of one stretch of the path share errors.
+    another landmark that fits the bundle's rays. Only bundles whose boxes have sizes are compared. Without sizes, only the
+    bearings tell how far away the thing is, and the rays of one stretch of the path share errors.
 
     sized: (R,) whether the camera of each ray observes sizes. fewest: the number of such boxes that a bundle must have.
     """
@@ -150,7 +150,7 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
 
 
 def excess_of(gain: Floats) -> Floats:
-    """Return for each landmark (S,) the factor by which two points gain more than by the nominal noise.
+    """Return for each landmark (S,) the factor by which two points usually gain more than the nominal noise explains.
 
     Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses
     can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second thing. The

@@ -45,13 +45,14 @@ far away enlarge it."""
 
 @dataclass(frozen=True)
 class UsualViews:
-    """What is usual for each of N landmarks by the other landmarks of its class.
+    """What is usual for each of N landmarks, according to the other landmarks of its class.
 
-    state: the landmarks. distance: (N,) m, the distance within which most boxes are. log_density: (N,) of things of its
-    class, ln m^-3. ln_size: (R,) of each box for a distance of 1 m, of the side whose sizes scatter less. It is NaN for a
-    box without a size. size: (N,) the median ln size of each landmark, NaN if it has few boxes. view: the standard deviation
-    of ln size between views of one thing. class_mean, class_spread: (N,) mean and standard deviation of ln size among the
-    other landmarks of the class. The mean is NaN if there are none.
+    state: the landmarks. distance: (N,) m, most boxes of the class come from within this distance. log_density: (N,) ln of
+    the number of things of the class per m^3. ln_size: (R,) ln of the width or of the height of the thing in each box per m
+    of its distance, whichever scatters less. It is NaN for a box without a size. size: (N,) the median ln size of each
+    landmark, NaN if it has few boxes. view: the standard deviation of ln size between views of one thing. class_mean,
+    class_spread: (N,) mean and standard deviation of ln size among the other landmarks of the class. The mean is NaN if
+    there are none.
     """
 
     state: State

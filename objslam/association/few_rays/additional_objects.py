@@ -17,14 +17,13 @@ from objslam.association.few_rays.sparse_search import SparseSearch, discover_sp
 from objslam.association.gating import alternate, gate_limit, near
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import close_pairs, merge_targets
-from objslam.association.observations import observe
+from objslam.association.observations import PosedRays, observe
 from objslam.association.refinement import refine
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.camera import Camera
-from objslam.core.ground.flattening import LEVEL, flattened_points
+from objslam.core.ground.flattening import flattened_points
 from objslam.core.statistics import logistic
-from objslam.core.types import Association, Keyframes, Rays
+from objslam.core.types import Association
 
 _MOVING = 6
 """The number of coordinates of a moving point: those of its position and of its velocity. So it explains any three rays."""
@@ -48,32 +47,18 @@ _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair.
 
 
 def add_few_ray_objects(
-    rays: Rays,
-    keyframes: Keyframes,
-    cameras: tuple[Camera, ...],
-    settings: config.Settings,
-    association: Association,
-    positions: Floats,
-    *,
-    map_T_camera: Floats,
-    sigma: Floats,
-    position_sigma: float,
-    seed: int = 0,
-    flat_scale: float = LEVEL,
+    of: PosedRays, settings: config.Settings, association: Association, positions: Floats, *, seed: int = 0
 ) -> Association:
     """Add the objects that can be found from a few unassigned rays. They come after the other objects.
 
     The association stays as it is if the poses are not localised, if the settings do not allow the search, or if the
     association has no probability that its objects exist.
 
-    rays, keyframes: all observed frames and their rays. positions: (N, 3) m of the objects, NaN where unknown.
-    map_T_camera: (K, 4, 4) of the keyframes. sigma: (R,) rad, position_sigma: m, the noise of the rays' angles and origins.
-    flat_scale: as in `associate_globally`.
+    positions: (N, 3) m of the objects, NaN where unknown. seed: the seed of the random pairs of rays.
     """
-    if association.existence is None or not (settings.association.few_rays and keyframes.localized_every):
+    if association.existence is None or not (settings.association.few_rays and of.keyframes.localized_every):
         return association
-    noise = sigma, position_sigma, flat_scale
-    few, ray = _few(rays, keyframes, cameras, settings, association, positions, map_T_camera, noise)
+    few, ray = _few(of, settings, association, positions)
     few, found = few.search(settings.association.min_existence, seed)
     old, new = association.count, found.count
     index = association.object.copy()
@@ -111,26 +96,15 @@ class FewRayEvidence:
 
 
 def few_ray_evidence(
-    rays: Rays,
-    keyframes: Keyframes,
-    cameras: tuple[Camera, ...],
-    settings: config.Settings,
-    *,
-    map_T_camera: Floats,
-    sigma: Floats,
-    position_sigma: float,
-    seed: int = 0,
-    correct_places: bool = False,
+    of: PosedRays, settings: config.Settings, *, seed: int = 0, correct_places: bool = False
 ) -> FewRayEvidence:
-    """Return the evidence of all objects that a search for few rays finds. Arguments are as in `add_few_ray_objects`.
+    """Return the evidence of all objects that a search for few rays finds.
 
     correct_places: whether to correct the places from which the objects were seen. The evidence is always that of the given
     places, at which each ray has its own error.
     """
-    nothing = Association(np.full(len(rays), -1), np.zeros(0, dtype=np.int64))
-    positions = np.zeros((0, 3))
-    noise = sigma, position_sigma, LEVEL
-    few, ray = _few(rays, keyframes, cameras, settings, nothing, positions, map_T_camera, noise)
+    nothing = Association(np.full(len(of.rays), -1), np.zeros(0, dtype=np.int64))
+    few, ray = _few(of, settings, nothing, np.zeros((0, 3)))
     given, least = few.known.obs, settings.association.min_existence
     few, landmarks = few.search(least, seed) if correct_places else (few, few.search_once(least, seed))
     found = few.joined(landmarks)
@@ -149,21 +123,12 @@ def few_ray_evidence(
     return FewRayEvidence(chance, rates.log_likelihood(found.history, found.label), explained, *members)
 
 
-def _few(
-    rays: Rays,
-    keyframes: Keyframes,
-    cameras: tuple[Camera, ...],
-    settings: config.Settings,
-    association: Association,
-    positions: Floats,
-    map_T_camera: Floats,
-    noise: tuple[Floats, float, float],
-) -> tuple["_Few", Ints]:
-    """Return the search of `add_few_ray_objects`, and the index (P,) of the ray of each observation. noise: `sigma`,
-    `position_sigma` and `flat_scale`."""
-    obs, ray, keyframe = observe(rays, keyframes, cameras, map_T_camera, *noise)
+def _few(of: PosedRays, settings: config.Settings, association: Association, positions: Floats) -> tuple["_Few", Ints]:
+    """Return the search of `add_few_ray_objects`, and the index (P,) of the ray of each observation."""
+    rays = of.rays
+    obs, ray, keyframe = observe(of)
     positions = flattened_points(positions, obs.scale)
-    view = frames_of(keyframes, keyframe, cameras, map_T_camera, settings, cut=rays.cut)
+    view = frames_of(of.keyframes, keyframe, of.cameras, of.map_T_camera, settings, cut=rays.cut)
     known = np.isfinite(positions).all(axis=1)
     labels = len(rays.label_names)
     held = Landmarks.new(positions[known], np.ones(known.sum()), association.label[known], labels)

@@ -45,7 +45,7 @@ class LikelyPath:
 def most_likely_path(
     keyframes: Keyframes, rays: Rays, map_T_base: Floats, positions: Floats, label: Ints, rate: Floats
 ) -> LikelyPath | None:
-    """Return the most likely path through a map, None if no label has two landmarks to confuse.
+    """Return the most likely path through a map, None if no label has two landmarks that could be confused.
 
     Corrections are planar like the drift of wheels. They reach as far as a few neighbouring landmarks. A match with a
     landmark that is rarely detected costs more, so a second copy of a landmark loses its rays. A frame may give two rays to

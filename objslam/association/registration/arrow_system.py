@@ -51,7 +51,7 @@ class ArrowSystem:
         return np.asarray(own + _times(back, self._to_maps(shift.reshape(-1, 3))))
 
     def covariances(self) -> tuple[Floats, Floats, Floats]:
-        """Return what the inverse of the matrix says of objects and maps.
+        """Return the covariances of objects and maps, from the inverse of the matrix.
 
         The first array is the part (N, 3, 3) that each object has alone. The second one is the part that is correlated
         between objects, as a factor (N, 3, m). The third one has the blocks (S, w, w) of the maps. If the system is

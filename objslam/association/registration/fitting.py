@@ -127,7 +127,7 @@ def gate(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Int
 def fit(problem: Problem, index: Ints, x: Floats, hessian: Floats) -> tuple[Floats, Floats]:
     """Return transforms (H, 4) after one robust Gauss-Newton step on the matches of objects (H, P), and their information.
 
-    A transform that its matches do not determine stays, and its information is NaN. One match is never enough.
+    A transform that its matches do not determine does not change, and its information is NaN. One match is never enough.
     """
     _, miss, covariance, jacobian, good = gate(problem, index, x, hessian)
     return robust_step(x, miss, covariance, jacobian, good)

@@ -21,7 +21,7 @@ that nearly touch the camera a box."""
 def beside_centres(
     axes: Floats, to: Floats, half: Floats, yaw: Floats, shape: Ints, covariance: Floats
 ) -> tuple[Floats, Floats]:
-    """Return vectors (n, 3), m in map, from the centres of bodies to points on the rays through the centres of their boxes.
+    """Return vectors from the centres of bodies to points on the rays through the centres of their boxes, and their noise.
 
     Let a camera with the axes x, y, z see an ellipsoid with the centre c and the matrix M of squared half axes. The left and
     the right edge of its box are planes with the normal n = x - u z that touch it: (n . c)^2 = n^T M n (Hartley and
@@ -29,7 +29,8 @@ def beside_centres(
     goes around the images of its corners, that of a cylinder around its rims. The vector is 0 for a body that reaches behind
     its camera.
 
-    The second array (n,) has the standard deviations, m, of these vectors along an axis of the image, to first order.
+    The vectors (n, 3) are in m in map. Their standard deviations (n,), m, are along an axis of the image, to first order.
+
     axes: (n, 3, 3) the axes of the images in map, as columns: map_R_camera for a pinhole image. to: (n, 3) m, from the
     cameras to the centres. half: (n, 3) m, the half axes along the yaw, across it and upwards. yaw: (n,) rad. shape: (n,)
     indices of `SHAPES`. covariance: (n, 4, 4) of half axes, m, and yaw, rad.

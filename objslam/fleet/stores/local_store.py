@@ -39,7 +39,7 @@ class LocalStore:
             raise _failed(self._folder / prefix, error) from error
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file. FileNotFoundError if there is none, StoreError if the disk refuses."""
+        """Return the content of a file. FileNotFoundError if there is none, StoreError if it cannot be read."""
         try:
             return (self._folder / name).read_bytes()
         except FileNotFoundError:
@@ -58,7 +58,7 @@ class LocalStore:
         return found
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. StoreError if the disk refuses.
+        """Write a file, and replace an older one. StoreError if it cannot be written.
 
         A folder may have a file for each of a million logs, so no write lists it. `names` leaves out what killed
         processes left.
@@ -71,8 +71,8 @@ class LocalStore:
     def upload(self, folder: Path, name: str) -> list[str]:
         """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order.
 
-        StoreError if the disk refuses. When this function returns, the files are on the disk, so a file that is written
-        later may rely on them.
+        StoreError if a file cannot be read or written. When this function returns, the files are on the disk, so a file that
+        is written later may rely on them.
         """
         to = self._folder / name
         self._make(to)

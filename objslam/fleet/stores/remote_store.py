@@ -29,7 +29,7 @@ _T = TypeVar("_T")
 def open_filesystem(url: str) -> tuple[Any, str]:
     """Return the file system of a URL, and the path of the URL in it.
 
-    ObjslamError if fsspec, or the package of the protocol, is not installed, or if nobody knows the protocol.
+    ObjslamError if fsspec, or the package of the protocol, is not installed, or if the protocol is unknown.
     """
     try:
         import fsspec
@@ -100,7 +100,7 @@ class RemoteStore:
         return found
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. StoreError if the store refuses."""
+        """Write a file, and replace an older one. StoreError if it cannot be written."""
         self._parent(name)
         self._try(name, lambda path: self._fs.pipe_file(path, data))
 

@@ -11,7 +11,7 @@ from objslam.errors import ObjslamError
 
 
 class StoreError(ObjslamError):
-    """A store does not answer, or refuses. A later try may succeed."""
+    """A store does not answer, or does not allow the access. A later try may succeed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Store(Protocol):
         """Return the contents of files by name. Files that do not exist are left out."""
 
     def write(self, name: str, data: bytes) -> None:
-        """Write a file, and replace an older one. StoreError if the store refuses."""
+        """Write a file, and replace an older one. StoreError if it cannot be written."""
 
     def upload(self, folder: Path, name: str) -> list[str]:
         """Copy the files of a local folder into the folder `name`. Return their names without the folder, in order."""

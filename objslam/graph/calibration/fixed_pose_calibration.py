@@ -6,6 +6,7 @@ A Gauss-Newton step moves the errors and the objects together. Each object is el
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -29,6 +30,9 @@ correlated over a longer time, but the size of these errors is less exact then."
 _FREE = 1e-6
 """The information (m^-2) added to each object, so that an object without rays is determined too. A larger value moves other
 objects."""
+
+_RAYS_AT_ONCE = 200_000
+"""The most rays that are computed together, counted once for each value of the errors. A larger number takes more memory."""
 
 Noise = tuple[float, float]
 """The standard deviations of given poses: of headings, rad, and of places, m."""
@@ -105,10 +109,11 @@ def calibrate_at_poses(
 
 def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) -> Floats:
     """Return the standard deviations (R,), rad, of ray directions in map that follow from `calibration.covariance`."""
-    size, axes = np.linalg.eigh(calibration.covariance)
+    steps, values = calibration.root.T, calibration.values
     variance = np.zeros(len(errors.rays))
-    for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
-        variance += turned_by_errors(errors, calibration.values - step, calibration.values + step) ** 2 / 4
+    for some in _batches(len(steps), len(variance)):
+        ends = errors.rays_in_map(values + np.concatenate([-steps[some], steps[some]]))[1]
+        variance += ((ends[len(some) :] - ends[: len(some)]) ** 2).sum(axis=(0, 2)) / 4
     return np.sqrt(variance)
 
 
@@ -126,28 +131,31 @@ def noise_beside_objects(
     if not held.any():
         return noise_of_errors(errors, found.calibration)
 
-    def missed(step: Floats) -> Floats:
-        keyframes, rays, _ = errors.at(values + step, drift=False)
-        origins, directions = rays.in_map(keyframes.map_T_camera)
-        to = (positions + found.sensitivity @ step)[owner[held]] - origins[held]
-        return np.asarray(directions[held] - to / np.linalg.norm(to, axis=1, keepdims=True))
+    def missed(steps: Floats) -> Floats:
+        origins, directions, _ = errors.rays_in_map(values + steps)
+        moved = positions + np.einsum("nip,mp->mni", found.sensitivity, steps)
+        to = moved[:, owner[held]] - origins[:, held]
+        return np.asarray(directions[:, held] - to / np.linalg.norm(to, axis=2, keepdims=True))
 
-    size, axes = np.linalg.eigh(found.calibration.covariance)
+    steps = found.calibration.root.T
     variance = np.zeros(int(held.sum()))
-    for step in (axes * np.sqrt(np.maximum(size, 0.0))).T:
-        variance += ((missed(step) - missed(-step)) ** 2).sum(axis=1) / 4
+    for some in _batches(len(steps), len(held)):
+        variance += ((missed(steps[some]) - missed(-steps[some])) ** 2).sum(axis=(0, 2)) / 4
     every = np.full(len(held), float(np.median(variance)))
     every[held] = variance
     return np.sqrt(every)
 
 
 def turned_by_errors(errors: CalibratedMeasurements, before: Floats, after: Floats) -> Floats:
-    """Return the small angles (R,), rad, by which rays in map turn between two values (P,) of the shared errors."""
-    ends = []
-    for values in (before, after):
-        keyframes, rays, _ = errors.at(values, drift=False)
-        ends.append(rays.in_map(keyframes.map_T_camera)[1])
-    return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1))
+    """Return the small angles (M, R), rad, by which rays in map turn from M values (M, P) of the shared errors to another
+    value (P,)."""
+    _, directions, _ = errors.rays_in_map(np.concatenate([after[None], before]))
+    return np.asarray(np.linalg.norm(directions[1:] - directions[0], axis=2))
+
+
+def _batches(number: int, rays: int) -> list[Ints]:
+    """Split a number of steps into batches whose rays are computed together."""
+    return np.array_split(np.arange(number), max(1, -(-number * rays // _RAYS_AT_ONCE)))
 
 
 def linearise_points(
@@ -169,12 +177,11 @@ def linearise_points(
     target = points[owner]
 
     def misses(values: Floats) -> _Misses:
-        keyframes, rays, _ = errors.at(values, drift=False)
-        origins, directions = rays.in_map(keyframes.map_T_camera)
-        return _Misses.of(origins[held], directions[held], target, np.hypot(rays.sigma[held], noise[0]), noise[1])
+        origins, directions, sigma = (part[:, held] for part in errors.rays_in_map(values))
+        return _Misses.of(origins, directions, target, np.hypot(sigma, noise[0]), noise[1])
 
-    here = misses(theta)
-    e, by_point = here.deviation, here.by_point(trusted)
+    here = misses(theta[None])
+    e, by_point = here.deviation[0], here.by_point(trusted)[0]
     weight = 1 / (1 + (np.linalg.norm(e, axis=1) / _CAUCHY) ** 2)
     camera = errors.keyframes.camera[errors.rays.keyframe[held]]
     by_error = _slopes(lambda values: misses(values).deviation, errors, theta, camera)
@@ -218,31 +225,40 @@ def _slopes(residual: Callable[[Floats], Floats], errors: CalibratedMeasurements
     """Return the derivatives (n, 2, P) of the residuals by the errors, as central differences.
 
     An error of a camera moves no ray of another camera. So the errors of one kind are moved at once for all cameras
-    (Curtis, Powell and Reid 1974), and each ray shows the error of its own camera. camera: (n,) the camera of each ray.
+    (Curtis, Powell and Reid 1974), and each ray shows the error of its own camera. residual: returns the residuals (M, n, 2)
+    at M values (M, P). camera: (n,) the camera of each ray.
     """
-    owner = {f"{name}.{kind(one)}": i for one in errors.names for i, name in enumerate(errors.cameras)}
-    together: dict[str, list[int]] = {}
-    for k, name in enumerate(errors.names):
-        together.setdefault(f"of each camera: {kind(name)}" if name in owner else name, []).append(k)
-    slopes, steps = np.zeros((len(camera), 2, len(theta))), errors.steps
-    for group in together.values():
-        move = np.zeros(len(theta))
-        move[group] = steps[group]
-        change = residual(theta + move) - residual(theta - move)
-        for k in group:
-            number = owner.get(errors.names[k])
-            mine = slice(None) if number is None else camera == number
-            slopes[mine, :, k] = change[mine] / (2 * steps[k])
+    groups, owner = _moved_together(errors.names, errors.cameras)
+    moves = np.array([np.isin(np.arange(len(theta)), group) for group in groups]).reshape(-1, len(theta)) * errors.steps
+    slopes = np.zeros((len(camera), 2, len(theta)))
+    for some in _batches(len(groups), len(errors.rays)):
+        ends = residual(theta + np.concatenate([moves[some], -moves[some]]))
+        for number, change in zip(some.tolist(), ends[: len(some)] - ends[len(some) :], strict=True):
+            for k in groups[number]:
+                mine = slice(None) if owner[k] is None else camera == owner[k]
+                slopes[mine, :, k] = change[mine] / (2 * errors.steps[k])
     return slopes
+
+
+@lru_cache(maxsize=16)
+def _moved_together(
+    names: tuple[str, ...], cameras: tuple[str, ...]
+) -> tuple[tuple[tuple[int, ...], ...], tuple[int | None, ...]]:
+    """Return groups of errors, as indices, that move no ray together, and the camera of each error, None if it has none."""
+    owner = [cameras.index(name.rpartition(".")[0]) if name.rpartition(".")[0] in cameras else None for name in names]
+    together: dict[str, list[int]] = {}
+    for k, name in enumerate(names):
+        together.setdefault(name if owner[k] is None else f"of each camera: {kind(name)}", []).append(k)
+    return tuple(tuple(group) for group in together.values()), tuple(owner)
 
 
 @dataclass(frozen=True)
 class _Misses:
     """By how much n rays miss their points. The standard deviation of a miss depends on the distance.
 
-    deviation: (n, 2) the angles between rays and points, in standard deviations, along the axes `basis` (n, 2, 3). to:
-    (n, 3) the unit vectors to the points. distance: (n,) m. angle: (n,) rad, the noise of directions. sigma: (n,) rad, that
-    of misses.
+    All arrays have a first axis for M values of the errors. deviation: (M, n, 2) the angles between rays and points, in
+    standard deviations, along the axes `basis` (M, n, 2, 3). to: (M, n, 3) the unit vectors to the points. distance: (M, n)
+    m. angle: (M, n) rad, the noise of directions. sigma: (M, n) rad, that of misses.
     """
 
     deviation: Floats
@@ -254,22 +270,22 @@ class _Misses:
 
     @classmethod
     def of(cls, origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float) -> Self:
-        """Measure rays (n, 3) against points `target` (n, 3). place: m, the noise of origins."""
+        """Measure rays (M, n, 3) against points `target` (n, 3). place: m, the noise of origins."""
         to = target - origins
-        distance = np.maximum(np.linalg.norm(to, axis=1), 1e-3)
-        to = to / distance[:, None]
-        level = np.stack([-directions[:, 1], directions[:, 0], np.zeros(len(directions))], axis=1)
-        level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-6)
-        basis = np.stack([level, cross(directions, level)], axis=1)
+        distance = np.maximum(np.linalg.norm(to, axis=-1), 1e-3)
+        to = to / distance[..., None]
+        level = np.stack([-directions[..., 1], directions[..., 0], np.zeros(distance.shape)], axis=-1)
+        level /= np.maximum(np.linalg.norm(level, axis=-1, keepdims=True), 1e-6)
+        basis = np.stack([level, cross(directions, level)], axis=-2)
         sigma = np.hypot(angle, place / distance)
-        return cls(np.einsum("nki,ni->nk", basis, to) / sigma[:, None], basis, to, distance, angle, sigma)
+        return cls(np.einsum("mnki,mni->mnk", basis, to) / sigma[..., None], basis, to, distance, angle, sigma)
 
     def by_point(self, trusted: bool) -> Floats:
-        """Return the derivatives (n, 2, 3) of the deviations by the points.
+        """Return the derivatives (M, n, 2, 3) of the deviations by the points.
 
         If the noise is trusted, they contain those of the standard deviation. Without them, the noise would bias the errors
         of the camera and the points, and more rays would not reduce this bias.
         """
-        along = self.deviation * self.sigma[:, None] * (self.angle / self.sigma)[:, None] ** 2 * trusted
-        across = self.basis - along[:, :, None] * self.to[:, None, :]
-        return np.asarray(across / (self.distance * self.sigma)[:, None, None])
+        along = self.deviation * self.sigma[..., None] * (self.angle / self.sigma)[..., None] ** 2 * trusted
+        across = self.basis - along[..., None] * self.to[..., None, :]
+        return np.asarray(across / (self.distance * self.sigma)[..., None, None])

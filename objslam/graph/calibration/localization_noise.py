@@ -33,8 +33,8 @@ more exact, and the time grows with the cube of their number."""
 def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
     """Return `errors.noise` with the noise of the localisation that agrees best with the rest of a graph at its values.
 
-    Factors are at least 1, and 1 unless the log refutes the settings. theta: (P,) the shared errors. SolveError if the graph
-    without its localisation is singular.
+    Factors are at least 1. They are 1 if the log agrees with the settings. theta: (P,) the shared errors. SolveError if the
+    graph without its localisation is singular.
     """
     data = _compared(of, errors, theta)
     found = most_likely(data)

@@ -231,7 +231,8 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
         return np.asarray(range_root * (lengths(to_landmark) - measured) / (measured / range_))
 
     def turned(keyframes: Keyframes) -> Floats:
-        """Return the poses (P, 4, 4) of the cameras on another mount in the frames of these cameras on the present one."""
+        """Return the poses (P, 4, 4) that the cameras have on another mount, in the frames of the cameras on the present
+        mount."""
         return inverse(mounts) @ keyframes.base_T_camera
 
     def off(measured: Floats, moved: Floats, turned: Floats) -> Floats:

@@ -92,8 +92,8 @@ def place(seen: Corners, shapes: Floats, sides: Floats) -> Placement:
 def placed(seen: Corners, shapes: Floats, sides: Floats, landmarks: Ints, positions: Floats) -> Floats:
     """Return the positions (M, 3) m of landmarks, with the corners of each fiducial at its best pose.
 
-    A fiducial whose corners already form a square stays, unless another pose is better. The corners of a fiducial without a
-    pose become NaN, so that they are in no graph. landmarks: (T, 4) of each fiducial.
+    A fiducial whose corners already form a square is not moved, unless another pose is better. The corners of a fiducial
+    without a pose become NaN, so that they are in no graph. landmarks: (T, 4) of each fiducial.
     """
     found = place(seen, shapes, sides)
     corners = np.where(np.isfinite(found.cost)[:, None, None], found.best.corners, np.nan)

@@ -114,8 +114,8 @@ class BodyCentring(Rounds[BodiesMessage, BodiesMessage]):
 def turn_to_centres(m: MapState, found: BodiesMessage) -> bool:
     """Turn the bearings of landmarks to the centres of these bodies. A landmark of shape 0 has none.
 
-    Return whether bearings in the graph have changed. A bearing that would hardly change stays (`_CHANGED`). Landmarks that
-    are not in the map any more are left out.
+    Return whether bearings in the graph have changed. A bearing that would hardly change (`_CHANGED`) is not turned.
+    Landmarks that are not in the map any more are left out.
     """
     m.graph.refresh()
     m.read_positions()

@@ -43,7 +43,8 @@ class BodyRequest:
 
 
 def most_grown(m: MapState, rows: Ints, before: Ints) -> Ints:
-    """Return the rows of the landmarks to fit, in the order of their ids. If there are too many, those that have grown most.
+    """Return the rows of the landmarks to fit, in the order of their ids. If there are too many, return those whose rays
+    have grown most.
 
     rows: (n,) of the landmarks that are due. before: (n,) the numbers of their rays in their last fits, 0 without one.
     """

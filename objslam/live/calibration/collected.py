@@ -9,7 +9,8 @@ from objslam.core.noise import range_noise
 from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
 from objslam.errors import ObjslamError
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import measured_ranges, range_factors
 from objslam.live.mapper.state import MapState
 from objslam.mapping.solution import seen_something
@@ -102,10 +103,10 @@ def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:
     """Return the rays in these rows (R,) without corrections. keyframe: (R,) index of each ray's keyframe."""
     longer = range_factors(m.errors, m.half_widths(rows))
     rays = offline_rays(m, rows, keyframe)
-    direction, reach = rays.direction, measured_ranges(m.errors, rays.range, rays.direction, longer)
+    direction, reach = rays.direction.copy(), measured_ranges(m.errors, rays.range, rays.direction, longer)
     for number, camera in enumerate(m.cameras):
         mine = m.camera_of_rays(rows) == number
-        direction = refocused(direction, mine, inverse_lens(lens_errors(m.errors, camera.name)))
+        direction[mine], _ = refocused(direction[mine], inverse_lens(lens_errors(m.errors, camera.name)))
     return replace(rays, direction=direction, range=reach, range_sigma=rays.range_sigma / longer)
 
 

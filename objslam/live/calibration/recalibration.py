@@ -88,8 +88,9 @@ def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
     for number, one in enumerate(m.cameras):
         had, has = lens_errors(before, one.name), lens_errors(m.errors, one.name)
         if had != has:
-            seen = refocused(rays.direction, camera == number, inverse_lens(had))
-            rays.direction[:] = refocused(seen, camera == number, has)
+            mine = camera == number
+            seen, _ = refocused(rays.direction[mine], inverse_lens(had))
+            rays.direction[mine], _ = refocused(seen, has)
             changed = True
     return changed
 

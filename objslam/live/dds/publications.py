@@ -29,9 +29,9 @@ class Publication:
 class Publications:
     """The publishers by handle, at most `MOST`.
 
-    Beyond that, nobody can crowd out the others. A type with many publishers gives way to a type with fewer. Within a type,
-    a longer name of a topic gives way to a shorter one, because that is how `TopicChoice` chooses. All types of tags count
-    as one, because anybody can make up more of them.
+    If there are more, one type of messages with very many publishers must not remove all others. So a publisher of the type
+    with the most publishers is removed. Of this type, it is the one whose topic has the longest name, because `TopicChoice`
+    prefers short names. All types of tags count as one type, because a program can invent more of them.
     """
 
     def __init__(self, kept: Callable[[], Collection[str]]) -> None:
@@ -65,7 +65,7 @@ class Publications:
         return gone
 
     def add(self, handle: int, new: Publication) -> Publication | None:
-        """Keep a publisher. Returns the publisher that gives way, which may be the new one, or None if there is room."""
+        """Keep a publisher. Returns the publisher that is removed, which may be the new one, or None if there is room."""
         out = self.remove(handle)
         if out is None and len(self) >= MOST:
             worst = self._gives_way(new)

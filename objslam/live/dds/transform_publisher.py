@@ -36,7 +36,7 @@ class TransformPublisher:
         self._writer: Any = DataWriter(network.participant, at, qos=qos)
 
     def update(self, snapshot: Snapshot) -> None:
-        """Take map_T_odom of a snapshot. If the snapshot has none, the last one stays."""
+        """Take map_T_odom of a snapshot. If the snapshot has none, the last one is kept."""
         if snapshot.map_T_odom is not None:
             self._newest, self._messages.frame = snapshot.map_T_odom, snapshot.map.frame
 

@@ -52,7 +52,7 @@ class BearingExtractor:
         m.cameras[number : number + 1] = [corrected_camera(CameraLog(camera), m.errors).camera] if m.errors else [camera]
 
     def add_mount(self, message: MountMessage) -> None:
-        """Add a mount: the pose of a camera on the robot, which holds from its stamp."""
+        """Add a mount: a pose of a camera on the robot, valid from its stamp until the next mount."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
     def extract(self, frame: FrameMessage, stamp: float) -> FrameView:
@@ -78,7 +78,7 @@ class BearingExtractor:
         reach = reach * to_centres(half, settings.depth.centre)
         lens, longer = lens_errors(errors, frame.camera), range_factors(errors, half)
         rays = FrameRays(
-            direction=refocused(direction, np.ones(len(direction), dtype=bool), lens),
+            direction=refocused(direction, lens)[0] if any(lens) else direction,
             sigma=sigma,
             range=corrected_ranges(errors, reach, direction, longer),
             range_sigma=range_noise(reach, half, same, [camera], settings)[0] * longer,

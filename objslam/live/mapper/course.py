@@ -157,7 +157,8 @@ class Course:
         return stretch is not None and (goes_on or localization.newest >= odometry.stretch_begin)
 
     def place(self, stamp: float, keyframes: KeyframeTable, before: int | None) -> Placed | None:
-        """Return the pose of a frame. None if no path covers its stamp, or if the frame is late and would need a new piece.
+        """Return the pose of a frame. None if no path covers its stamp, or if the frame is late and none of the existing
+        pieces of the course covers it.
 
         before: the row of the last keyframe before the frame.
         """

@@ -24,7 +24,7 @@ class KeyframeSelector:
         self._standing = 0
 
     def is_redundant(self, camera: int, start_T_camera: Floats, shown: set[int]) -> bool:
-        """Return whether a frame adds nothing: its camera stands, and enough keyframes since the stop show its labels."""
+        """Return whether a frame adds nothing: its camera stands, and enough keyframes since it stopped show its labels."""
         seen_before = shown <= self._shown and self._standing >= _STANDING
         return seen_before and not self._has_moved(camera, start_T_camera)
 
@@ -40,7 +40,8 @@ class KeyframeSelector:
         self._last[camera] = start_T_camera
 
     def pass_over(self, camera: int, start_T_camera: Floats) -> None:
-        """Register a frame that is neither redundant nor a keyframe. If its camera has moved, the stop has ended."""
+        """Register a frame that is neither redundant nor a keyframe. If its camera has moved since its last keyframe, it no
+        longer counts as standing."""
         if self._has_moved(camera, start_T_camera):
             self._shown.clear()
             self._standing = 0

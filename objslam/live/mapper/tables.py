@@ -78,10 +78,10 @@ class GrowingTable:
 class PathTable(GrowingTable):
     """The poses of a path in the order of their stamps, as the robot sent them.
 
-    Above _MOST_POSES, some are dropped, evenly over time, so that a session of months takes no more memory. Near the stamps
-    that a later solve asks for, the kept poses have no new gap. Elsewhere, any time may lie between two kept poses. The
-    distance and the turn that the robot travelled between kept poses are kept, because the drift of the odometry grows with
-    them.
+    If there are more than _MOST_POSES, poses at even intervals are kept and the others dropped, so that a session of months
+    takes no more memory. This makes no new gap near the stamps that a later solve asks for. Elsewhere, any time may lie
+    between two kept poses. The distance and the turn that the robot travelled between kept poses are kept, because the drift
+    of the odometry grows with them.
 
     max_gap: s, the shortest time between two poses that is a gap. reach: s, the longest time between a stamp that a solve
     asks for and the poses that it takes. newest: s, the time before the end of the path in which a solve may still ask for

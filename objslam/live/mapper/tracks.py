@@ -65,7 +65,7 @@ class Track:
         self.spread = max(self.spread, math.acos(min(1.0, float(n @ self._ahead))))
 
     def sight(self, graph: IncrementalGraph) -> Observations:
-        """Return its rays in map at the current poses of the graph."""
+        """Return the rays of the track in map, at the current poses of the graph."""
         return _in_map(self.rays, graph)
 
     def remeasure(self, directions: Floats, ranges: Floats, range_sigmas: Floats, drift: Floats) -> None:

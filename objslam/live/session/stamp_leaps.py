@@ -61,7 +61,7 @@ class _Stream(Generic[T]):
         return found[::-1]
 
     def pass_on(self, stamps: list[float]) -> list[T]:
-        """Return the waiting messages with these stamps, in order. They wait no longer."""
+        """Remove the waiting messages with these stamps, and return them in order."""
         passing = sorted((one for one in self.waiting if one[0] in stamps), key=lambda one: one[0])
         self.waiting = [one for one in self.waiting if one[0] not in stamps]
         for stamp, _ in passing:
@@ -69,11 +69,11 @@ class _Stream(Generic[T]):
         return [message for _, message in passing]
 
     def near(self, until: float) -> list[T]:
-        """Return the waiting messages up to a stamp, s, in order. They wait no longer."""
+        """Remove the waiting messages up to a stamp, s, and return them in order."""
         return self.pass_on([stamp for stamp, _ in self.waiting if stamp <= until])
 
     def empty(self) -> list[T]:
-        """Return the messages that wait. They wait no longer."""
+        """Remove all waiting messages, and return them."""
         waited, self.waiting = self.waiting, []
         return [message for _, message in waited]
 

@@ -73,10 +73,10 @@ def edges_behind_boxes(
 
 
 def with_hidden_parts(solution: Solution, cameras: tuple[Camera, ...]) -> Solution:
-    """Return the solution with the covariances of points that allow for boxes of which something hides a part.
+    """Return the solution with wider covariances of the points whose boxes are partly hidden.
 
-    The rays of such boxes miss the object to one side, and their mean does not come nearer to it. The centres of bodies have
-    this in their own covariances.
+    The rays of such boxes all miss the object on the same side. So more rays do not make its point more exact. The
+    covariances of the centres of bodies contain this error already.
     """
     estimate, association, keyframes = solution.estimate, solution.association, solution.keyframes
     if solution.hidden is None or not solution.hidden.any():

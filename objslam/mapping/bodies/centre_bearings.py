@@ -37,11 +37,10 @@ larger value solves fewer logs again."""
 def solve_to_centres(state: JointState, association: Association, estimate: Estimate) -> tuple[Estimate, CentreShift | None]:
     """Return the estimate from bearings and ranges to the centres of bodies, and the shift of the rays.
 
-    A ray that the solve rejects stays as it was.
-    The bearings of an object that would be lost stay at the centres of its boxes. The estimate stays as before, and the
-    second value is None, in two cases: no body shifts its bearings or its ranges enough, or an object would still be lost.
-    There is no second round, from the bodies at the new poses. In 24 simulated drives between large objects, it would change
-    the path by 1 mm, and the objects by less than their noise.
+    A ray that the solve rejects is not shifted. If an object would be lost, its bearings stay at the centres of its boxes.
+    If an object would be lost even so, or if no body shifts its bearings or ranges enough, the estimate does not change and
+    the second value is None. The bodies are not fitted again at the new poses. In 24 simulated drives between large objects,
+    this would change the path by 1 mm, and the objects by less than their noise.
     """
     if not state.settings.bodies.use:
         return estimate, None

@@ -40,7 +40,7 @@ shape of its body. The centres of simulated pots, cones, seats, monitors and peo
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return a solution with a body for each object whose boxes show one. The points and their covariances stay.
+    """Return a solution with a body for each object whose boxes show one. The points and their covariances do not change.
 
     The covariance of a centre contains the noise of the boxes and the errors that they share. The covariance of the point
     may be larger than the noise of its rays explains, because solved poses have noise, or because errors of given poses

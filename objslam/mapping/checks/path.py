@@ -34,7 +34,7 @@ _ACCELERATION = 5.0
 4 to 8. A larger value warns less often."""
 _TIMES = 5.0
 """The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. The same
-holds for turn rates. A larger number warns less often."""
+is done with turn rates. A larger number warns less often."""
 _TIMES_ODD = 3.5
 """The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard

@@ -56,7 +56,7 @@ def check_pose_noise(
 ) -> Finding | None:
     """Return a finding if the log shows so much noise of the poses that most rays are far noisier than the settings say.
 
-    The covariances of the map contain this noise, so they are honest. With better poses, the map would be more exact.
+    The covariances of the map contain this noise, so they are right. With better poses, the map would be more exact.
     calibrated: whether the cameras were calibrated against the poses.
     """
     if keyframes.pose_noise == (1.0, 1.0) or not held_rays(objects, association).any():

@@ -12,8 +12,8 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import UNITS, kind
 from objslam.core.types import Keyframes, Log, Rays
-from objslam.frontend.known_errors import prior_sigma
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import prior_sigma, shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.graph.calibration.fixed_pose_calibration import PointSystem, linearise_points
 from objslam.mapping.checks.agreement import Agreement
 

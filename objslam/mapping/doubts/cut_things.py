@@ -52,7 +52,7 @@ class CutThing:
     expected: int
 
     def place(self) -> str:
-        """Return its place in words."""
+        """Return the place of the thing in words."""
         x, y, z = self.position
         return f"({x:.1f}, {y:.1f}, {z:.1f})"
 

@@ -48,8 +48,8 @@ def disagreeing(result: RunResult, misfits: Misfits) -> list[Doubt]:
 def crossing(result: RunResult, evidence: Evidence) -> list[Doubt]:
     """Return a doubt for each object that is probably not one thing at its place, the most probable first. Its rays come
     from two sides, and two things whose rays cross explain them too. The association divides such objects only if they are
-    clearly two, because to divide one thing may lose it. It also allows for more noise than the solved poses have. And the
-    object may be no thing at all, because frames that should show it do not (`existence`).
+    clearly two, because a thing that is divided may be lost. It also allows for more noise than the solved poses have. And
+    the object may be no thing at all, because frames that should show it do not (`existence`).
     """
     state = evidence.state
     sized = np.array([camera.sees_size for camera in result.cameras], dtype=bool)

@@ -9,7 +9,7 @@ import numpy as np
 
 from objslam.association.gating import gate_limit
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.observations import observe
+from objslam.association.observations import PosedRays, observe
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.result import RunResult
@@ -56,7 +56,7 @@ def evidence_of(result: RunResult) -> Evidence:
     frames, keyframe = all_frames(result)
     poses = frames.map_T_camera
     in_frames = replace(rays, keyframe=keyframe[rays.keyframe])
-    obs, ray, order = observe(in_frames, frames, result.cameras, poses, sigma, place)
+    obs, ray, order = observe(PosedRays(in_frames, frames, result.cameras, poses, sigma, place))
     obs = replace(obs, origin=result.origins[ray], direction=result.directions[ray])
     objects = result.map.objects
     position = np.array([o.position if o.ray_point is None else o.ray_point for o in objects]).reshape(-1, 3)

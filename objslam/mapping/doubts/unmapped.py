@@ -25,7 +25,7 @@ def unmapped_labels(result: RunResult, evidence: Evidence, things: Sequence[CutT
     """Return a doubt for each label that was seen in `_FEWEST` frames, if none of its boxes belongs to an object.
 
     Boxes that the image's edge cuts off count as seen. The label with the most boxes comes first. evidence: of the result.
-    things: those with cut off boxes only, whose places are named.
+    things: the things that have only cut off boxes. A doubt names their places.
     """
     rays, found = result.rays, result.association.object
     labels = len(rays.label_names)

@@ -182,7 +182,7 @@ def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> s
         case "no parallax":
             return f": their rays span {np.degrees(groups.parallax[g]):.1f} deg, too little to tell a distance"
         case "apart":
-            return f": their rays pass {miss} apart, 3 sigma are {sigmas}"
+            return f": their rays miss a common point by {miss}, and 3 sigma are {sigmas}"
         case "range":
             return f": their ranges are {groups.range[g]:.2f} m, and their rays meet at {groups.distance[g]:.2f} m"
         case "rare":

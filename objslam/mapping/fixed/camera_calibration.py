@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,8 @@ from objslam.core.statistics import STRAY_RAY
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Log
 from objslam.errors import SolveError
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.fixed.fixed_poses import MOST_ROUNDS, SAME, FixedPoses, placed_objects, with_noise_of
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution
@@ -66,41 +67,43 @@ def calibrate_fixed(
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[Floats, Floats]] = []
     in_rows = False
+    now = at.without(errors, calibration.values)
     for number in range(MOST_ROUNDS):
         progress(f"association, round {number + 1}", 0, 0)
-        now = at.without(errors, calibration.values)
         if number:
             association = now.associate(told)
+            progress("solve", 0, 0)
+            trial = _tried(at, now, errors, calibration, association, trace)
         else:
-            association, in_rows = _first_association(at, errors)
+            trial, in_rows = _first_trial(at, now, errors, calibration, told, trace)
+        association, estimate, found = trial.association, trial.estimate, trial.found
         rounds = (*rounds, {"objects": association.count})
-        progress("solve", 0, 0)
-        estimate = now.solve(association, trace, _parameters(calibration))
-        placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
-        try:
-            found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
-        except SolveError as error:
-            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {error}")
+        if trace is not None and trial.trace is not None:
+            trace.take(trial.trace)
+        if found is None:
+            ledger.warn(f"the shared errors could not be estimated, and stay as they were: {trial.failure}")
             every_object = now.add_few(association, estimate, told)
             if every_object.count > association.count:
                 association, estimate = every_object, now.solve(every_object, trace, _parameters(calibration))
             return now, association, replace(estimate, calibration=calibration, uncalibrated=True), rounds
         earlier.append((calibration.values, np.hypot(_own(now), told)))
-        moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
-        calibration = found.calibration
+        calibration, now = found.calibration, trial.corrected
         # Wide gates also hold the rays of poses whose errors last. In rows of equal things they hold those of neighbours.
-        told = noise_beside_objects(errors, found, association, moved) if in_rows else noise_of_errors(every, calibration)
-        corrected = at.without(errors, calibration.values)
-        at = at.with_noise_of_poses(corrected.noise_of_poses(association, moved, estimate.weight))
+        told = (
+            noise_beside_objects(errors, found, association, trial.moved) if in_rows else noise_of_errors(every, calibration)
+        )
+        at = at.with_noise_of_poses(now.seen.pose_noise)
         allowed = np.hypot(_own(at), told)
+        turned = turned_by_errors(every, np.array([values for values, _ in earlier]), calibration.values)
         if any(
-            _rms(turned_by_errors(every, values, calibration.values) / before) < SAME and _rms(allowed / before - 1) < SAME
-            for values, before in earlier
+            _rms(angle / before) < SAME and _rms(allowed / before - 1) < SAME
+            for angle, (_, before) in zip(turned, earlier, strict=True)
         ):
             break
     else:
         ledger.warn(f"the shared errors still change after {MOST_ROUNDS} rounds of association")
-    now = at.without(errors, calibration.values)
+    assert found is not None  # There is at least one round.
+    progress("solve", 0, 0)
     estimate = now.solve(association, trace, _parameters(calibration))
     centred = _calibrated_by_centres(now, errors, association, estimate, calibration.values)
     if centred is not None:
@@ -160,50 +163,91 @@ def _expected(errors: SharedErrors) -> Calibration:
     return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
 
 
-def _first_association(at: FixedPoses, errors: SharedErrors) -> tuple[Association, bool]:
+@dataclass(frozen=True)
+class _Trial:
+    """An association at some values of the errors, and what follows from it.
+
+    estimate: the objects at these values. found: the calibration by these objects, None if `failure` prevents it. moved:
+    (N, 3) m, the objects at the calibrated errors, NaN without a position. corrected: the input at the calibrated errors,
+    with the noise of the poses that it shows. trace: the record of the estimate, None if nothing is recorded.
+    """
+
+    association: Association
+    estimate: Estimate
+    found: FixedCalibration | None
+    failure: SolveError | None
+    moved: Floats
+    corrected: FixedPoses
+    trace: Trace | None
+
+    def left(self) -> tuple[float, float]:
+        """Return what the calibration leaves (`_left`), infinities without a calibration."""
+        if self.found is None:
+            return float("inf"), float("inf")
+        return _left(self.corrected, self.association, self.moved)
+
+
+def _tried(
+    at: FixedPoses,
+    now: FixedPoses,
+    errors: SharedErrors,
+    calibration: Calibration,
+    association: Association,
+    trace: Trace | None,
+) -> _Trial:
+    """Solve the objects of an association, and calibrate the errors by them.
+
+    at, now: the input as measured, and corrected for `calibration.values`.
+    """
+    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
+    from objslam.graph.fixed_pose_triangulation import largest_noise
+
+    attempt = None if trace is None else trace.aside()
+    estimate = now.solve(association, attempt, _parameters(calibration))
+    placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
+    try:
+        found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
+    except SolveError as error:
+        return _Trial(association, estimate, None, error, placed, now, attempt)
+    moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
+    then = at.without(errors, found.calibration.values)
+    then = then.with_noise_of_poses(then.noise_of_poses(association, moved, estimate.weight))
+    return _Trial(association, estimate, found, None, moved, then, attempt)
+
+
+def _first_trial(
+    at: FixedPoses,
+    now: FixedPoses,
+    errors: SharedErrors,
+    calibration: Calibration,
+    told: Floats,
+    trace: Trace | None,
+) -> tuple[_Trial, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
     An association that allows for the uncertainty of ray directions because of the errors is right if things are far apart.
     In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong distance. Then a
     narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the associations are compared
     by how likely the rays are after a calibration. A narrower one has to be clearly better. Also return whether it is.
-    """
-    from objslam.graph.calibration.fixed_pose_calibration import noise_of_errors
 
-    calibration = _expected(errors)
-    told = noise_of_errors(errors.take(at.frames, at.rays), calibration)
-    now = at.without(errors, calibration.values)
-    wide = now.associate(told)
+    at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
+    of the errors.
+    """
+    wide = _tried(at, now, errors, calibration, now.associate(told), trace)
     best = wide
-    missed, least = _left_calibrated(at, errors, calibration, wide)
+    missed, least = wide.left()
     if missed <= _FITS:
         return wide, False
     least -= _CLEARLY
     for share in _NARROWER:
-        narrow = now.associate(share * told)
-        _, left = _left_calibrated(at, errors, calibration, narrow)
+        association = now.associate(share * told)
+        if np.array_equal(association.object, wide.association.object):
+            continue  # It leaves the same.
+        narrow = _tried(at, now, errors, calibration, association, trace)
+        _, left = narrow.left()
         if left < least:
             best, least = narrow, left
     return best, best is not wide
-
-
-def _left_calibrated(
-    at: FixedPoses, errors: SharedErrors, calibration: Calibration, association: Association
-) -> tuple[float, float]:
-    """Return what a calibration by an association leaves (`_left`). Infinities if the association does not allow it."""
-    from objslam.graph.calibration.fixed_pose_calibration import calibrate_at_poses
-    from objslam.graph.fixed_pose_triangulation import largest_noise
-
-    now = at.without(errors, calibration.values)
-    estimate = now.solve(association, None)
-    placed, noise = placed_objects(estimate), largest_noise(now.seen, now.settings)
-    try:
-        found = calibrate_at_poses(errors, association, placed, calibration.values, noise)
-    except SolveError:
-        return float("inf"), float("inf")
-    moved = placed + found.sensitivity @ (found.calibration.values - calibration.values)
-    then = at.without(errors, found.calibration.values)
-    return _left(then.with_noise_of_poses(then.noise_of_poses(association, moved, estimate.weight)), association, moved)
 
 
 def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:

@@ -90,6 +90,7 @@ class Searched:
 def search_objects(log: Log, settings: Settings, noise: SparseNoise, *, correct_places: bool = False) -> Searched:
     """Search the objects of a log with a noise. correct_places: as in `few_ray_evidence`."""
     from objslam.association.few_rays.additional_objects import few_ray_evidence
+    from objslam.association.observations import PosedRays
     from objslam.graph.fixed_pose_triangulation import pose_noise
 
     noisier = noise.settings(settings)
@@ -97,17 +98,8 @@ def search_objects(log: Log, settings: Settings, noise: SparseNoise, *, correct_
     rays = build_rays(log, frames, noisier, Ledger())
     sigma, place = pose_noise(rays, frames, noisier)
     cameras = tuple(one.camera for one in log.cameras)
-    found = few_ray_evidence(
-        rays,
-        frames,
-        cameras,
-        noisier,
-        map_T_camera=frames.map_T_camera,
-        sigma=sigma,
-        position_sigma=place,
-        seed=settings.seed,
-        correct_places=correct_places,
-    )
+    posed = PosedRays(rays, frames, cameras, frames.map_T_camera, sigma, place)
+    found = few_ray_evidence(posed, noisier, seed=settings.seed, correct_places=correct_places)
     of = rays.take(found.ray)
     origin, direction = of.in_map(frames.map_T_camera)
     up = upright(frames)

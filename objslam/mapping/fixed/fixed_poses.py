@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.association.nearest_neighbour import associate_by_label
+from objslam.association.observations import PosedRays
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
@@ -81,47 +82,27 @@ class FixedPoses:
     def associate(self, more: Floats | float = 0.0) -> Association:
         """Associate the rays. more: (R,) rad, noise of the ray directions in addition to the noise of boxes and poses."""
         from objslam.association.global_association import associate_globally
-        from objslam.graph.fixed_pose_triangulation import flat_noise
 
-        settings = self.settings
-        if settings.association.method == "by_label":
+        if self.settings.association.method == "by_label":
             return associate_by_label(self.rays_seen)
-        sigma, place, scale = flat_noise(self.rays, self.frames, settings)
-        return associate_globally(
-            self.rays,
-            self.frames,
-            self.cameras,
-            settings,
-            map_T_camera=self.frames.map_T_camera,
-            sigma=np.hypot(sigma, more),
-            position_sigma=place,
-            seed=settings.seed,
-            flat_scale=scale,
-        )
+        return associate_globally(self._posed(more), self.settings, seed=self.settings.seed)
 
     def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
         """Add the objects that can be found from few rays.
 
         estimate: the estimate of the objects, None if there are none. more: as in `associate`."""
         from objslam.association.few_rays.additional_objects import add_few_ray_objects
+
+        placed = np.zeros((0, 3)) if estimate is None else placed_objects(estimate)
+        return add_few_ray_objects(self._posed(more), self.settings, association, placed, seed=self.settings.seed)
+
+    def _posed(self, more: Floats | float) -> PosedRays:
+        """Return all rays at the given poses. more: as in `associate`."""
         from objslam.graph.fixed_pose_triangulation import flat_noise
 
-        settings = self.settings
-        sigma, place, scale = flat_noise(self.rays, self.frames, settings)
-        placed = np.zeros((0, 3)) if estimate is None else np.where(estimate.solved[:, None], estimate.positions, np.nan)
-        return add_few_ray_objects(
-            self.rays,
-            self.frames,
-            self.cameras,
-            settings,
-            association,
-            placed,
-            map_T_camera=self.frames.map_T_camera,
-            sigma=np.hypot(sigma, more),
-            position_sigma=place,
-            seed=settings.seed,
-            flat_scale=scale,
-        )
+        sigma, place, scale = flat_noise(self.rays, self.frames, self.settings)
+        noise = np.hypot(sigma, more), place, scale
+        return PosedRays(self.rays, self.frames, self.cameras, self.frames.map_T_camera, *noise)
 
     def solve(self, association: Association, trace: Trace | None, parameters: Parameters | None = None) -> Estimate:
         """Triangulate the objects of an association, and record a round. parameters: the shared errors that were removed."""
@@ -146,8 +127,9 @@ def associate_fixed(
     """Find the objects, and the noise of the poses if the settings allow it.
 
     With too narrow gates, one object becomes several, and their rays show hardly any noise. So the noise is first taken from
-    an association with wide gates. Then the association and the noise are found in turns until the noise stays. Returns the
-    input with this noise, the association, the estimate, and the number of objects in each round if there were several.
+    an association with wide gates. Then the association and the noise are found in turns until the noise no longer changes.
+    Returns the input with this noise, the association, the estimate, and the number of objects in each round if there were
+    several.
     """
     rounds: tuple[dict[str, int], ...] = ()
     earlier: list[tuple[float, float]] = []

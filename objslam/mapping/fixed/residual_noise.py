@@ -68,7 +68,8 @@ def noise_of_residuals(searched: Searched, unknown: tuple[bool, bool, bool], pri
 
 
 def gain_of_shared_places(searched: Searched) -> float:
-    """Return the log odds that all rays of one moment have the same error of their place, over each ray having its own."""
+    """Return the log odds that all rays of one moment have the same error of their place, against an own error for each
+    ray."""
     if not len(searched.found.owner):
         return 0.0
     residuals = _Residuals.of(searched)

@@ -153,7 +153,7 @@ class CommonTilt:
     prior: float
 
     def lasting(self) -> Uneven:
-        """Return the ground with the time for which its tilt lasts, and the size with which it lasts that long.
+        """Return the ground with the time for which its tilt lasts, and with the size of the tilt if it lasts that long.
 
         Tilt that lasts lifts a thing in all its rays, so rays show less of it, and its size is larger than it seems.
         """

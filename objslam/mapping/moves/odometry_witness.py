@@ -9,7 +9,8 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.types import Log
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.shared_errors import SharedErrors, shared_errors
+from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.turning_clocks import clocks_of_turns
 
 _LONG = 5.0
@@ -18,7 +19,8 @@ turn takes, 2 to 4 s in recorded drives. A larger value misses shorter errors.""
 
 
 def odometry_contradicts(log: Log, settings: Settings) -> bool:
-    """Return whether the odometry shows that the localisation errs for seconds, by at least what `localization` says.
+    """Return whether the odometry shows that the localisation errs for seconds, by at least the noise in the settings
+    `localization`.
 
     Both paths are compared at the clocks that the turns of the robot show. A localisation that agrees with its settings, and
     a log without odometry, give False.

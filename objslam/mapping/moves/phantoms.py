@@ -75,9 +75,9 @@ def check_neighbours(solution: Solution, errors: SharedErrors | None, settings: 
     many = int(near.any(axis=1).sum())
     return Finding(
         NEIGHBOURS,
-        f"{many} of {len(placed)} objects have a neighbour of the same label that is nearer than the localisation errs "
-        f"for seconds: by {np.degrees(yaw):.2g} deg and {100 * place:.2g} cm. Their boxes may be exchanged, and objects may "
-        "be missing or false",
+        f"{many} of {len(placed)} objects have a neighbour of the same label that is too near to be told apart, because the "
+        f"localisation errs by {np.degrees(yaw):.2g} deg and {100 * place:.2g} cm for seconds. Their boxes may be "
+        "exchanged, and objects may be missing or false",
         spoils=False,
     )
 
@@ -89,7 +89,7 @@ def without_phantoms(state: JointState) -> JointState:
     a thing, and a solve bends the path until they agree. Each ray then fits, so no round of association frees it. Here each
     object is taken out of the map in turn. The most likely path without the object gives its rays to other objects. If this
     explains the log better, the object is a phantom. The phantom whose loss explains the log best is dropped, and the other
-    phantoms are tried again. The shared errors and the noise stay in these trials.
+    phantoms are tried again. The shared errors and the noise are fixed in these trials.
     """
     assert state.association is not None
     best = replace(state.attempt(), hold=state.errors is not None)

@@ -39,8 +39,8 @@ class Comparison:
 
     registration: the match of the two maps. reason: why it was accepted or refused, in a few words. changes: one for each
     object of both maps, empty if the registration was refused. a_T_b: (4, 4) takes points from the second frame to the
-    first. has_views: whether the first and the second map say what was in view. Otherwise nothing can be told to be gone
-    (second map), and each object that only the second map has counts as new (first map).
+    first. has_views: whether the first and the second map say what was in view. If the second map does not say it, no object
+    counts as gone. If the first map does not say it, each object that only the second map has counts as new.
     """
 
     registration: Registration

@@ -31,7 +31,7 @@ def write_export(out: Path, to: str, file: Path | None = None, datum: Datum | No
 
     file = file or out / _chosen(to, datum).file
     if file.is_dir():
-        raise OutputError("a folder stands where the file goes", where=str(file))
+        raise OutputError("the file cannot be written, because a folder has its name", where=str(file))
     write_file(file, dump_export(out, to, datum))
     return file
 

@@ -119,7 +119,7 @@ def cut_crops(
     """Return a crop for each ray whose index is in `chosen`, by this index.
 
     A ray has no crop if there is no readable image within `MAX_IMAGE_LAG` of its frame, or if its box is outside the image.
-    progress: is called with the number of image files that are done, and the number of all.
+    progress: a function that gets the number of image files that are done, and the number of all.
     """
     by_file: dict[Path, list[int]] = {}
     for ray in chosen:

@@ -69,7 +69,7 @@ def write_report(
         log: the path of the run's log, which has the images for the pictures; by default the path in summary.json.
         crops: the most pictures of the best boxes of an object, 0 for no pictures. The worst and the rejected boxes of an
             object get half as many each. The boxes of no object get `crops` for each label.
-        progress: is called with the stage, the steps done and the total number of steps.
+        progress: a function that gets the stage, the steps done and the total number of steps.
     Raises:
         OutputError: the result cannot be read, or the page cannot be written.
         LogError: the ground truth cannot be read.

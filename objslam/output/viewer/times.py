@@ -27,7 +27,7 @@ def iteration_column(numbers: Ints) -> Any:
 
 
 def moments(stamps: Floats, of: Ints) -> tuple[Floats, Ints, Ints]:
-    """Group items by their stamp. A stamp without items stays, so that the viewer shows no older items there.
+    """Group items by their stamp. A stamp without items is kept, so that the viewer shows no older items there.
 
     Args:
         stamps: (K,) s, ascending.

@@ -151,7 +151,7 @@ class Journal:
             self._warn(f"{self.file}: {left:.1f} MB of the disk are free, the journal stops at {limit:.1f} MB")
 
     def _seal(self) -> bool:
-        """Begin a new segment, and compress the full one. Return False if the disk refuses the new segment or the sync."""
+        """Begin a new segment, and compress the full one. Return False if the segment cannot be created or synced."""
         try:
             identity, number = identity_of(self.file, self._header), self._header.number
             fresh, stream = new_file(self.file, identity, number + 1)

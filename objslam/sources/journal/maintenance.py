@@ -54,7 +54,7 @@ def repair(path: Path) -> list[Path]:
     """Rewrite each damaged segment without its damage, and compress the earlier segments that are uncompressed.
 
     Return the files that were written. The damaged file is kept beside the new one, with ".damaged" after its name. Records
-    that this version of objslam cannot read stay. A missing segment, or one without a header, cannot be repaired. Raises
+    that this version of objslam cannot read are kept. A missing segment, or one without a header, cannot be repaired. Raises
     LogError if the path is not a journal, and OutputError if a session writes it or a file cannot be written.
     """
     file = journal_file(path)

@@ -51,7 +51,7 @@ class PoseMessage:
 
 @dataclass(frozen=True)
 class MountMessage:
-    """The pose base_T_camera (4, 4) of a moving camera on the robot. It holds from its stamp (s) until the next mount."""
+    """The pose base_T_camera (4, 4) of a moving camera on the robot. It is valid from its stamp (s) until the next mount."""
 
     stamp: float
     camera: str
@@ -59,7 +59,7 @@ class MountMessage:
 
 
 class HeldMounts:
-    """The mounts of one camera, which are its poses on the robot. Each mount holds until the next."""
+    """The mounts of one camera, which are its poses on the robot. Each mount is valid until the next one."""
 
     def __init__(self, most: int | None = None) -> None:
         """Start without mounts. most: how many of the newest mounts are kept. None keeps all."""

@@ -83,7 +83,7 @@ def read_mrclam(folder: Path, ledger: Ledger, options: MrclamOptions) -> Log:
 def integrate(stamps: Floats, velocities: Floats) -> Floats:
     """Integrate the velocities of a robot. Returns x, y (m) and yaw (rad) at each stamp, (N, 3), with zero at the first.
 
-    stamps: (N,) s. velocities: (N, 2) forward (m/s) and turn (rad/s). Each holds until the next stamp, so that the robot
+    stamps: (N,) s. velocities: (N, 2) forward (m/s) and turn (rad/s). Each is valid until the next stamp, so that the robot
     drives exact arcs.
     """
     way, turn = (velocities[:-1] * np.diff(stamps)[:, None]).T

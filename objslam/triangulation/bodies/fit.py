@@ -89,16 +89,20 @@ def fit(
     damping = np.full(len(start), _DAMPING[0])
     steps = 0
     while len(moving) and steps < most:
-        part = moving
-        boxes = np.flatnonzero(np.isin(edges.body, part))
-        some = edges.take(boxes)
-        some = replace(some, body=np.searchsorted(part, some.body))
-        mine = Weights(weights.variance[boxes], weights.spread[boxes], weights.robust)
-        own = Prior(prior.mean[part], prior.information[part])
+        part, some, own, mine, before = moving, edges, prior, weights, now
+        if len(part) < len(start):
+            boxes = np.flatnonzero(np.isin(edges.body, part))
+            some, before = edges.take(boxes), now.take(boxes)
+            some = replace(some, body=np.searchsorted(part, some.body))
+            mine = Weights(weights.variance[boxes], weights.spread[boxes], weights.robust)
+            own = Prior(prior.mean[part], prior.information[part])
         values[part], damping[part], found, rest, steps = _steps(
-            some, values[part], damping[part], now.take(boxes), own, mine, kind, (steps, most, still)
+            some, values[part], damping[part], before, own, mine, kind, (steps, most, still)
         )
-        now.put(boxes, found)
+        if some is edges:
+            now = found
+        else:
+            now.put(boxes, found)
         moving = part[~rest]
     weight = _weight(now, weights)
     information, _, _ = _normal(edges.body, now, weight, prior, values)

@@ -2,7 +2,7 @@
 
 A box goes around the visible part of an object, which is never larger than the object. So if something hides a part, the box
 ends short of the body. An edge that ends short by more than the noise may be hidden. Then it is a bound, as at the image's
-border. No edge is hidden because it reaches too far.
+border. An edge that reaches too far does not count as hidden.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.triangulation.bodies.choice import log_evidence
 from objslam.triangulation.bodies.edges import BoxEdges
-from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Prior, Weights, fit
+from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Prior, fit
 from objslam.triangulation.bodies.prior import cuboid_prior
 from objslam.triangulation.bodies.residuals import residuals
 from objslam.triangulation.bodies.shapes import CUBOID, KINDS, Kind
-from objslam.triangulation.bodies.shared import effective_variance, sides_of, spread_of
+from objslam.triangulation.bodies.shared import sides_of, spread_of, weights_of
 
 _OUTER = 0.05
 """The outer body may reach beyond an edge. Then the edge counts with this share of its usual weight. With a smaller share,
@@ -56,11 +56,12 @@ def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
 def hidden_edges(
     edges: BoxEdges, some: Ints, start: Floats, shape: Ints, prior: Prior, side: Floats, factors: Floats, share: Floats
 ) -> Hidden:
-    """Return the edges that are hidden, of the objects whose boxes this explains better than a body that bends to them.
+    """Return the hidden edges. An object has some only if they explain its boxes better than a body that bends to fit all
+    edges.
 
     The first body bends to fit hidden edges too, and then none stands out. So an outer body is fitted, which reaches beyond
     edges at little cost. Edges far inside it are taken to be hidden, and a body is fitted without them, in turns. It
-    competes with the body of all edges by the evidence. Both are equally probable before.
+    competes with the body of all edges by the evidence. Before the fits, both are equally probable.
 
     some: indices of the boxes that the fits use. start, shape: (N, 7) and (N,), bodies and their shapes. prior: of
     ellipsoids. side: (B,) px as in `log_evidence`. factors, share: as in `Bodies`.
@@ -114,8 +115,7 @@ def _of_bodies(edges: BoxEdges, boxes: Ints, bodies: Ints) -> BoxEdges:
 def _fitted(edges: BoxEdges, start: Floats, kind: Kind, prior: Prior, side: Floats, noise: Noise) -> tuple[Floats, Floats]:
     """Return the best bodies (N, 7) of one kind, and the logarithm of their evidence (N,)."""
     sides = sides_of(edges, start[:, :3])
-    variance = effective_variance(edges, sides, noise.factors, noise.share)
-    weights = Weights(variance, spread_of(edges, noise.factors, noise.share))
+    weights = weights_of(edges, sides, noise.factors, noise.share)
     found = fit(edges, start, prior, weights, kind, still=ENOUGH, most=STEPS)
     return found.values, log_evidence(edges, found, prior, weights, side)
 

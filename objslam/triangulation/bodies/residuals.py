@@ -64,7 +64,7 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     away = points - edges.origin[:, None]
     scale = np.maximum(np.sqrt(np.einsum("bei,bei->be", away, away)) * edges.turn, _LEAST)  # m per px
     off, by = gap / scale, by_gap / scale[..., None]
-    count = len(edges)
+    count = len(off)
     value, use = np.empty((count, ROWS)), np.ones((count, ROWS))
     jacobian = np.empty((count, ROWS, PARAMETERS))
     for out, mixed in ((value, off), (jacobian, by)):
@@ -74,7 +74,14 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     for place in (axis, axis + 2):
         value[row, place], jacobian[row, place] = off[row, place], by[row, place]
         use[row, place] = 1.0 - edges.bound[row, place] * (off[row, place] > 0)
-    value[:, 4], jacobian[:, 4], use[:, 4] = _ranges(edges, values, kind)
+    value[:, 4], jacobian[:, 4], use[:, 4] = 0.0, 0.0, 0.0
+    known = np.flatnonzero(np.isfinite(edges.range))
+    if len(known):
+        distance, jacobian[known, 4], hit = kind.ranges(
+            values[edges.body[known]], edges.origin[known], edges.direction[known]
+        )
+        value[known, 4] = np.where(hit, distance - edges.range[known], 0.0)
+        use[known, 4] = hit
     return Residuals(value, jacobian, use)
 
 
@@ -105,7 +112,8 @@ def touched_points(edges: BoxEdges, values: Floats, shape: Ints) -> Floats:
 
 def nominal_noise(edges: BoxEdges) -> Floats:
     """Return the noise (B, 5) of shift, size and range by the settings, before it is estimated from the log."""
-    edge, sigma = edges.sigma / np.sqrt(2), np.empty((len(edges), ROWS))
+    edge = edges.sigma / np.sqrt(2)
+    sigma = np.empty((len(edge), ROWS))
     sigma[:, :2], sigma[:, 2:4] = np.hypot(edge, edges.shift)[:, None], edge[:, None]
     sigma[:, 4] = np.where(np.isfinite(edges.range), edges.range_sigma, 1.0)
     return sigma
@@ -145,14 +153,3 @@ def whole_axes(edges: BoxEdges) -> Bools:
 def _axes_with_bound(edges: BoxEdges) -> tuple[Ints, Ints]:
     row, axis = np.nonzero((edges.bound[:, :2] > 0) | (edges.bound[:, 2:] > 0))
     return row, axis
-
-
-def _ranges(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
-    """Return predicted minus measured ranges (B,), m, to the surface, their derivatives (B, 7), and which (B,) count."""
-    known = np.flatnonzero(np.isfinite(edges.range))
-    gap, by, use = np.zeros(len(edges)), np.zeros((len(edges), PARAMETERS)), np.zeros(len(edges))
-    if len(known):
-        distance, by[known], hit = kind.ranges(values[edges.body[known]], edges.origin[known], edges.direction[known])
-        gap[known] = np.where(hit, distance - edges.range[known], 0.0)
-        use[known] = hit
-    return gap, by, use

@@ -14,7 +14,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import evenly_spread
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.triangulation.bodies.edges import BoxEdges
-from objslam.triangulation.bodies.fit import Fit, grouped
+from objslam.triangulation.bodies.fit import Fit, Weights, grouped
 from objslam.triangulation.bodies.residuals import ROWS, Residuals, at_edges, nominal_noise, on_shift_and_size, whole_axes
 
 SIDES = 103
@@ -115,12 +115,12 @@ def spread_of(edges: BoxEdges, factors: Floats, share: Floats) -> Floats:
     return at_edges(edges, np.hypot(_white(edges, factors), _scale(edges, share)))
 
 
-def effective_variance(edges: BoxEdges, sides: Sides, factors: Floats, share: Floats) -> Floats:
-    """Return the variances (B, 5) with which residuals count, so that the shared error of a side counts once."""
+def weights_of(edges: BoxEdges, sides: Sides, factors: Floats, share: Floats) -> Weights:
+    """Return how much the residuals count. The variances are such that the shared error of a side counts once."""
     ranged = np.bincount(edges.body, np.isfinite(edges.range))  # All ranges of a body share their error.
     number = np.column_stack([sides.number, ranged[edges.body]])
     own, shared = at_edges(edges, _white(edges, factors)), at_edges(edges, _scale(edges, share))
-    return np.asarray(own**2 + number * shared**2)
+    return Weights(own**2 + number * shared**2, np.hypot(own, shared))
 
 
 def _white(edges: BoxEdges, factors: Floats) -> Floats:

@@ -20,11 +20,10 @@ from objslam.triangulation.bodies.shapes import CYLINDER, ELLIPSOID, KINDS, rows
 from objslam.triangulation.bodies.shared import (
     Sides,
     covariance_of,
-    effective_variance,
     share_of,
     sides_of,
     some_of_each_side,
-    spread_of,
+    weights_of,
     white_factors,
 )
 from objslam.triangulation.bodies.to_centre import directions_to_centres, shifts_of
@@ -190,7 +189,7 @@ def _counted(edges: BoxEdges, now: _State) -> Floats | None:
 
 def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints) -> _State:
     """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
-    weights, first = _weights(edges, sides, now), now.best is None
+    weights, first = weights_of(edges, sides, now.factors, now.share), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
     ball_prior = sphere_prior(now.prior)
     ball = fit(edges, now.fitted[_SPHERE], ball_prior, weights, ELLIPSOID, still=ENOUGH, most=STEPS)
@@ -245,7 +244,7 @@ def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> 
 
 def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bodies:
     """Return the bodies of the chosen shapes from all boxes. between: (N, 6, 6), see `Bodies.between_shapes`."""
-    weights = _weights(edges, sides, now)
+    weights = weights_of(edges, sides, now.factors, now.share)
     count, boxes = len(now.shape), len(edges)
     values, covariance = np.zeros((count, 7)), np.zeros((count, 7, 7))
     shift, weight = np.zeros((boxes, 2)), np.zeros(boxes)
@@ -282,11 +281,6 @@ def _axes_of_shapes(now: _State) -> Floats:
 def _of_shapes(fitted: tuple[Floats, ...], shape: Ints) -> Floats:
     """Return the body (N, 7) of the given shape (N,) of each object."""
     return np.stack(fitted)[shape, np.arange(len(shape))]
-
-
-def _weights(edges: BoxEdges, sides: Sides, now: _State) -> Weights:
-    variance = effective_variance(edges, sides, now.factors, now.share)
-    return Weights(variance, spread_of(edges, now.factors, now.share))
 
 
 def _dots(edges: BoxEdges, now: _State, weights: Weights, side: Floats) -> tuple[Floats, Floats]:

@@ -12,7 +12,7 @@ from objslam.triangulation.bodies.residuals import Residuals, whole_axes
 def shifts_of(edges: BoxEdges, found: Residuals) -> Floats:
     """Return by how much predicted boxes lie to the right of the measured ones and below them (B, 2), px.
 
-    If one edge of an axis is a bound, the other edge tells the shift. Two bounds tell none, so their shift is 0.
+    If one edge of an axis is a bound, the other edge tells the shift. Two bounds tell no shift, so it is 0.
     """
     low, high, both = edges.bound[:, :2], edges.bound[:, 2:], found.value[:, :4]
     by_one_edge = np.where(high, np.where(low, 0.0, -both[:, :2]), both[:, 2:])

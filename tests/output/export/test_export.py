@@ -194,7 +194,7 @@ def test_what_cannot_be_exported(result, tmp_path):
         write_export(result, "xls")
     with pytest.raises(OutputError, match="no such result folder"):
         write_export(tmp_path / "nowhere", "csv")
-    with pytest.raises(OutputError, match="a folder stands where"):
+    with pytest.raises(OutputError, match="a folder has its name"):
         write_export(result, "csv", tmp_path)
     with pytest.raises(OutputError):
         write_export(result, "csv", tmp_path / "nowhere" / "x.csv")

@@ -332,7 +332,7 @@ def pictures(page: Page) -> list[tuple[str, Any]]:
 def test_doubts_are_said_with_pictures_of_their_boxes(mapped: Path) -> None:
     rays = load_rays(mapped / "out")
     plants = np.flatnonzero(rays.label == "plant")
-    text = "2 plant boxes near (1.00, 2.00, 3.00): <b>their rays</b> pass 6 cm apart, 3 sigma are 2 cm."
+    text = "2 plant boxes near (1.00, 2.00, 3.00): <b>their rays</b> miss a common point by 6 cm, and 3 sigma are 2 cm."
     doubt = Doubt("boxes", "apart", "plant", text, (0, 99), np.array([1.0, 2.0, 3.0]), plants[:2], {})
     beyond = dataclasses.replace(doubt, kind="pair", rays=np.array([len(rays) + 5]))  # A ray that is not in the file.
     before = Page(write_report(mapped / "out", crops=3))

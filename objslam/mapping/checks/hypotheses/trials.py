@@ -65,7 +65,8 @@ class Trial:
 
 
 def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Settings, progress: Progress) -> list[Trial]:
-    """Return a trial of the unchanged log, followed by one for each hypothesis. The best hypothesis comes first."""
+    """Return a trial of the unchanged log, and behind it a trial of each hypothesis, in the order from the best to the
+    worst."""
     first = _unchanged(before, log)
     every = list(hypotheses(part.log))
 
