@@ -8,15 +8,16 @@ The second line runs whole drives in joint mode instead, with bodies and without
 that the image's edge cuts off. The third line feeds drives of two laps to live sessions. It takes the map before the end of
 the session, and the pose of each keyframe when the session had just mapped it.
 
-The nearest peer, gtsam-quadrics, has wheels for Python 3.10 and numpy below 1.24 only. The benchmark says whether it can be
-imported here, and compares nothing with it otherwise.
+The nearest peer, gtsam-quadrics, has wheels for Python 3.10 and numpy below 1.24 only. With --peer PYTHON, the interpreter
+of an environment that has it solves the same boxes from the same points. Without it, a line says that the peer is absent.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=0, help="drives between large objects, in place of single bodies")
     parser.add_argument("--short", type=float, help="draw cut off boxes, up to this share of their size short")
     parser.add_argument("--live", type=int, default=0, help="drives of two laps between large objects, in live sessions")
+    parser.add_argument("--peer", help="the Python of an environment with gtsam-quadrics 0.3.0 and numpy below 1.24")
     options = parser.parse_args()
     if options.live:
         live(options.live)
@@ -70,9 +72,35 @@ def main() -> None:
         start = time.process_time()
         bodies = solved(boxes, poses, points)
         report(seed, true, points, bodies, distance, time.process_time() - start)
-    peer = importlib.util.find_spec("gtsam_quadrics")
+        if options.peer:
+            peer(options.peer, true, boxes, poses, points, options.noise, distance)
+    if not options.peer:
+        print(
+            "gtsam-quadrics: absent (it needs Python 3.10 and numpy < 1.24; name the Python of its environment with --peer)"
+        )
+
+
+def peer(python: str, true: Floats, boxes: Floats, poses: Floats, points: Floats, noise: float, distance: Floats) -> None:
+    """Solve the same boxes with gtsam-quadrics in another Python, and print its errors and CPU time."""
+    half = start_sizes(boxes, poses, points).mean(axis=1)
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder, "in.npz"), Path(folder, "out.npz")
+        body = owners(boxes, len(true))
+        np.savez(given, boxes=boxes, poses=poses, body=body, points=points, half=half, matrix=CAMERA.matrix, noise=noise)
+        script = Path(__file__).resolve().parent / "peers" / "quadrics.py"
+        done = subprocess.run([python, str(script), str(given), str(found)], capture_output=True, text=True, check=False)
+        if done.returncode:
+            print(f"  gtsam-quadrics: absent or failed: {(done.stderr.strip().splitlines() or ['no message'])[-1]}")
+            return
+        with np.load(found) as solution:
+            centres, axes, seconds = solution["centres"], solution["axes"], float(solution["seconds"])
+    off = np.linalg.norm(centres - true[:, :3], axis=1)
+    large = 2 * half_axes(true).max(axis=1) / distance > LARGE
+    rms = [float(np.sqrt(np.nanmean(off[which] ** 2))) for which in (large, ~large)]
+    sides = np.nanmedian(np.abs(axes / np.sort(half_axes(true), axis=1) - 1))
     print(
-        "gtsam-quadrics:", "absent (it needs Python 3.10 and numpy < 1.24)" if peer is None else "present, but not compared"
+        f"  gtsam-quadrics: {np.isfinite(off).sum()} solved, RMSE large {rms[0]:.4f} m, other {rms[1]:.4f} m, "
+        f"half axes off by {100 * sides:.1f} % (median), {seconds:.2f} s of CPU"
     )
 
 
@@ -176,13 +204,18 @@ def triangulated(boxes: Floats, poses: Floats, count: int) -> Floats:
     return triangulate(poses[:, :3, 3], rays, owners(boxes, count), count, sigma, settings).positions
 
 
+def start_sizes(boxes: Floats, poses: Floats, points: Floats) -> Floats:
+    """Return half the width and the height (N, 2), m, that the boxes of objects have at points (N, 3)."""
+    away = np.linalg.norm(points[owners(boxes, len(points))] - poses[:, :3, 3], axis=1)
+    size = (boxes[:, 2:] - boxes[:, :2]) * away[:, None] / CAMERA.focal
+    return np.asarray(np.median(size.reshape(len(points), -1, 2), axis=1) / 2)
+
+
 def solved(boxes: Floats, poses: Floats, points: Floats) -> Bodies:
     """Return the bodies of objects at points (N, 3), with the default noise of the settings."""
     count, number = len(points), len(boxes)
-    body = owners(boxes, count)
-    size = boxes[:, 2:] - boxes[:, :2]
-    away = np.linalg.norm(points[body] - poses[:, :3, 3], axis=1)
-    half = np.median((size * away[:, None] / CAMERA.focal).reshape(count, -1, 2), axis=1) / 2
+    body, size = owners(boxes, count), boxes[:, 2:] - boxes[:, :2]
+    half = start_sizes(boxes, poses, points)
     direction, _ = undistort(CAMERA, (boxes[:, :2] + boxes[:, 2:]) / 2)
 
     def measure(_: Floats | None) -> BoxEdges:
