@@ -162,10 +162,11 @@ def _run(
         missing = missing or late
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
+    told = None if earlier is None else (earlier.yaw, earlier.xy)
     if (
         settings.checks.use
         and settings.mode == "joint"
-        and (near := check_neighbours(solution, before, settings, earlier and (earlier.yaw, earlier.xy))) is not None
+        and (near := check_neighbours(solution, before, settings, told)) is not None
     ):
         diagnosis = diagnosis.with_findings([near])
         say(diagnosis, ledger)
