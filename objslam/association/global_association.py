@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam import config
-from objslam.association.appearance.evidence import learn_ratio
+from objslam.association.crossings.exchanged_rays import annealed, learned
+from objslam.association.crossings.ghost_pairs import replace_ghosts
 from objslam.association.crossings.one_or_two import find_crossings, without_smaller_bundles
 from objslam.association.existence import chance_odds, existence, rest_odds
-from objslam.association.gating import alternate, explained, gate_limit, near, size_costs
+from objslam.association.gating import alternate, gate_limit, near, size_costs
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
@@ -47,10 +48,6 @@ smaller odds, they are tried more often, which takes time."""
 _EXPLAINED = 0.9
 """Points at rest replace moving points if they explain at least this share of their rays. With a smaller share, parts of the
 path of a moving thing become objects. With a larger share, wrong boxes keep things at rest from being found."""
-_COOLING = (20.0, 10.0, 5.0, 3.0, 2.0)
-"""The factors on the noise of the rays while an association is annealed. A larger first factor lets the appearance move more
-rays, and more factors take longer. In simulated clusters, a first factor of 20 mends more exchanges than 10, and 10 more
-than 5."""
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
 
@@ -95,7 +92,7 @@ def associate_globally(
         association, position = guess
         known = flattened_points(position, of.scale), np.ones(len(position)), association.label
         state = replace(state, landmarks=Landmarks.new(*known, len(rays.label_names)), matched=association.object[ray])
-        state = _alternate(task, _learned(state.keep(_plausible(task, state))))
+        state = _alternate(task, learned(state.keep(_plausible(task, state))))
     state, refuted, moving = _search(task, state, nothing)
     if moving.count and keyframes.localized_every:  # At poses that drift, things at rest seem to move.
         state, refuted = _at_rest(task, state, refuted, moving)
@@ -103,10 +100,11 @@ def associate_globally(
     refuted |= dropped
     sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
     if solved or keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
-        state, likely, dropped = _without_crossings(task, state, likely, sized)
-        refuted |= dropped
+        for repair in (_without_ghosts, _without_crossings):
+            state, likely, dropped = repair(task, state, likely, sized)
+            refuted |= dropped
     if state.ratio is not None:
-        state, likely = _drop_all(task, _annealed(task, state))
+        state, likely = _drop_all(task, annealed(state, task.gate, lambda now: _alternate(task, now)))
     if settings.association.fuse_labels:
         landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
@@ -119,33 +117,6 @@ def associate_globally(
     return replace(_result(state, likely, ray), refuted=(refuted & (state.matched < 0))[np.argsort(ray)])
 
 
-def _learned(state: State) -> State:
-    """Return the state with a ratio of appearances that is learnt from its present landmarks."""
-    obs = state.obs
-    ratio = learn_ratio(obs, obs.frame, obs.track, state.matched, len(state.unassigned))
-    return state if ratio is state.ratio is None else replace(state, ratio=ratio)  # A new state would compute all anew.
-
-
-def _annealed(task: _Task, state: State) -> State:
-    """Assign the rays of close landmarks again, first by their appearance and then more and more by their position.
-
-    Two close landmarks may have exchanged some rays. Then both landmarks lie between the objects, and no single ray fits the
-    other landmark better. If the noise of the rays is assumed larger than it is, the appearance decides (deterministic
-    annealing, Rose 1998). Each label keeps its earlier landmarks if the new ones explain its rays no better.
-    """
-    obs, begin = state.obs, _learned(state)
-    if begin.ratio is None:
-        return begin
-    now = begin
-    for times in _COOLING:
-        hot = replace(obs, sigma=obs.sigma * times, position_sigma=obs.position_sigma * times)
-        now = _alternate(task, replace(now, obs=hot))
-    now = _learned(_alternate(task, replace(now, obs=obs)))
-    before, after = (explained(one, task.gate) for one in (replace(begin, ratio=now.ratio), now))
-    better = after > before
-    return replace(begin.keep(~better[begin.label]).joined(now.keep(better[now.label])), ratio=now.ratio)
-
-
 def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bools, State]:
     """Search for landmarks, and drop unlikely ones, until a search finds none. excluded: landmarks that are not found.
 
@@ -155,7 +126,7 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
     for turn in range(_TURNS):
         before = state.count
         state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded), 2)
-        state = _merge_round(task, _learned(state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)))
+        state = _merge_round(task, learned(state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)))
         likely = existence(state, task.gate)
         moving = moving.joined(state.keep(_seems_to_move(task, state, likely)))
         kept = _drop(task, state, likely)
@@ -283,6 +254,19 @@ def _merged_and_dropped(task: _Task, state: State) -> tuple[State, Floats, Bools
         refuted |= (merged.matched >= 0) & (state.matched < 0)
         if state.count == merged.count:
             break
+    return state, likely, refuted
+
+
+def _without_ghosts(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats, Bools]:
+    """Replace pairs of landmarks at crossings by the two things whose rays cross there. Values as `_without_crossings`."""
+    refuted, earlier = np.zeros(len(state.matched), dtype=bool), set[bytes]()
+    while len(earlier) < _TURNS and (key := state.matched.tobytes()) not in earlier:
+        earlier.add(key)
+        replaced = replace_ghosts(state, task.gate, task.seed)
+        if replaced is state:
+            break
+        state, likely, dropped = _merged_and_dropped(task, _alternate(task, replaced))
+        refuted |= dropped
     return state, likely, refuted
 
 

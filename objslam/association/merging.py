@@ -9,7 +9,7 @@ from objslam.association.gating import gated_edges
 from objslam.association.label_fusion import SIZE_RATIO
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations, overlap
-from objslam.association.refinement import BEHIND, normalised_residuals, range_costs, refine, squared_offsets, variance
+from objslam.association.refinement import BEHIND, normalised_residuals, ray_costs, refine
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import nearest_points
@@ -126,13 +126,13 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
     count, a, b, number = len(pairs.a), pairs.a, pairs.b, state.ray_count.astype(float)
     obs, history, position, noise = state.obs, state.history, state.landmarks.position, state.landmarks.noise
     r, own = obs.take(pairs.ray), state.matched[pairs.ray]
-    two = _ray_costs(r, position[own], noise[own], gate)
+    two = ray_costs(r, position[own], noise[own], gate)
     share = (number[a] / (number[a] + number[b]))[:, None]
     wider = np.maximum(noise[a], noise[b])
     middle = refine(obs, pairs.ray, pairs.pair, share * position[a] + (1 - share) * position[b], wider)
     deviation = np.minimum(normalised_residuals(r, middle[pairs.pair]), BEHIND)
     joint = np.maximum(grouped_median(deviation, pairs.pair, count) / RAYLEIGH_MEDIAN, np.minimum(noise[a], noise[b]))
-    one = _ray_costs(r, middle[pairs.pair], joint[pairs.pair], gate)
+    one = ray_costs(r, middle[pairs.pair], joint[pairs.pair], gate)
 
     order = np.lexsort((one, r.frame, pairs.pair))
     again = np.flatnonzero((np.diff(pairs.pair[order]) == 0) & (np.diff(r.frame[order]) == 0)) + 1
@@ -149,13 +149,6 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
     seen = history.seen[a] + history.seen[b] - both_seen
     expected = history.expected[a] + history.expected[b] - both_expected
     return np.asarray(saved + misses[a] + misses[b] - rates.cost(seen, expected, stronger))
-
-
-def _ray_costs(r: Observations, position: Floats, noise: Floats, gate: float) -> Floats:
-    """Return -2 ln likelihood (R,) of each ray for its point, up to a constant. It is at most `gate`, the cost of
-    a ray without a landmark."""
-    off2, distance = squared_offsets(r, position)
-    return np.minimum(off2 / variance(r, distance, noise) + 4 * np.log(noise) + range_costs(r, distance), gate)
 
 
 def common_frames(history: DetectionHistory, a: Ints, b: Ints) -> list[Ints]:

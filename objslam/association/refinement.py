@@ -73,6 +73,15 @@ def range_costs(
     return np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
 
 
+def ray_costs(obs: Observations, position: Floats, noise: Floats | float, gate: float) -> Floats:
+    """Return -2 ln likelihood (R,) of each ray for its point, up to a constant. It is at most `gate`, the cost of a ray
+    without a landmark. position: (R, 3) or (3,) m. noise: (R,) or one factor on the nominal noise."""
+    off2, distance = squared_offsets(obs, position)
+    return np.asarray(
+        np.minimum(off2 / variance(obs, distance, noise) + 4 * np.log(noise) + range_costs(obs, distance), gate)
+    )
+
+
 def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floats) -> Floats:
     """Refine positions (N, 3) m of points from P pairs of a ray and its point. A ray may be in several pairs.
 

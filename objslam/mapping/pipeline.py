@@ -35,6 +35,7 @@ from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.far_sides import with_far_sides
 from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasting_errors
+from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
@@ -62,22 +63,30 @@ def run(
     SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
-    result, wrong = _run(log, settings, ledger, progress, known)
+    result, wrong, lasting = _run(log, settings, ledger, progress, known)
     if settings.mode != "auto" or not wrong or chosen_poses(log, settings).odometry is None:
         return result
     at_poses = ledger.copy()
     ledger.restore(before)  # What a run drops counts once.
     ledger.warn(f"{wrong}, so the poses are solved too (--mode fixed keeps them)")
     try:
-        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known)[0]
+        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known, lasting)[0]
     except SolveError as error:  # The map at the given poses is better than none.
         ledger.restore(at_poses)
         ledger.warn(f"{wrong}, but the poses cannot be solved too: {error}")
         return result
 
 
-def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known: PriorMap | None) -> tuple[RunResult, str]:
-    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, else ""."""
+def _run(
+    log: Log,
+    settings: Settings,
+    ledger: Ledger,
+    progress: Progress,
+    known: PriorMap | None,
+    earlier: LastingNoise | None = None,
+) -> tuple[RunResult, str, LastingNoise | None]:
+    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, else "", and their
+    errors that last. earlier: such errors that a map at the given poses showed."""
     given = log = chosen_poses(log, settings)
     unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
@@ -152,10 +161,11 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
         missing = missing or late
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
+    told = None if earlier is None else (earlier.yaw, earlier.xy)
     if (
         settings.checks.use
         and settings.mode == "joint"
-        and (near := check_neighbours(solution, before, settings)) is not None
+        and (near := check_neighbours(solution, before, settings, told)) is not None
     ):
         diagnosis = diagnosis.with_findings([near])
         say(diagnosis, ledger)
@@ -218,7 +228,7 @@ def _run(log: Log, settings: Settings, ledger: Ledger, progress: Progress, known
     why = "the localisation errs for seconds" if late is not None else ""
     if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
         why = "no object has a place at the localised poses"
-    return result, why
+    return result, why, lasting
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

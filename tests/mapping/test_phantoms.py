@@ -1,16 +1,19 @@
 """Equal things in groups at a localisation whose headings err for seconds, so that rays of several things meet."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from test_lasting_errors import with_lasting
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.noise import NoiseFactors
 from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import joint_solve, pipeline
-from objslam.mapping.moves.phantoms import NEIGHBOURS
+from objslam.mapping.moves.phantoms import BENT, NEIGHBOURS, check_neighbours
 from objslam.simulation import DriveSettings, PoseNoise, simulate
 
 MIDDLES = ((-2.0, 1.5), (2.2, 1.2), (0.3, -2.2), (-0.5, 2.4))
@@ -74,3 +77,25 @@ def test_a_good_localisation_takes_no_time_for_phantoms(monkeypatch):
 
     monkeypatch.setattr(joint_solve, "without_phantoms", searched)
     assert mapped(drive(0)) == ((8, 0, 0), [])
+
+
+@pytest.mark.parametrize(("turning", "labels", "told"), [(3.5, [0, 0], True), (1.5, [0, 0], False), (3.5, [0, 1], False)])
+def test_a_path_that_may_be_bent_to_false_objects_is_named(turning, labels, told):
+    """Only if a map at the given poses showed that they err. Things 4 m apart are not exchanged by errors of 0.2 degrees."""
+    poses = np.broadcast_to(np.eye(4), (2, 4, 4))
+    solution = SimpleNamespace(
+        keyframes=SimpleNamespace(localized_every=1.0),
+        rays=SimpleNamespace(keyframe=np.array([0, 1])),
+        association=SimpleNamespace(object=np.array([0, 1]), label=np.array(labels), count=2),
+        estimate=SimpleNamespace(
+            noise=NoiseFactors(turning=turning),
+            weight=np.ones(2),
+            map_T_base=poses,
+            positions=np.array([[2.0, 2.0, 0.0], [2.0, -2.0, 0.0]]),
+            covariance=np.broadcast_to(1e-4 * np.eye(3), (2, 3, 3)),
+        ),
+    )
+    settings, earlier = load_settings(None, ()), (0.004, 0.017)
+    found = check_neighbours(solution, None, settings, earlier)
+    assert (found is not None and found.name == BENT) == told
+    assert check_neighbours(solution, None, settings) is None

@@ -1,5 +1,6 @@
-"""Landmarks where the rays of two things cross. A bundle is the rays from one stretch of the path.
+"""Landmarks where the rays of two things cross, or that exchanged rays. A bundle is the rays from one stretch of the path.
 
-one_or_two compares one thing and two as explanations of the rays of a landmark. bundles divides the rays. positions fits
-points to bundles. usual_views holds what is usual in a class.
+ghost_pairs replaces two landmarks at crossings by two things. one_or_two compares one thing and two as explanations of the
+rays of a landmark. exchanged_rays lets the appearance of boxes decide. bundles divides the rays. positions fits points to
+bundles. usual_views holds what is usual in a class.
 """

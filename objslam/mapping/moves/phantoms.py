@@ -29,6 +29,12 @@ errors, at the distance from which they are seen. A ray errs by more than 2 stan
 value warns of more maps."""
 NEIGHBOURS = "equal things nearer than the poses err"
 """The name of the finding that the errors of poses are as large as the distances of equal things."""
+BENT = "a path that may be bent to false objects"
+"""The name of the finding that the odometry contradicts both the poses and the boxes, where labels have several objects."""
+_BENT = 3.0
+"""If an earlier map at the given poses showed that they err, and the odometry then counts as this many times as noisy as the
+settings say, the path may be bent to false objects, which hide how far the poses err. Nine tenths of the variance are then
+not in the settings. A larger value warns of fewer maps."""
 _MOST = 60
 """The most objects that are tried as phantoms, those that are least likely to exist first. Each takes a search of the path
 and a solve. A larger number finds more phantoms in large maps, and takes longer."""
@@ -46,22 +52,29 @@ def begins_with_lasting_errors(state: JointState) -> bool:
     return has_lasting_errors(state) and state.errors is not None and max(lasting_long(state.errors.noise)) >= _LARGE
 
 
-def check_neighbours(solution: Solution, errors: SharedErrors | None, settings: Settings) -> Finding | None:
+def check_neighbours(
+    solution: Solution, errors: SharedErrors | None, settings: Settings, earlier: tuple[float, float] | None = None
+) -> Finding | None:
     """Return a finding if a joint solve at a localisation that errs for seconds has equal things that it cannot tell apart.
 
     All rays of these seconds pass their things on the same side, so a ray to one thing may point at its neighbour. The solve
-    bends the path until such rays fit, so the residuals do not show it. The odometry may show it.
-    errors: of all frames, before the solve.
+    bends the path until such rays fit, so the residuals do not show it. The odometry may show it, or an earlier map at the
+    given poses.
+    errors: of all frames, before the solve. earlier: the errors of headings, rad, and of places, m, that an earlier map at
+    the given poses showed.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     noise = estimate.noise
     number = np.bincount(association.label[np.isfinite(estimate.covariance[:, 0, 0])])
     if noise is None or not keyframes.localized_every or number.max(initial=0) < 2:
         return None
-    turned, moved = np.maximum(noise.lasting_factors, lasting_by_odometry(errors)).tolist()
-    if max(turned, moved) < _LARGE:
+    said = np.array([settings.localization.yaw, settings.localization.xy])
+    size = np.maximum(noise.lasting_factors, lasting_by_odometry(errors)) * said
+    if earlier is not None:  # They were a finding, because the odometry contradicts the poses as well.
+        size = np.maximum(size, earlier)
+    elif (size < _LARGE * said).all():
         return None
-    yaw, place = turned * settings.localization.yaw, moved * settings.localization.xy
+    yaw, place = size.tolist()
     held = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     owner, origins = association.object[held], estimate.map_T_base[solution.rays.keyframe[held], :3, 3]
     away = grouped_median(np.linalg.norm(estimate.positions[owner] - origins, axis=1), owner, association.count)
@@ -69,7 +82,15 @@ def check_neighbours(solution: Solution, errors: SharedErrors | None, settings: 
     placed = np.flatnonzero(np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(shift))
     apart = np.linalg.norm(estimate.positions[placed, None, :2] - estimate.positions[None, placed, :2], axis=2)
     equal = association.label[placed][:, None] == association.label[placed]
-    near = (apart < _APART * np.maximum(shift[placed][:, None], shift[placed])) & equal & ~np.eye(len(placed), dtype=bool)
+    equal &= ~np.eye(len(placed), dtype=bool)
+    near = (apart < _APART * np.maximum(shift[placed][:, None], shift[placed])) & equal
+    if not near.any() and earlier is not None and (bent := max(noise.along, noise.across, noise.turning)) >= _BENT:
+        message = (
+            f"{int(equal.any(axis=1).sum())} of {len(placed)} objects share their label with others, the localisation errs "
+            f"for seconds, and the boxes agree only if the odometry is {bent:.1f} times as noisy as the settings say. The "
+            "path may be bent to objects that are false"
+        )
+        return Finding(BENT, message, spoils=False)
     if not near.any():
         return None
     many = int(near.any(axis=1).sum())
