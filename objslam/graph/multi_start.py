@@ -59,8 +59,8 @@ class MultiStart:
         """Return the solution with the least misfit: `found`, or one that begins at another growing graph.
 
         Ranges determine a position at once. So if at least half of the objects have one, or if there are fiducials, the
-        first solution is returned. It is also returned for a log with many rays (`_MOST_RAYS`). In a log with more than few rays
-        (`_FEW_RAYS`), the first start that ends in a known minimum is the last one.
+        first solution is returned. It is also returned for a log with many rays (`_MOST_RAYS`). In a log with more than few
+        rays (`_FEW_RAYS`), the first start that ends in a known minimum is the last one.
         """
         rays, object_ = self.measured.rays, self.association.object
         ranged = np.unique(object_[np.isfinite(rays.range) & (object_ >= 0)])
