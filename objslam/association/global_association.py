@@ -100,7 +100,7 @@ def associate_globally(
     refuted |= dropped
     sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
     if solved or keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
-        for repair in (_without_ghosts, _without_crossings):
+        for repair in (_without_crossings, _without_ghosts):
             state, likely, dropped = repair(task, state, likely, sized)
             refuted |= dropped
     if state.ratio is not None:
