@@ -86,7 +86,7 @@ def _run(
     earlier: LastingNoise | None = None,
 ) -> tuple[RunResult, str, LastingNoise | None]:
     """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, else "", and their
-    errors that last. earlier: such errors that a map at the given poses showed."""
+    errors that last, if these are a finding. earlier: such errors of an earlier map at the given poses."""
     given = log = chosen_poses(log, settings)
     unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
@@ -228,7 +228,7 @@ def _run(
     why = "the localisation errs for seconds" if late is not None else ""
     if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
         why = "no object has a place at the localised poses"
-    return result, why, lasting
+    return result, why, None if late is None else lasting
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

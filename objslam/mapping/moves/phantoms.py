@@ -70,7 +70,7 @@ def check_neighbours(
         return None
     said = np.array([settings.localization.yaw, settings.localization.xy])
     size = np.maximum(noise.lasting_factors, lasting_by_odometry(errors)) * said
-    if earlier is not None:  # They were a finding, because the odometry contradicts the poses as well.
+    if earlier is not None:  # They were a finding of the earlier map.
         size = np.maximum(size, earlier)
     elif (size < _LARGE * said).all():
         return None
