@@ -13,7 +13,6 @@ from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.geometry import inverse
 from objslam.errors import SolveError
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.frontend.turning_odometry import with_turns_of_tracks
 from objslam.mapping.doubted_labels import (
     CLEAR_ODDS,
     doubted_names,
@@ -22,6 +21,7 @@ from objslam.mapping.doubted_labels import (
     has_several,
     needs_noisy_boxes,
 )
+from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
 from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
 from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
 from objslam.mapping.fixed.camera_calibration import associate_at_poses
@@ -89,7 +89,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         if doubtful or has_lasting_errors(state):
             state = without_phantoms(_anew(state.split()))
     else:
-        begin = _with_turns(state)
+        begin = with_errors_of_tracks(state)
         start, sure = explored(begin)
         first = _from_start(*solved_if_sure(begin, start, sure))
         state = _improved(first, JointState.relocalized)
@@ -138,15 +138,6 @@ def _with_clocks(state: JointState) -> JointState:
     if state.errors is None or state.theta is not None:
         return state
     theta = clocks_of_turns(state.errors)
-    keyframes, rays, _ = state.errors.at(theta)
-    return replace(state, theta=theta, keyframes=keyframes, rays=rays)
-
-
-def _with_turns(state: JointState) -> JointState:
-    """Return the state that begins at the error of the odometry's turns which the tracks of boxes show."""
-    if state.errors is None:
-        return state
-    theta = with_turns_of_tracks(state.errors, state.errors.mean if state.theta is None else state.theta)
     keyframes, rays, _ = state.errors.at(theta)
     return replace(state, theta=theta, keyframes=keyframes, rays=rays)
 

@@ -1,0 +1,70 @@
+"""Chains of boxes that show one thing in images that follow each other, from odometry alone."""
+
+import numpy as np
+
+from objslam.core.arrays import Ints
+from objslam.core.types import Association, Keyframes, Rays
+
+_LONGEST = 1.0
+"""The longest time (s) between two boxes of a track that follow each other. Over a longer time, the robot drives past the
+thing, and the next box is not where the odometry expects it."""
+_NEAR = np.radians(6.0)
+"""The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
+moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
+_FEWEST = 3
+"""The fewest rays of a track. Two rays nearly always meet. With a larger number, fewer tracks tell anything."""
+
+
+def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
+    """Return an association with an object for each track of at least three rays.
+
+    A ray continues a track of the image before if both are the nearest of their label to each other. Rays of shorter tracks
+    have no object.
+
+    keyframes: with odometry, which tells where each ray is expected in the next image.
+    """
+    _, track, length = np.unique(_tracks(keyframes, rays), return_inverse=True, return_counts=True)
+    long = length >= _FEWEST
+    number = np.where(long, np.cumsum(long) - 1, -1)
+    label = np.zeros(int(long.sum()), dtype=rays.label.dtype)
+    owner = number[track]
+    label[owner[owner >= 0]] = rays.label[owner >= 0]
+    return Association(owner, label)
+
+
+def _tracks(keyframes: Keyframes, rays: Rays) -> Ints:
+    """Return the track (R,) of each ray: the index of its first ray."""
+    assert keyframes.odom_T_base is not None
+    odom_R_camera = (keyframes.odom_T_base @ keyframes.base_T_camera)[:, :3, :3]
+    direction = np.einsum("rij,rj->ri", odom_R_camera[rays.keyframe], rays.direction)
+    one, two = _neighbours(keyframes, rays)
+    cosine = np.einsum("pi,pi->p", direction[one], direction[two])
+    near = np.flatnonzero(cosine > np.cos(_NEAR))
+    one, two, cosine = one[near], two[near], cosine[near]
+    forward, backward = np.full((2, len(rays)), -1.0)
+    np.maximum.at(forward, one, cosine)
+    np.maximum.at(backward, two, cosine)
+    linked = (cosine == forward[one]) & (cosine == backward[two])
+    root = np.arange(len(rays))
+    root[two[linked]] = one[linked]
+    while (root[root] != root).any():
+        root = root[root]
+    return root
+
+
+def _neighbours(keyframes: Keyframes, rays: Rays) -> tuple[Ints, Ints]:
+    """Return the pairs (P,) of rays of one label in images of one camera that follow each other."""
+    group = rays.label * (int(keyframes.camera.max(initial=0)) + 1) + keyframes.camera[rays.keyframe]
+    order = np.lexsort((rays.keyframe, group))
+    changes = np.flatnonzero((np.diff(group[order]) != 0) | (np.diff(rays.keyframe[order]) != 0)) + 1
+    begin = np.append(0, changes)
+    end = np.append(changes, len(order))
+    first = order[begin]
+    apart = np.diff(keyframes.stamps[rays.keyframe[first]])
+    follow = np.flatnonzero((np.diff(group[first]) == 0) & (apart > 0) & (apart <= _LONGEST))
+    many, more = (end - begin)[follow], (end - begin)[follow + 1]
+    pair = np.repeat(np.arange(len(follow)), many * more)
+    step = np.arange(len(pair)) - np.repeat(np.cumsum(many * more) - many * more, many * more)
+    one = begin[follow][pair] + step // more[pair]
+    two = begin[follow + 1][pair] + step % more[pair]
+    return order[one], order[two]

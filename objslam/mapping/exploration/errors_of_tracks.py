@@ -1,0 +1,85 @@
+"""Find the shared errors of a log before any map: each track of boxes is a landmark of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.errors import SolveError
+from objslam.frontend.tracks import associate_tracks
+
+if TYPE_CHECKING:
+    from objslam.core.arrays import Bools, Floats, Ints
+    from objslam.mapping.joint_alternation import JointState
+
+_ROUNDS = 2
+"""The number of times that tracks are found and solved. In the second round, the odometry expects each box at the place that
+the first round corrected. More rounds change the errors by less than their sigmas."""
+_APART = 0.15
+"""The least time (s) between two images that are solved. A track needs no more images to be linked, and more of them tell
+little more. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
+_MOST = 3000
+"""About the largest number of rays that are solved. The errors of more rays would be known better than an exploration needs,
+and would take longer."""
+_BLOCK = 50
+"""If more rays are left, this number of consecutive keyframes is solved at a time, and the next ones are left out. A track
+ends where its block ends. With a larger number, fewer tracks are cut, and fewer parts of the drive are heard."""
+
+
+def with_errors_of_tracks(state: JointState) -> JointState:
+    """Return the state that begins at the shared errors which the tracks of boxes show.
+
+    A track is a chain of boxes in images that follow each other (`frontend.tracks`). Nobody needs to know which tracks show
+    the same thing: at the right clocks, turns and rotations of cameras, the rays of each track meet in one point. So the
+    tracks are solved as landmarks, with the odometry and the priors of all errors. The noise stays that of the settings: many
+    landmarks with few rays hardly tell it.
+
+    The first association of a drive takes these errors as given. With a gyroscope that turns by 0.2 degrees a second too
+    much, the rays of one minute meet nowhere.
+    """
+    if state.errors is None or not state.errors.names or state.keyframes.odom_T_base is None:
+        return state
+    tracked = _excerpt(state)
+    for _ in range(_ROUNDS):
+        association = associate_tracks(tracked.keyframes, tracked.rays)
+        if association.count == 0:
+            break
+        try:
+            tracked = tracked.solve("association", association)
+        except SolveError:  # No track tells anything.
+            break
+    if tracked.theta is None:
+        return state
+    keyframes, rays, _ = state.errors.at(tracked.theta)
+    return replace(state, theta=tracked.theta, keyframes=keyframes, rays=rays)
+
+
+def _excerpt(state: JointState) -> JointState:
+    """Return an attempt with images that are some time apart, in parts of the log that have few rays together, and with the
+    noise of the settings."""
+    assert state.errors is not None
+    keep = _apart(state.keyframes.stamps, state.keyframes.camera)
+    every = -(-int(keep[state.rays.keyframe].sum()) // _MOST)
+    keep &= (np.cumsum(keep) - 1) // _BLOCK % every == 0
+    number, mine = np.cumsum(keep) - 1, keep[state.rays.keyframe]
+    measured = []
+    for keyframes, rays in ((state.keyframes, state.rays), (state.errors.keyframes, state.errors.rays)):
+        some = rays.take(mine)
+        measured.append((keyframes.take(keep), replace(some, keyframe=number[some.keyframe])))
+    (keyframes, rays), raw = measured
+    noise = state.settings.noise.model_copy(update={"rays": False, "ranges": False, "odometry": False})
+    settings = state.settings.model_copy(update={"noise": noise})
+    errors = replace(state.errors.take(*raw), settings=settings)
+    attempt = replace(state.attempt(), trace=None, association=None, estimate=None)
+    return replace(attempt, keyframes=keyframes, rays=rays, settings=settings, errors=errors)
+
+
+def _apart(stamps: Floats, camera: Ints) -> Bools:
+    """Return a mask (K,) of keyframes of which each camera has one in each span of `_APART`. stamps: (K,) s. camera: (K,)."""
+    span = np.stack([camera, np.floor((stamps - stamps.min()) / _APART).astype(np.int64)])
+    _, first = np.unique(span, axis=1, return_index=True)
+    keep = np.zeros(len(stamps), dtype=bool)
+    keep[first] = True
+    return keep

@@ -1,0 +1,89 @@
+"""The shared errors that tracks of boxes show before any map, on simulated drives with known errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bench_robots import robot
+from log_parts import without_names
+from turning_drive import drive, errors_of
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.evaluation.evaluate import evaluate
+from objslam.mapping import pipeline
+from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
+from objslam.mapping.joint_alternation import JointState
+from objslam.simulation.shared_errors import add_shared_errors
+
+TURN_SCALE, TURN_BIAS, CLOCK = "odometry.turn_scale", "odometry.turn_bias", "front.clock"
+
+
+def begin(log, *overrides):
+    errors = errors_of(log, "mode=joint", *overrides)
+    cameras = tuple(one.camera for one in log.cameras)
+    of_log = errors.keyframes, errors.rays
+    return JointState(*of_log, *of_log, cameras, errors.settings, Ledger(), lambda *_: None, None, errors)
+
+
+def found(state):
+    state = with_errors_of_tracks(state)
+    assert state.estimate is None  # The tracks are no map.
+    assert len(state.keyframes) == len(state.errors.keyframes)
+    return dict(zip(state.errors.names, state.theta.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(("scale", "seed", "labels"), [(-0.1, 1, 40), (0.0, 2, 3), (0.08, 4, 1)])
+def test_tracks_show_how_far_the_robot_turned(scale, seed, labels):
+    log = add_shared_errors(drive(seed, labels=labels), {TURN_SCALE: scale})
+    assert found(begin(log))[TURN_SCALE] == pytest.approx(scale, abs=0.02)
+
+
+def test_wrong_labels_and_other_errors_hide_neither_turns_nor_clock():
+    wrong = {"front.yaw": 0.02, TURN_BIAS: 0.003, "odometry.scale": 0.03, TURN_SCALE: -0.05}
+    values = found(begin(add_shared_errors(drive(3, false=0.1, labels=3, clock=0.1), wrong)))
+    assert values[TURN_SCALE] == pytest.approx(-0.05, abs=0.02)
+    assert values[CLOCK] == pytest.approx(0.1, abs=0.02)  # s
+
+
+def test_tracks_show_the_bias_of_a_gyroscope():
+    log, true = robot(5008, "gyro")
+    values = found(begin(without_names(log)))
+    assert true[TURN_BIAS] < -0.006  # rad/s
+    assert values[TURN_BIAS] == pytest.approx(true[TURN_BIAS], abs=0.002)
+    assert values[CLOCK] == pytest.approx(true[CLOCK], abs=0.015)  # s
+
+
+def test_parts_of_a_long_log_are_enough(monkeypatch):
+    from objslam.mapping.exploration import errors_of_tracks
+
+    log = add_shared_errors(drive(1, labels=1), {TURN_SCALE: 0.08})
+    assert len(begin(log).rays) > 3 * 300
+    monkeypatch.setattr(errors_of_tracks, "_MOST", 300)
+    monkeypatch.setattr(errors_of_tracks, "_BLOCK", 20)
+    assert found(begin(log))[TURN_SCALE] == pytest.approx(0.08, abs=0.03)
+
+
+def test_a_log_without_tracks_keeps_what_is_expected():
+    log = drive(1)
+    detections = log.cameras[0].detections
+    every = np.flatnonzero(detections.frame % 7 == 0)  # More than a second lies between the others.
+    camera = replace(log.cameras[0], detections=detections.take(every))
+    state = begin(replace(log, cameras=(camera,)))
+    assert with_errors_of_tracks(state) is state
+
+
+def test_turns_that_are_held_stay():
+    log = add_shared_errors(drive(), {TURN_SCALE: 0.08})
+    assert TURN_SCALE not in found(begin(log, "calibration.turn_scale=0"))
+    state = begin(log, "calibration.use=false")
+    assert with_errors_of_tracks(state) is state
+
+
+def test_a_gyroscope_with_a_bias_is_mapped_without_names():
+    """The rays of one minute meet nowhere before the bias is known: 7 of 12 objects were found, and 8 false ones."""
+    log = without_names(robot(5007, "gyro")[0])
+    result = pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false")), Ledger())
+    compared = evaluate(result.map, log.truth, align="se2", radius=0.5).to_dict()
+    assert tuple(compared[name] for name in ("matched", "false", "missed")) == (12, 0, 0)
+    assert result.summary["assessment"]["level"] == "good"
