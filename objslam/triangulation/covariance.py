@@ -129,12 +129,12 @@ def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     xp = bundle.xp
     rays = bundle.select(use)
     widest = xp.zeros(len(rays.number), dtype=rays.direction.dtype, device=rays.direction.device)
-    axes = as_tensor(evenly_spread(64), backend_of(rays.direction))
     few = indices_of((rays.number > 1) & (rays.number <= _EVERY_PAIR))
     many = indices_of(rays.number > _EVERY_PAIR)
     for objects, members, real in (*rays.blocks(few, _PLACES), *rays.blocks(many, _PLACES)):
         direction = rays.direction[members]
         if members.shape[1] > _EVERY_PAIR:
+            axes = as_tensor(evenly_spread(64).copy(), backend_of(direction))
             towards = xp.where(real[:, :, None], direction @ axes.T, -xp.inf).argmax(axis=1)
             direction = direction[xp.arange(len(objects), device=towards.device)[:, None], towards]
             real = xp.ones_like(towards, dtype=xp.bool)

@@ -19,8 +19,8 @@ _FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # For each of the nine entries of a symmetr
 class LineBlock:
     """Lines of B objects with up to n lines each, in coordinates of their object.
 
-    foot: (3, n, B) the point of each line nearest to the coordinate origin. direction: (3, n, B) unit. weight: (n, B) 1 for a
-    line, 0 for a filler. xp: the library of the arrays, numpy or torch.
+    foot: (3, n, B) the point of each line nearest to the coordinate origin. direction: (3, n, B) unit. weight: (n, B) 1 for
+    a line, 0 for a filler. xp: the library of the arrays, numpy or torch.
     """
 
     foot: Tensor
