@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from turning_drive import drive, errors_of
 
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.turning_odometry import TURN_SCALE, with_turns_of_tracks
-from objslam.simulation.shared_errors import add_shared_errors
 
 
 def found(errors: SharedErrors) -> float:

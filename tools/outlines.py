@@ -16,6 +16,14 @@ _STEPS = 8  # The number of steps of the search for an extreme pixel. More are m
 _NEAREST = 0.05  # The least depth, m, of an outline. A larger value drops closer bodies.
 
 
+def from_axes(centre: Floats, half: Floats, yaw: Floats) -> Floats:
+    """Return ellipsoids (N, 7) from centres (N, 3), half axes (N, 3) along x, y, z before the turn, m, and yaws (N,)."""
+    log = np.log(half)
+    aspect = (log[:, 0] - log[:, 1]) / 2
+    flat = [(log[:, 0] + log[:, 1]) / 2, aspect * np.cos(2 * yaw), aspect * np.sin(2 * yaw)]
+    return np.column_stack([centre, *flat, log[:, 2]])
+
+
 def looking_at(place: Floats, target: Floats) -> Floats:
     """Return map_T_camera (4, 4) of a level camera at a place (3,) that looks at a target (3,), m."""
     z = target - place
