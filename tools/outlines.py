@@ -1,4 +1,4 @@
-"""Compute exact boxes around ellipsoids from the outlines of their images. Tests and benchmarks of bodies use them."""
+"""Compute exact boxes around ellipsoids from the outlines of their images."""
 
 from __future__ import annotations
 

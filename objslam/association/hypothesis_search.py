@@ -42,7 +42,8 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator, exclud
     """Return the points (N, 3) m on which rays of one label agree. The point with the most support comes first.
 
     Each hypothesis is scored against all rays at once. In each frame only the best ray counts: 1 for a perfect fit, 0 at the
-    gate. The support of a point excludes the rays of better points. excluded: (M, 3) m, points that are not found.
+    gate. The support of a point excludes the rays of better points. excluded: (M, 3) m, points that must not be
+    found.
     """
     points = _propose(obs, search, rng)
     if len(points) == 0:

@@ -109,7 +109,7 @@ def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
 
     Args:
         total: (Y, X, X) of the states before.
-        x, y, yaw: as of `Motions.costs`.
+        x, y, yaw: as in `Motions.costs`.
     """
     below = total < _SLIP
     turns, east, north = (_extent(np.any(below, axis=others, keepdims=True).ravel()) for others in ((1, 2), (0, 2), (0, 1)))
