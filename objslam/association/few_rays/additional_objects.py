@@ -40,8 +40,8 @@ streets. A larger number takes longer."""
 _FIRST = 0.7
 """The noise of the places in the first search, as a share of the noise in the settings. With wide gates, near objects become
 one, and then they show no errors of places. On 30 simulated streets with the right noise in the settings, 0.7 and 1 give the
-same objects. With 1.2 times the true noise in the settings, 0.7 is better. With a smaller share, errors of more than usual
-size are not found."""
+same objects. With 1.2 times the true noise in the settings, 0.7 is better. With a smaller share, unusually large errors
+are not found."""
 _SAMPLE = 512  # The most rays of one label in a search. The time grows with the square of this number.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
