@@ -110,7 +110,7 @@ def _windows(keyframes: Keyframes) -> tuple[Ints, Floats]:
 def _tracks(keyframes: Keyframes, rays: Rays) -> Ints:
     """Return the track (R,) of each ray: the index of its first ray.
 
-    A ray continues a track of the image before if both are the nearest of their label to each other.
+    A ray continues the track of a ray in the previous image if each of the two is the nearest ray of its label to the other.
     """
     assert keyframes.odom_T_base is not None
     odom_R_camera = (keyframes.odom_T_base @ keyframes.base_T_camera)[:, :3, :3]
