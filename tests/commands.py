@@ -3,13 +3,12 @@
 import io
 import sys
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import pytest
 
 
-@dataclass(frozen=True)
-class Call:
+class Call(NamedTuple):
     code: int
     out: str
     err: str

@@ -25,6 +25,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 from mapping.body_drives import drive, scores
+from outlines import from_axes, looking_at, outline_box
 
 from objslam.config import load_settings
 from objslam.core.arrays import Floats, Ints
@@ -35,9 +36,8 @@ from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.live.adapters.replay import events
 from objslam.live.session.session import Session
-from objslam.simulation.outlines import looking_at, outline_box
 from objslam.triangulation.bodies.edges import BoxEdges, tangent_planes
-from objslam.triangulation.bodies.ellipsoid import from_axes, half_axes, heading
+from objslam.triangulation.bodies.ellipsoid import half_axes, heading
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 from objslam.triangulation.triangulate import triangulate
 

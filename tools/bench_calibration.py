@@ -20,6 +20,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from added_errors import add_shared_errors
 
 from objslam.config import Settings, load_settings
 from objslam.core.arrays import Floats
@@ -29,7 +30,6 @@ from objslam.core.result import RunResult
 from objslam.core.types import Log, Trajectory
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 CHI2_95 = 7.815  # chi-squared, 3 degrees of freedom
 CAMERA = {"front.clock": 0.1, "front.roll": 0.02, "front.tilt": 0.02, "front.yaw": 0.03}

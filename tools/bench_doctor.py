@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
+from wrong_inputs import MISTAKES, join
 
 from objslam.config import Odometry, Settings, load_settings
 from objslam.core.diagnostics import Ledger
@@ -34,7 +35,6 @@ from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.mapping.checks.diagnosis import diagnose
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
-from objslam.simulation.wrong_inputs import MISTAKES, join
 from objslam.sources import SourceOptions, read
 
 ROOM = {"objects": 10, "classes": 10, "pixel_sigma": 2.0, "missed": 0.1, "false": 0.01, "frames": 300}

@@ -24,7 +24,7 @@ import numpy as np
 from bench_triangulation import scene
 
 from objslam import config
-from objslam.core.array_module import Backend, as_tensor
+from objslam.core.array_module import Backend, as_tensor, module_of
 from objslam.triangulation import ac_ransac
 from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.point_to_lines import minimise_distances
@@ -60,7 +60,7 @@ def bundle_of(objects: int, rays: int, device: Backend) -> Bundle:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     noise, number = np.full(len(index), 0.006), np.full(objects, rays)
     origin, direction, sigma, owner, count = (as_tensor(one, device) for one in (origins, directions, noise, index, number))
-    return Bundle(origin, direction, sigma, 0.0, owner, count)
+    return Bundle(origin, direction, sigma, 0.0, owner, count, module_of(origin))
 
 
 def main() -> int:
@@ -99,7 +99,7 @@ def main() -> int:
         number = objects * rays
         work: dict[str, tuple[Callable[[], Any], float]] = {
             "Eq. 1": (lambda: minimise_distances(bundle), RAY * number * solved.iterations),  # noqa: B023
-            "score of one point": (lambda: ac_ransac.consensus_about(bundle, solved.point), RAY * number),  # noqa: B023
+            "score of one point": (lambda: ac_ransac.consensus_about(bundle, solved.point[:, None], every), RAY * number),  # noqa: B023
             f"best of {HYPOTHESES} pairs": (
                 lambda: ac_ransac.best_pair(bundle, every, HYPOTHESES, jitter),  # noqa: B023
                 2 * 4 * number * HYPOTHESES,  # The score of each ray and pair is written and read once, in single precision.

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from added_errors import add_shared_errors
 
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.config import Odometry, Settings, load_settings
@@ -35,7 +36,6 @@ from objslam.graph.variables import make_values
 from objslam.mapping import pipeline
 from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 MINUTES = (2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
 HIGHEST = 1.10

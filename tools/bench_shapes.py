@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from outlines import looking_at
 from triangulation.true_boxes import CAMERAS, box_around, edges_of
 
 from objslam.core.arrays import Floats
 from objslam.mapping.bodies.fitting import repeated_error
-from objslam.simulation.outlines import looking_at
 from objslam.triangulation.bodies.solve import solve_bodies
 
 CAMERA = CAMERAS["pinhole"]

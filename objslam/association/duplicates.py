@@ -9,8 +9,8 @@ TOGETHER = 0.03
 
 
 def near_pairs(position: Floats, label: Ints, farthest: float) -> tuple[Ints, Ints, Floats]:
-    """Return the pairs a < b (P,) of objects of one label that are less than `farthest` m apart. Also the offsets (P, 3) m,
-    a - b."""
+    """Return the pairs a < b (P,) of objects of one label that are less than `farthest` m apart, and
+    their offsets a - b (P, 3) m."""
     a, b = np.triu_indices(len(position), 1)
     apart = position[a] - position[b]
     near = (label[a] == label[b]) & (np.linalg.norm(apart, axis=1) < farthest)

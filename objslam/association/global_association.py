@@ -118,7 +118,7 @@ def associate_globally(
 
 
 def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bools, State]:
-    """Search for landmarks, and drop unlikely ones, until a search finds none. excluded: landmarks that are not found.
+    """Search for landmarks, and drop unlikely ones, until a search finds none. excluded: landmarks that must not be found.
 
     Also returns the rays (R,) that belonged to a dropped landmark, and the landmarks that seemed to move, with their rays.
     """
@@ -161,7 +161,7 @@ def _at_rest(task: _Task, state: State, refuted: Bools, moving: State) -> tuple[
 
 def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: Landmarks | None = None) -> State:
     """Add landmarks where unassigned rays of one label agree. turn: the number of the search, which changes the random
-    pairs. parallax: as in `Search`. excluded: landmarks that are not found."""
+    pairs. parallax: as in `Search`. excluded: landmarks that must not be found."""
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
     for label in np.flatnonzero(state.unassigned).tolist():
         free = np.flatnonzero((obs.label == label) & (state.matched < 0))

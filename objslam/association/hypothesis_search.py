@@ -42,7 +42,8 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator, exclud
     """Return the points (N, 3) m on which rays of one label agree. The point with the most support comes first.
 
     Each hypothesis is scored against all rays at once. In each frame only the best ray counts: 1 for a perfect fit, 0 at the
-    gate. The support of a point excludes the rays of better points. excluded: (M, 3) m, points that are not found.
+    gate. The support of a point excludes the rays of better points. excluded: (M, 3) m, points that must not be
+    found.
     """
     points = _propose(obs, search, rng)
     if len(points) == 0:
@@ -54,8 +55,7 @@ def discover(obs: Observations, search: Search, rng: np.random.Generator, exclud
 def _best(scorer: "_Scorer", points: Floats, search: Search, excluded: Floats) -> Floats:
     """Refine points (H, 3) m, and return the points (N, 3) m that have enough support even without the rays of better
     points."""
-    moved = scorer.load(points)
-    xp = module_of(moved)
+    moved, xp = scorer.load(points), scorer.xp
     for _ in range(_REFINEMENTS):
         moved = scorer.refine(moved, scorer.supports(moved))
     support = scorer.supports(moved)
@@ -135,6 +135,7 @@ class _Scorer:
         self.dtype = np.float32 if np.abs(origin).max() < _SINGLE_EXTENT else np.float64
         n, zero, one = obs.direction, np.zeros(len(obs)), np.ones(len(obs))
         self.ahead = self._tensor(np.stack([*n.T, zero, -(n * origin).sum(axis=1)]))
+        self.xp = module_of(self.ahead)
         self.apart2 = self._tensor(np.stack([*(-2 * origin.T), one, (origin**2).sum(axis=1)]))
         self.slope, self.floor = self._tensor(search.gate * obs.sigma**2), search.gate * obs.position_sigma**2 + 1e-9
         across = np.eye(3) - n[:, :, None] * n[:, None, :]
@@ -157,7 +158,7 @@ class _Scorer:
     def supports(self, points: Tensor) -> Tensor:
         """Return the support (H, R) of each point by each ray. It falls with the squared deviation, from 1 for a perfect fit
         to 0 at the gate. A wrong range also reduces it."""
-        xp = module_of(points)
+        xp = self.xp
         p = xp.concat([points, (points**2).sum(axis=1)[:, None], xp.ones_like(points[:, :1])], axis=1)
         out = xp.empty((len(p), self.ahead.shape[1]), dtype=p.dtype, device=p.device)
         step = max(1, _PAIRS_AT_ONCE // self.ahead.shape[1])
@@ -178,7 +179,7 @@ class _Scorer:
 
     def per_frame(self, support: Tensor) -> Tensor:
         """Return the sum over the frames (H,) of the best support in each frame. support: (H, R)."""
-        xp = module_of(support)
+        xp = self.xp
         best, at = 1 * support[:, : self.slices[0]], self.slices[0]
         for width in self.slices[1:]:
             xp.maximum(best[:, :width], support[:, at : at + width], out=best[:, :width])
@@ -188,7 +189,7 @@ class _Scorer:
     def refine(self, points: Tensor, support: Tensor) -> Tensor:
         """Move points (H, 3) to the least-squares solution of the rays, with the weights `support` (H, R). A point does not
         move in directions that its rays do not fix."""
-        xp = module_of(points)
+        xp = self.xp
         information = (support @ self.across).reshape(-1, 3, 3)
         trace = information[:, 0, 0] + information[:, 1, 1] + information[:, 2, 2]
         damping = (1e-3 * trace + 1e-6)[:, None]

@@ -25,6 +25,8 @@ def fused_labels(state: State, gate: float) -> Bools:
     boxes.
     """
     obs, accepts = state.obs, state.landmarks.accepts
+    if accepts.all():  # There is no other label.
+        return accepts
     count, labels = accepts.shape
     free = obs.take(state.matched < 0)
     edges = gated_edges(free, replace(state.landmarks, accepts=np.ones_like(accepts)), gate)

@@ -162,8 +162,8 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """Return the pairs (C,), (C,) of landmarks here and there that may be one landmark within the drift. If there are more
-    than `_CANDIDATES`, those remain whose landmark here has the fewest partners."""
+    """Return the pairs (C,), (C,) of landmarks here and there that may be one landmark within the drift. At most
+    `_CANDIDATES` pairs remain: those of the landmarks here that have the fewest partners."""
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)
     shifted = float(np.sqrt(np.linalg.eigvalsh(problem.prior[:2, :2])[-1]))
@@ -239,7 +239,7 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
     """Return the gains (H, C) of pairs a, b (C,) under corrections (H, 3). A gain is -inf outside the gate.
 
-    It is a log likelihood ratio: that the two are one landmark, against that the landmark here is new.
+    A gain is the log likelihood ratio of two explanations: the two are one landmark, or the landmark here is new.
     """
     return _gain(problem, a, b, problem.target[b] - _moved(problem.offset, x)[0][:, a])
 

@@ -12,7 +12,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera, depths, in_view
 from objslam.core.geometry import evenly_spread
-from objslam.core.ground.flattening import raised_points
+from objslam.core.ground.flattening import LEVEL, raised_points
 from objslam.core.object_map import SeenFrom
 from objslam.core.statistics import distinct, grouped_median, grouped_quantile, grouped_quantiles
 from objslam.core.types import Keyframes
@@ -130,8 +130,8 @@ def detection_history(
     it. The camera sees its front, if it has one. matched: (R,) the object of each observation, -1 for none. position, label:
     (N, 3) m and (N,), of the objects, in the world of the observations.
     """
-    position = raised_points(position, obs.scale)
-    obs = replace(obs, origin=raised_points(obs.origin, obs.scale))
+    if obs.scale != LEVEL:
+        position, obs = raised_points(position, obs.scale), replace(obs, origin=raised_points(obs.origin, obs.scale))
     count = len(position)
     held = np.flatnonzero(matched >= 0)
     index = matched[held]

@@ -8,6 +8,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.core.maps.shared_covariance import root_of
 from objslam.core.noise import NoiseFactors
 from objslam.core.types import Keyframes, Rays
 
@@ -70,8 +71,7 @@ class Calibration:
     @property
     def root(self) -> Floats:
         """(P, P) a matrix whose product with its own transpose is the covariance."""
-        size, axes = np.linalg.eigh(self.covariance)
-        return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+        return root_of(self.covariance)
 
     @property
     def expected(self) -> Floats:

@@ -5,6 +5,7 @@ Twists have the order of GTSAM, rotation first: (wx, wy, wz, vx, vy, vz).
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -325,12 +326,15 @@ def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
     return np.arctan2(lengths(cross(to, directions)), np.einsum("ri,ri->r", to, directions))
 
 
+@lru_cache(maxsize=8)
 def evenly_spread(number: int) -> Floats:
-    """Return unit directions (number, 3) spread evenly over the sphere (a Fibonacci lattice)."""
+    """Return unit directions (number, 3) spread evenly over the sphere (a Fibonacci lattice). They are read-only."""
     k = np.arange(number) + 0.5
     z, azimuth = 1 - 2 * k / number, k * (np.pi * (3 - np.sqrt(5)))
     radius = np.sqrt(1 - z**2)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+    directions = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+    directions.flags.writeable = False  # All callers share them.
+    return directions
 
 
 def nearest_points(points: Floats, count: int) -> Ints:

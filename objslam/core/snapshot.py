@@ -12,7 +12,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.types import Trajectory
 
 NOT_USED = " not used"  # The end of a name in `Snapshot.counters`, such as "odometry not used" if the settings exclude it.
-CAME_BEFORE = " that came before"  # The end of a name for data that a restarted program sent again. Nothing is lost.
+CAME_BEFORE = " that came before"  # The end of a name in `Snapshot.counters`, for repeated data of a restarted program.
 LATE_FRAME = "frame that is late (live.max_late)"  # The reason to drop a frame whose poses are long past.
 TOO_SLOW = "frames that waited too long (live.max_lag)"  # The reason to drop a frame for which the session had no time.
 RARE_POSES = "frames whose pose came more than live.max_lag later: poses are too rare or late, or live.max_lag is too short"

@@ -35,7 +35,7 @@ class Trajectory:
     """Poses of one coordinate frame in another over time.
 
     stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. travel: (N, 3) the sum of
-    `trajectory.travel` since the pose before, over all measured poses. None if no measured pose was left out. Other values
+    `trajectory.travel` since the previous pose, over all measured poses. None if no measured pose was left out. Other values
     raise ValueError.
     """
 

@@ -83,7 +83,8 @@ class CorrectablePath:
     def _curvature(self) -> Floats:
         """(N-1,) rad/m, how sharply the path turns in each step.
 
-        It is of the time `_CURVE` around the middle of the step, so the jitter of headings does not look like curves.
+        It is the mean over the time `_CURVE` around the middle of the step. So the jitter of headings does not look like
+        curves.
         """
         middle, seconds = (self._seconds[1:] + self._seconds[:-1]) / 2, self._seconds
         travel = self.odometry.travel

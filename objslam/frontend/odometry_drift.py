@@ -53,8 +53,7 @@ class DriftPath:
 
     @classmethod
     def of(cls, odometry: Trajectory) -> Self:
-        """Measure the steps of the odometry. If poses were left out of a step, its length is that of the whole way between
-        its ends."""
+        """Measure the steps of the odometry. A step may leave out poses. Its length is then that of the whole way."""
         poses = odometry.poses
         start, places = poses[0, :3, :3], (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3]
         up = start[:, 2] @ poses[:, :3, :3]

@@ -44,7 +44,8 @@ def triangulate_landmarks(
 def flat_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float, float]:
     """Return the noise of rays in a world that is flattened until it is equal in all directions, and the factor on z.
 
-    The noise is as of `pose_noise`, without what planar poses lack on uneven ground. The factor is `LEVEL` on a flat floor.
+    The noise is that of `pose_noise`, without the noise for what planar poses lack on uneven ground. The factor is `LEVEL`
+    on a flat floor.
     """
     yaw, place = noise_of_poses(keyframes, settings)
     uneven = any(noise_up(keyframes, settings))

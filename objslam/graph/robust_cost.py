@@ -1,4 +1,4 @@
-"""The cost of a solution, for a comparison of solutions with different inliers. Also the information of rays."""
+"""The cost of a solution, for a comparison of solutions with different inliers, and the information of rays."""
 
 import numpy as np
 

@@ -54,7 +54,7 @@ class Rounds(ABC, Generic[Answer, Told]):
         self._known, self._replaying = deque(known), True
 
     def begin(self) -> None:
-        """Continue after the journal of a resumed session. Repeat a round that had begun but not corrected the map."""
+        """Continue after the journal of a resumed session. Repeat the last round if it had not yet corrected the map."""
         self._replaying = False
         if self._asked is not None and self._asked[1] is not None and not self._here:
             self._worker.ask(self._asked[1])

@@ -145,7 +145,7 @@ def _solve(
     if settings.mode == "joint":
         estimate, images, keyframes, rays = solution.estimate, solution.keyframes, solution.keyframes, solution.rays
         if errors is not None and estimate.calibration is not None:
-            # A solve takes lengths corrected for its shrinkage (`NoiseFactors`). The solution has them as measured.
+            # A solve needs lengths corrected for its shrinkage (`NoiseFactors`). Those of the solution are as measured.
             noise = errors.noise if estimate.noise is None else estimate.noise
             images = errors.keyframes
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)

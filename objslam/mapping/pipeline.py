@@ -126,7 +126,7 @@ def _run(
         # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.
         spoilt = diagnosis.spoilt and settings.mode == "fixed"
         errors = None if spoilt else shared_errors(log, *seen_something(frames, rays), settings)
-        before = None if spoilt else shared_errors(log, frames, rays, settings)
+        before = shared_errors(log, frames, rays, settings) if settings.mode == "joint" else None
         try:
             solution = solve(frames, rays, cameras, settings, ledger, of_solve, errors=errors)
         except SolveError:

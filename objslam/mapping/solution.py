@@ -94,7 +94,7 @@ class Solution:
     a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
     the box. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
     object in the box of each ray. bodies, body_share, to_centre and hidden are None if no bodies were solved. doubted: the
-    labels that may name one object or several. unsettled: the objects that the last round changed, as of `objects_changed`,
+    labels that may name one object or several. unsettled: the objects that the last round changed, as in `objects_changed`,
     although no further round was allowed.
     """
 

@@ -7,6 +7,7 @@ chance.
 """
 
 import math
+from types import ModuleType
 
 from objslam.core.array_module import (
     Tensor,
@@ -15,7 +16,6 @@ from objslam.core.array_module import (
     group_sum,
     indices_of,
     length,
-    module_of,
     sorted_last,
     take_along,
 )
@@ -43,22 +43,17 @@ def fit_consensus(
     keeps all its rays if they agree within noise, because its rays do not meet by chance. hypotheses, jitter: as in
     `best_pair`.
     """
-    xp = module_of(bundle.origin)
+    xp = bundle.xp
     used = xp.ones_like(bundle.index, dtype=xp.bool)
     result = minimise_distances(bundle)
-    inlier, log_nfa = consensus_about(bundle, result.point)
-
-    def improve(candidate: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
-        agreeing, nfa = consensus_about(bundle, candidate)
-        better = objects & (nfa < log_nfa)
-        return xp.where(better[bundle.index], agreeing, inlier), xp.where(better, nfa, log_nfa)
-
     fitting = _within_noise(bundle, result.point)
     searched = indices_of((bundle.number > 2) & ~fitting)
-    pair_point = xp.asarray(result.point, copy=True)
-    pair_point[searched] = best_pair(bundle, searched, hypotheses, jitter)
-    for candidate in (pair_point, _far_ahead(bundle)):
-        inlier, log_nfa = improve(candidate, xp.ones_like(result.determined))
+    candidates = [result.point, _far_ahead(bundle)]
+    if len(searched):
+        pair_point = xp.asarray(result.point, copy=True)
+        pair_point[searched] = best_pair(bundle, searched, hypotheses, jitter)
+        candidates.insert(1, pair_point)
+    inlier, log_nfa = consensus_about(bundle, xp.stack(candidates, axis=1), bundle.with_rays())
     alone = group_sum(as_type(inlier, log_nfa), bundle.index, len(log_nfa)) < 2
     whole = alone if judged is None else alone | (fitting & judged)  # A part of few noisy rays may look better by chance.
     inlier |= whole[bundle.index]
@@ -74,7 +69,9 @@ def fit_consensus(
             result.iterations + again.iterations,
         )
         used = inlier
-        inlier, log_nfa = improve(result.point, changed)
+        agreeing, nfa = consensus_about(bundle, result.point[:, None], indices_of(changed))
+        better = nfa < log_nfa
+        inlier, log_nfa = xp.where(better[bundle.index], agreeing, inlier), xp.where(better, nfa, log_nfa)
     return result, used, log_nfa
 
 
@@ -96,16 +93,23 @@ def _far_ahead(bundle: Bundle) -> Tensor:
     return heading / length(heading)[:, None].clip(min=1e-12) * 1e6 * reach[:, None]
 
 
-def consensus_about(bundle: Bundle, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which rays (R,) agree with the point (N, 3) of their object, and the log NFA (N,) of this agreement. A log NFA
-    below 0 means that the agreement is not by chance."""
-    xp = module_of(points)
+def consensus_about(bundle: Bundle, points: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
+    """Return which rays (R,) agree with the best of the points (N, H, 3) of their object, and the log NFA (N,) of this
+    agreement.
+
+    The best point is the first one with the lowest log NFA. A log NFA below 0 means that the agreement is not by chance.
+    objects: (B,) the indices of the objects that are judged. No ray of another object agrees, and its log NFA is infinite.
+    """
+    xp = bundle.xp
     inlier = xp.zeros_like(bundle.index, dtype=xp.bool)
-    log_nfa = xp.full_like(points[:, 0], xp.inf)
-    for objects, rays, real in bundle.blocks(bundle.with_rays(), _PAIRS_AT_ONCE):
-        chance = _chance(bundle, rays, real, points[objects, None])
-        log_nfa[objects, None], limit = _least_chance(chance, bundle.number[objects])
-        inlier[rays[real]] = ((chance[:, 0] <= limit) & (chance[:, 0] < 1))[real]
+    log_nfa = xp.full_like(points[:, 0, 0], xp.inf)
+    for chunk, rays, real in bundle.blocks(objects, _PAIRS_AT_ONCE // points.shape[1]):
+        chance = _chance(bundle, rays, real, points[chunk])
+        nfa, limit = _least_chance(chance, bundle.number[chunk], xp)
+        nfa = xp.where(xp.isnan(nfa), xp.inf, nfa)  # Of a candidate that does not exist.
+        row, best = xp.arange(len(nfa), device=nfa.device), nfa.argmin(axis=1)
+        log_nfa[chunk], chance = nfa[row, best], chance[row, best]
+        inlier[rays[real]] = ((chance <= limit[row, best, None]) & (chance < 1))[real]
     return inlier, log_nfa
 
 
@@ -117,17 +121,17 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
     `hypotheses` equal parts, and one pair of each part is tried. jitter: (hypotheses,) in [0, 1), the relative position of
     the tried pair in each part. The result of an object depends on its own rays alone.
     """
-    xp = module_of(bundle.origin)
+    xp = bundle.xp
     points = xp.full((len(bundle.number), 3), xp.nan, dtype=bundle.origin.dtype, device=bundle.origin.device)
     log_nfa = xp.full_like(points[:, 0], xp.inf)
     for chunk, rays, real in bundle.blocks(objects, _PAIRS_AT_ONCE // hypotheses):
         step = max(1, _PAIRS_AT_ONCE // max(1, math.prod(rays.shape)))
         for begin in range(0, hypotheses, step):
             which = xp.arange(begin, min(begin + step, hypotheses), device=rays.device)
-            first, second, exists = _pairs(bundle.number[chunk], which, hypotheses, jitter[which])
+            first, second, exists = _pairs(bundle.number[chunk], which, hypotheses, jitter[which], xp)
             candidates, valid = _midpoints(bundle, take_along(rays, first, 1), take_along(rays, second, 1))
             chance = as_single(_chance(bundle, rays, real, candidates))  # Single precision is enough to rank, and faster.
-            nfa = as_type(_least_chance(chance, bundle.number[chunk])[0], points)
+            nfa = as_type(_least_chance(chance, bundle.number[chunk], xp)[0], points)
             nfa = xp.where(valid & exists, nfa, xp.inf)
             row, best = xp.arange(len(nfa), device=nfa.device), nfa.argmin(axis=1)
             lowest = nfa[row, best]
@@ -138,10 +142,9 @@ def best_pair(bundle: Bundle, objects: Tensor, hypotheses: int, jitter: Tensor) 
     return points[objects]
 
 
-def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _pairs(number: Tensor, which: Tensor, hypotheses: int, jitter: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor, Tensor]:
     """Return the two rays of each pair, as indices (B, H) `first` < `second` among the rays of an object, and whether the
     pair exists. number: (B,) rays of each object. which, jitter: (H,) the indices and the jitter of the hypotheses."""
-    xp = module_of(number)
     n = as_type(number[:, None], jitter)
     pairs = n * (n - 1) / 2
     rank = xp.where(pairs <= hypotheses, which, xp.floor((which + jitter) * (pairs / hypotheses)))
@@ -159,7 +162,7 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
     """Return the midpoints (B, H, 3) of the closest approach of two rays (B, H), and whether they exist. Parallel rays have
     no midpoint. A midpoint may lie behind a ray. The ray then does not agree with it. `closest_approach` does the same in
     numpy."""
-    xp = module_of(first)
+    xp = bundle.xp
     n1, n2 = bundle.direction[first], bundle.direction[second]
     between = bundle.origin[second] - bundle.origin[first]
     cos = (n1 * n2).sum(-1)
@@ -176,7 +179,7 @@ def _midpoints(bundle: Bundle, first: Tensor, second: Tensor) -> tuple[Tensor, T
 def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tensor:
     """Return, for each ray, the probability (B, H, n) that the ray of a wrong box passes the point (B, H, 3) at least as
     closely. It is 1 for a ray that points away from the point, and for a ray that is not `real`."""
-    xp = module_of(points)
+    xp = bundle.xp
     origin, direction, sigma = bundle.origin[rays], bundle.direction[rays], bundle.sigma[rays]
     along = points @ direction.mT - (origin * direction).sum(-1)[:, None]
     distance2 = (points**2).sum(-1)[..., None] - 2 * points @ origin.mT + (origin**2).sum(-1)[:, None]
@@ -189,14 +192,13 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
     return xp.where(real[:, None], chance, 1.0)
 
 
-def _least_chance(chance: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
+def _least_chance(chance: Tensor, number: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
     """Return the lowest log NFA (B, H) over all numbers k of agreeing rays, and the k-th lowest chance for this k. The
     agreeing rays are those with the lowest chances. chance: (B, H, n) of each ray.
 
     NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
     and 3 of them determine the point. Each p counts for 2 coordinates.
     """
-    xp = module_of(chance)
     chance = sorted_last(chance)
     most = chance.shape[-1]
     k = xp.arange(1, most + 1, device=chance.device)

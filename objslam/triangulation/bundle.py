@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from types import ModuleType
 
-from objslam.core.array_module import Tensor, indices_of, module_of
+from objslam.core.array_module import Tensor, indices_of
 
 _SIMILAR = (2, 32)
 """The numbers a and b. If the smallest object of a block has n rays, the largest one has at most a n + b rays. Fillers make
@@ -17,7 +18,7 @@ class Bundle:
 
     origin: (R, 3) m, in coordinates of the ray's object. direction: (R, 3) unit. sigma: (R,) rad, noise of a ray's angle
     along each perpendicular axis. position_sigma: m, noise of the origins along each axis. index: (R,) object of each ray.
-    number: (N,) number of rays of each object.
+    number: (N,) number of rays of each object. xp: the library of the arrays, numpy or torch.
     """
 
     origin: Tensor
@@ -26,14 +27,16 @@ class Bundle:
     position_sigma: float
     index: Tensor
     number: Tensor
+    xp: ModuleType
 
     def select(self, use: Tensor) -> "Bundle":
         """Return the rays in the mask `use` (R,), of the same objects."""
         if bool(use.all()):
             return self
         index = self.index[use]
-        number = module_of(index).bincount(index, minlength=len(self.number))
-        return Bundle(self.origin[use], self.direction[use], self.sigma[use], self.position_sigma, index, number)
+        number = self.xp.bincount(index, minlength=len(self.number))
+        rays = self.origin[use], self.direction[use], self.sigma[use], self.position_sigma
+        return Bundle(*rays, index, number, self.xp)
 
     def blocks(self, objects: Tensor, most: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Split objects, given by their indices, into blocks of B objects with up to n rays each.
@@ -41,7 +44,7 @@ class Bundle:
         A block holds the objects (B,), the indices of their rays (B, n), and which of these indices are real. The other
         indices only fill the rows of objects with fewer rays. most: the largest B n of a block of several objects.
         """
-        xp = module_of(self.number)
+        xp = self.xp
         first = xp.cumsum(self.number, 0) - self.number
         objects = objects[xp.argsort(self.number[objects], stable=True)]
         size = self.number[objects]  # The sizes increase, so the fitting objects come first.

@@ -1,5 +1,7 @@
 """Compute covariance and parallax of triangulated objects, and fuse rays with ranges, for many objects at once."""
 
+from types import ModuleType
+
 from objslam.core.array_module import Tensor, as_tensor, as_type, backend_of, group_sum, indices_of, length, module_of
 from objslam.core.geometry import evenly_spread
 from objslam.core.statistics import CAUCHY_K, NORMAL_MEDIAN, RAYLEIGH_MEAN
@@ -22,16 +24,16 @@ def covariance(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     not reduce: rays miss a nearer object by less. So angular noise tilts u forward along ray i, E[u] = sqrt(pi / 2)
     sigma_i^2 r_i / s_i, where r_i is the length of the ray. The result includes the square of this bias.
     """
-    xp = module_of(point)
-    rays = bundle.select(use)
-    lines, index = Lines.through(rays.origin - point[rays.index], rays.direction, rays.index, len(point)), rays.index
+    rays, xp = bundle.select(use), bundle.xp
+    index = rays.index
+    lines = Lines.through(rays.origin - point[index], rays.direction, index, len(point), xp)
     distance = length(point[index] - rays.origin)
     s = _offset_sigma(rays, distance)
     a = lines.spread(0.5 * RAYLEIGH_MEAN / s)
     b = lines.spread(xp.full_like(s, 0.5))
     tilt = lines.sum((RAYLEIGH_MEAN * rays.sigma**2 * distance / s)[:, None] * rays.direction)
     factor = _variance_factor(length(lines.foot) / s, rays, 3)[:, None, None]
-    inverse, regular = _inverse(a)
+    inverse, regular = _inverse(a, xp)
     bias = factor * (inverse @ tilt[:, :, None])  # With more noise, the tilt is larger and the Hessian smaller.
     result = factor * inverse @ b @ inverse + bias @ bias.mT
     return xp.where(regular[:, None, None], result, xp.nan)
@@ -48,7 +50,7 @@ def fuse_ranges(
     because a range may belong to the background. `association.refinement.refine` is robust in both directions, but gives no
     covariance.
     """
-    xp = module_of(ranges)
+    xp = bundle.xp
     rays, count = bundle.select(use), len(bundle.number)
     ranges, range_sigma, range_bias = ranges[use], range_sigma[use], range_bias[use]
     known = xp.isfinite(ranges)
@@ -58,7 +60,7 @@ def fuse_ranges(
     has = xp.isfinite(typical)
     measured = xp.where(known[:, None], rays.origin + usual[:, None] * rays.direction, 0.0)
     informed = has[rays.index]
-    lines = Lines.through(xp.where(informed[:, None], rays.origin, 0.0), rays.direction, rays.index, count)
+    lines = Lines.through(xp.where(informed[:, None], rays.origin, 0.0), rays.direction, rays.index, count, xp)
     weight = xp.where(informed, 1 / s**2, 0.0)
     across_matrix = lines.spread(weight)
     across_vector = lines.sum(weight[:, None] * lines.foot)
@@ -90,7 +92,7 @@ def fuse_ranges(
     strength_along = robust / (scatter**2).clip(min=1)[rays.index]
     along_matrix = along(strength_along)
     factor = _variance_factor(length(lines.offset(point)) / s, rays, 2)
-    inverse, regular = _inverse(across_matrix / factor[:, None, None] + along_matrix)
+    inverse, regular = _inverse(across_matrix / factor[:, None, None] + along_matrix, xp)
     regular &= has
     # The point moves by `shift` if all ranges of its object are too long by one sigma of their bias.
     bias = xp.where(known, range_bias, 0.0)
@@ -117,22 +119,22 @@ def lies_ahead(bundle: Bundle, use: Tensor, point: Tensor) -> Tensor:
     """Return whether each point (N, 3) lies ahead of more than half of its rays in `use` (R,)."""
     index = bundle.index[use]
     towards = ((point[index] - bundle.origin[use]) * bundle.direction[use]).sum(1)
-    return group_sum(module_of(point).sign(towards), index, len(point)) > 0
+    return group_sum(bundle.xp.sign(towards), index, len(point)) > 0
 
 
 def parallax(bundle: Bundle, use: Tensor) -> Tensor:
     """Return the widest angle (N,) rad between any two rays in `use` (R,) of each object. Rays are undirected lines here.
     Of more than `_EVERY_PAIR` rays, only the rays nearest to 64 evenly spread axes are compared. The angle is then exact to
     1 %."""
-    xp = module_of(bundle.direction)
+    xp = bundle.xp
     rays = bundle.select(use)
     widest = xp.zeros(len(rays.number), dtype=rays.direction.dtype, device=rays.direction.device)
-    axes = as_tensor(evenly_spread(64), backend_of(rays.direction))
     few = indices_of((rays.number > 1) & (rays.number <= _EVERY_PAIR))
     many = indices_of(rays.number > _EVERY_PAIR)
     for objects, members, real in (*rays.blocks(few, _PLACES), *rays.blocks(many, _PLACES)):
         direction = rays.direction[members]
         if members.shape[1] > _EVERY_PAIR:
+            axes = as_tensor(evenly_spread(64).copy(), backend_of(direction))
             towards = xp.where(real[:, :, None], direction @ axes.T, -xp.inf).argmax(axis=1)
             direction = direction[xp.arange(len(objects), device=towards.device)[:, None], towards]
             real = xp.ones_like(towards, dtype=xp.bool)
@@ -164,7 +166,7 @@ def object_median(values: Tensor, index: Tensor, count: int) -> Tensor:
 
 def _offset_sigma(rays: Bundle, distance: Tensor) -> Tensor:
     """Return the standard deviation (R,) m, along each perpendicular axis, of the offset between each ray and its object."""
-    return module_of(distance).sqrt((rays.sigma * distance) ** 2 + rays.position_sigma**2).clip(min=1e-12)
+    return rays.xp.sqrt((rays.sigma * distance) ** 2 + rays.position_sigma**2).clip(min=1e-12)
 
 
 def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
@@ -182,9 +184,8 @@ def _variance_factor(miss: Tensor, rays: Bundle, taken: int) -> Tensor:
     return 1 + excess.clip(min=0) * (1 + 3.2 / (rest - 2).clip(min=1))
 
 
-def _inverse(matrices: Tensor) -> tuple[Tensor, Tensor]:
+def _inverse(matrices: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
     """Return the inverses of symmetric matrices (N, 3, 3), and which matrices are regular."""
-    xp = module_of(matrices)
     eye = xp.eye(3, dtype=matrices.dtype, device=matrices.device)
     finite = xp.isfinite(matrices).all(axis=2).all(axis=1)
     eigenvalues = xp.linalg.eigvalsh(xp.where(finite[:, None, None], matrices, eye))

@@ -6,9 +6,10 @@ numbers, and a sum over the lines of an object needs no indices.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import ModuleType
 
-from objslam.core.array_module import Tensor, as_type, contiguous, module_of, rows
+from objslam.core.array_module import Tensor, as_type, contiguous, rows
 from objslam.triangulation.bundle import Bundle
 
 _FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # For each of the nine entries of a symmetric matrix, the index of its value in `outer`.
@@ -16,12 +17,16 @@ _FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # For each of the nine entries of a symmetr
 
 @dataclass(frozen=True)
 class LineBlock:
-    """Lines of B objects with up to n lines each, in coordinates of their object. foot: (3, n, B) the point of each line
-    nearest to the coordinate origin. direction: (3, n, B) unit. weight: (n, B) 1 for a line, 0 for a filler."""
+    """Lines of B objects with up to n lines each, in coordinates of their object.
+
+    foot: (3, n, B) the point of each line nearest to the coordinate origin. direction: (3, n, B) unit. weight: (n, B) 1 for
+    a line, 0 for a filler. xp: the library of the arrays, numpy or torch.
+    """
 
     foot: Tensor
     direction: Tensor
     weight: Tensor
+    xp: ModuleType
 
     def offset(self, points: Tensor) -> Tensor:
         """Return the perpendicular offset (3, n, B) from each line to the point (3, B) of its object."""
@@ -30,17 +35,17 @@ class LineBlock:
     def spread(self, weight: Tensor) -> Tensor:
         """Return the sum of weight (n, B) times I - d d^T over the lines of each object, by its six entries (6, B). d: a
         line's direction."""
-        result = -outer(self.direction * weight, self.direction)
+        result = -outer(self.direction * weight, self.direction, self.xp)
         result[:3] += weight.sum(axis=0)
         return result
 
     def select(self, objects: Tensor) -> LineBlock:
         """Return the lines of the objects in a mask (B,)."""
-        return LineBlock(self.foot[:, :, objects], self.direction[:, :, objects], self.weight[:, objects])
+        return LineBlock(self.foot[:, :, objects], self.direction[:, :, objects], self.weight[:, objects], self.xp)
 
     def scaled(self, scale: Tensor) -> LineBlock:
         """Return the lines with feet multiplied by the scale (B,) of their object."""
-        return LineBlock(self.foot * scale, self.direction, self.weight)
+        return replace(self, foot=self.foot * scale)
 
 
 def gather(bundle: Bundle, rays: Tensor, real: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -52,16 +57,16 @@ def gather(bundle: Bundle, rays: Tensor, real: Tensor) -> tuple[Tensor, Tensor, 
     wide = rays.shape[0] >= rays.shape[1]
     weight = as_type(real, bundle.origin)
     rays, weight = (rays.T, weight.T) if wide else (rays, weight)
-    parts = [contiguous(module_of(rays).moveaxis(rows(values, rays), 2, 0)) for values in (bundle.origin, bundle.direction)]
+    parts = [contiguous(bundle.xp.moveaxis(rows(values, rays), 2, 0)) for values in (bundle.origin, bundle.direction)]
     parts.append(contiguous(weight))
     origin, direction, weight = parts if wide else [part.mT for part in parts]
     return origin, direction, weight
 
 
-def through(origin: Tensor, direction: Tensor, weight: Tensor) -> LineBlock:
+def through(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleType) -> LineBlock:
     """Return the lines through points (3, n, B), in coordinates of their object, along unit directions (3, n, B)."""
     # The first projection leaves a rounding error along the line, which grows with the origin. The second removes it.
-    return LineBlock(perpendicular(perpendicular(origin, direction), direction), direction, weight)
+    return LineBlock(perpendicular(perpendicular(origin, direction), direction), direction, weight, xp)
 
 
 def perpendicular(vectors: Tensor, direction: Tensor) -> Tensor:
@@ -79,12 +84,11 @@ def norm(vectors: Tensor) -> Tensor:
     return dot(vectors, vectors) ** 0.5
 
 
-def outer(a: Tensor, b: Tensor) -> Tensor:
+def outer(a: Tensor, b: Tensor, xp: ModuleType) -> Tensor:
     """Return the sums (6, B) of (a b^T + b a^T) / 2 over the lines of each object: xx, yy, zz, xy, xz, yz.
 
     a, b: (3, n, B). `b` may be `a` times a weight, or any other vector.
     """
-    xp = module_of(a)
     diagonal = [(a[i] * b[i]).sum(axis=0) for i in range(3)]
     pairs = ((0, 1), (0, 2), (1, 2))
     return xp.stack(diagonal + [0.5 * (a[i] * b[j] + a[j] * b[i]).sum(axis=0) for i, j in pairs])
@@ -95,7 +99,7 @@ def full(six: Tensor) -> Tensor:
     return six[list(_FULL)].T.reshape(-1, 3, 3)
 
 
-def solve_symmetric(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+def solve_symmetric(a: Tensor, b: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
     """Return x (3, B) with A x = b by Cramer's rule, and the regularity (B,) of A, from 0 to 1. The regularity is the
     determinant divided by the cube of the mean eigenvalue. a: (6, B) positive semidefinite. b: (3, B). If A is singular, x
     has no meaning."""
@@ -103,7 +107,6 @@ def solve_symmetric(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     determinant = xx * c0 + xy * c1 + xz * c2
     c3, c4, c5 = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
-    xp = module_of(a)
     mean = (xx + yy + zz) / 3
     regular = determinant / (mean * mean * mean).clip(min=1e-30)
     x = xp.stack([dot((c0, c1, c2), b), dot((c1, c3, c4), b), dot((c2, c4, c5), b)])

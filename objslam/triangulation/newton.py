@@ -6,7 +6,7 @@ and the Hessian t t^T / d, where t = n x u. The unit of length is about the mean
 
 from __future__ import annotations
 
-from objslam.core.array_module import Tensor, as_single, as_type, module_of, take_along
+from objslam.core.array_module import Tensor, as_single, as_type, take_along
 from objslam.triangulation.line_block import LineBlock, dot, norm, solve_symmetric
 
 _WEIGHTED_STEPS = 3
@@ -31,13 +31,13 @@ _TINY = 1e-30
 
 def approach(lines: LineBlock) -> tuple[Tensor, int]:
     """Return points (3, B) near the optimum, exact to about 1e-6, and the number of steps, from the coordinate origin on."""
-    xp = module_of(lines.foot)
-    rough = LineBlock(as_single(lines.foot), as_single(lines.direction), as_single(lines.weight))
+    xp = lines.xp
+    rough = LineBlock(as_single(lines.foot), as_single(lines.direction), as_single(lines.weight), xp)
     point = xp.zeros_like(rough.foot[:, 0])
     for _ in range(_WEIGHTED_STEPS):
         q = rough.offset(point)
         weight = rough.weight / xp.sqrt(dot(q, q) + _SMOOTHING**2)
-        point = point - solve_symmetric(rough.spread(weight), (q * weight).sum(axis=1))[0]
+        point = point - solve_symmetric(rough.spread(weight), (q * weight).sum(axis=1), xp)[0]
     point = xp.where(xp.isfinite(point), point, xp.zeros_like(point))
     point, _, _, steps = newton(rough, point, _SINGLE_STEPS)
     return as_type(point, lines.foot), _WEIGHTED_STEPS + steps
@@ -50,7 +50,7 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
         The points (3, B), the gradient norms (B,), which objects are solved up to rounding (B,), and the number of steps. An
         unsolved object may have a line through or near its solution, or no curvature.
     """
-    xp = module_of(start)
+    xp = lines.xp
     epsilon = _SINGLE if start.dtype == xp.float32 else _DOUBLE
     trial, point = start, start
     step, value = xp.zeros_like(start), xp.full_like(start[0], xp.inf)
@@ -66,7 +66,7 @@ def newton(lines: LineBlock, start: Tensor, steps: int = _STEPS) -> tuple[Tensor
         u = q * inverse
         pull, cost = u.sum(axis=1), (d * lines.weight).sum(axis=0)
         better = cost <= value + 1e-4 * slope + 50 * epsilon * cost
-        move = -solve_symmetric(_hessian(lines.direction, u, inverse), pull)[0]
+        move = -solve_symmetric(_hessian(lines, u, inverse), pull, xp)[0]
         point, value = xp.where(better, trial, point), xp.where(better, cost, value)
         slope = xp.where(better, dot(pull, move), _SHORTER * slope)
         step = xp.where(better, move, _SHORTER * step)
@@ -94,11 +94,11 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
     1973), and the returned norm is that of the smallest subgradient. If the gradient is larger, the optimum lies beside the
     line, and Newton steps start there.
     """
-    xp = module_of(start)
+    xp = lines.xp
     far = norm(lines.offset(start)) + xp.where(lines.weight > 0, 0.0, xp.full_like(lines.weight, xp.inf))
     nearest = far.argmin(axis=0)[None]
     slot = xp.arange(len(far), device=start.device)[:, None]
-    others = LineBlock(lines.foot, lines.direction, lines.weight * (slot != nearest))
+    others = LineBlock(lines.foot, lines.direction, lines.weight * (slot != nearest), xp)
     axis = take_along(lines.direction, xp.broadcast_to(nearest, (3, *nearest.shape)), 1)[:, 0]
     foot = take_along(lines.foot, xp.broadcast_to(nearest, (3, *nearest.shape)), 1)[:, 0]
     along = dot(axis, start)
@@ -134,12 +134,12 @@ def _slopes(lines: LineBlock, point: Tensor, axis: Tensor) -> tuple[Tensor, Tens
     return u.sum(axis=1), (across * inverse).sum(axis=0), limit
 
 
-def _hessian(direction: Tensor, u: Tensor, inverse: Tensor) -> Tensor:
+def _hessian(lines: LineBlock, u: Tensor, inverse: Tensor) -> Tensor:
     """Return the sums of t t^T / d with t = n x u, by their six entries (6, B). u: (3, n, B) and inverse: (n, B) 1 / d,
     both zero for a filler."""
-    x, y, z = direction
+    x, y, z = lines.direction
     a, b, c = u
     t0, t1, t2 = y * c - z * b, z * a - x * c, x * b - y * a
     w0, w1, w2 = t0 * inverse, t1 * inverse, t2 * inverse
     pairs = ((t0, w0), (t1, w1), (t2, w2), (t0, w1), (t0, w2), (t1, w2))
-    return module_of(u).stack([(t * w).sum(axis=0) for t, w in pairs])
+    return lines.xp.stack([(t * w).sum(axis=0) for t, w in pairs])

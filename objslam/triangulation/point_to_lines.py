@@ -7,8 +7,9 @@ smooth derivative, and `smoothed_newton` finishes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import ModuleType
 
-from objslam.core.array_module import Tensor, backend_of, indices_of, module_of
+from objslam.core.array_module import Tensor, backend_of, indices_of
 from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.line_block import (
     LineBlock,
@@ -54,7 +55,7 @@ def least_squares(bundle: Bundle) -> tuple[Tensor, Tensor]:
     """
     point, determined = _unsolved(bundle)
     for objects, rays, real in bundle.blocks(bundle.with_rays(), _places(bundle)):
-        start, fixed = _closed_form(*gather(bundle, rays, real))
+        start, fixed = _closed_form(*gather(bundle, rays, real), bundle.xp)
         point[objects], determined[objects] = start.T, fixed
     return point, determined
 
@@ -65,16 +66,16 @@ def minimise_distances(bundle: Bundle) -> PointSolution:
     If lines pass through the solution, the gradient is the smallest subgradient found. The value 0 still proves the optimum.
     An object whose rays fix no point keeps the point of `least_squares` and gets a NaN gradient.
     """
-    xp = module_of(bundle.origin)
+    xp = bundle.xp
     point, determined = _unsolved(bundle)
     gradient = xp.full_like(point[:, 0], xp.nan)
     guess, left = xp.zeros_like(point), xp.zeros_like(determined)
     iterations = [0] * (_ROUNDS + 2)
     for objects, rays, real in bundle.blocks(bundle.with_rays(), _places(bundle)):
         origin, direction, weight = gather(bundle, rays, real)
-        start, fixed = _closed_form(origin, direction, weight)
+        start, fixed = _closed_form(origin, direction, weight, xp)
         point[objects], determined[objects] = start.T, fixed
-        lines, unit, meeting = _unit_lines(origin - start[:, None], direction, weight)
+        lines, unit, meeting = _unit_lines(origin - start[:, None], direction, weight, xp)
         gradient[objects] = xp.where(fixed & meeting, xp.zeros_like(unit), xp.nan)
         solvable = fixed & ~meeting
         if not bool(solvable.all()):
@@ -90,7 +91,7 @@ def minimise_distances(bundle: Bundle) -> PointSolution:
         for objects, rays, real in bundle.blocks(indices_of(left), _places(bundle)):
             origin, direction, weight = gather(bundle, rays, real)
             start, near = point[objects].T, guess[objects].T
-            lines, unit, _ = _unit_lines(origin - start[:, None], direction, weight)
+            lines, unit, _ = _unit_lines(origin - start[:, None], direction, weight, xp)
             if last:
                 step, rest, steps = finish(lines)
                 solved = xp.ones_like(rest, dtype=xp.bool)
@@ -106,7 +107,7 @@ def minimise_distances(bundle: Bundle) -> PointSolution:
 
 
 def _unsolved(bundle: Bundle) -> tuple[Tensor, Tensor]:
-    xp = module_of(bundle.origin)
+    xp = bundle.xp
     point = xp.full((len(bundle.number), 3), xp.nan, dtype=bundle.origin.dtype, device=bundle.origin.device)
     return point, xp.zeros_like(bundle.number, dtype=xp.bool)
 
@@ -115,16 +116,15 @@ def _places(bundle: Bundle) -> int:
     return _PLACES[backend_of(bundle.origin)]
 
 
-def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
     """Return the points (3, B) of `least_squares` for the B objects of a block of lines, and which points are unique
     (B,)."""
-    xp = module_of(origin)
     number = weight.sum(axis=0)
     base = (origin * weight).sum(axis=1) / number  # Large map coordinates would cost digits.
     # One projection is exact enough for squared distances.
-    lines = LineBlock(perpendicular(origin - base[:, None], direction), direction, weight)
+    lines = LineBlock(perpendicular(origin - base[:, None], direction), direction, weight, xp)
     matrix, pull = lines.spread(weight), (lines.foot * weight).sum(axis=1)
-    point, regular = solve_symmetric(matrix, pull)
+    point, regular = solve_symmetric(matrix, pull, xp)
     determined = regular > _LEAST_REGULAR
     doubtful = indices_of(~determined)
     if len(doubtful):
@@ -142,14 +142,13 @@ def _closed_form(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[Ten
     return base + point, determined
 
 
-def _unit_lines(origin: Tensor, direction: Tensor, weight: Tensor) -> tuple[LineBlock, Tensor, Tensor]:
+def _unit_lines(origin: Tensor, direction: Tensor, weight: Tensor, xp: ModuleType) -> tuple[LineBlock, Tensor, Tensor]:
     """Return lines in units of their mean distance from the coordinate origin. Also return this unit (B,) m, and for which
     objects (B,) all lines meet in the coordinate origin, up to rounding.
 
     Lines that meet there stay in m. origin: (3, n, B) m. The coordinate origin is a point of the object.
     """
-    xp = module_of(origin)
-    lines = through(origin, direction, weight)
+    lines = through(origin, direction, weight, xp)
     number = weight.sum(axis=0)
     unit = (norm(lines.foot) * weight).sum(axis=0) / number
     meeting = unit <= 1e-14 * (norm(origin) * weight).sum(axis=0) / number

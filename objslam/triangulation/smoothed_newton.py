@@ -5,7 +5,9 @@ Smoothed distances are minimised first, and then the distances themselves.
 
 from __future__ import annotations
 
-from objslam.core.array_module import Tensor, indices_of, module_of
+from types import ModuleType
+
+from objslam.core.array_module import Tensor, indices_of
 from objslam.triangulation.line_block import LineBlock, apply, dot, full, norm, outer, perpendicular
 
 _MAX_ITERATIONS = 80  # The most Newton steps. A solved object leaves the block earlier.
@@ -25,7 +27,7 @@ def finish(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
     The unit of length is about the mean distance of an object from its lines. If lines pass through the solution, the
     gradient is the smallest subgradient found. The value 0 still proves the optimum.
     """
-    xp = module_of(lines.foot)
+    xp = lines.xp
     smoothed, dual, iterations = _smoothed_optimum(lines)
     point, gradient = _exact_optimum(lines, smoothed, dual, 0.0)
     for on_line in _ON_LINE:
@@ -46,7 +48,7 @@ def _smoothed_optimum(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
     is the unit vector of the offset. If the solution lies on the line, the dual is a vector across the line that is at most
     1 long.
     """
-    xp = module_of(lines.foot)
+    xp = lines.xp
     point, dual = xp.zeros_like(lines.foot[:, 0]), xp.zeros_like(lines.foot)
     live = xp.arange(point.shape[1], device=point.device)  # The unsolved objects.
     o, epsilon, late = xp.zeros_like(point), xp.ones_like(point[0]), xp.zeros_like(point[0])
@@ -80,10 +82,10 @@ def _smoothed_optimum(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
 
 def _newton_step(lines: LineBlock, o: Tensor, q: Tensor, y: Tensor, epsilon: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Take one damped primal-dual step. Return the new points o (3, B), offsets q (3, n, B) and duals y (3, n, B)."""
-    xp = module_of(o)
+    xp = lines.xp
     r = _radius(q, epsilon)
     inverse = lines.weight / r
-    six = lines.spread(inverse) - outer(y * (inverse / r), q)
+    six = lines.spread(inverse) - outer(y * (inverse / r), q, xp)
     six[:3] += 1e-14 * six[:3].sum(axis=0).clip(min=_TINY)
     gradient = (q * inverse).sum(axis=1)
     step = -xp.linalg.solve(full(six), gradient.T[:, :, None])[:, :, 0].T
@@ -110,7 +112,7 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
     moves onto these lines. Newton steps then move it in the directions that the lines leave free. The subgradient shows
     whether the assumption is right. Its norm is inf if the lines do not meet.
     """
-    xp = module_of(point)
+    xp = lines.xp
     on = xp.where(norm(lines.offset(point)) <= on_line, lines.weight, 0.0)
     off = lines.weight - on
     eigenvalues, vectors = xp.linalg.eigh(full(lines.spread(on)))
@@ -124,8 +126,8 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
         u = q * inverse_d
         pull = u.sum(axis=1)
         if newton:
-            curvature = full(lines.spread(inverse_d) - outer(u * inverse_d, u))
-            point = point - _short_newton(free @ curvature @ free, apply(free, pull))
+            curvature = full(lines.spread(inverse_d) - outer(u * inverse_d, u, xp))
+            point = point - _short_newton(free @ curvature @ free, apply(free, pull), xp)
     # Each line through the point may add a vector of length up to 1. They are chosen to make the subgradient smallest.
     answer = perpendicular(dual, lines.direction) * on
     for _ in range(30 if bool((on > 0).any()) else 0):
@@ -136,10 +138,9 @@ def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float
     return point, xp.where(missed, xp.inf, norm(pull + answer.sum(axis=1)))
 
 
-def _short_newton(hessian: Tensor, gradient: Tensor) -> Tensor:
+def _short_newton(hessian: Tensor, gradient: Tensor, xp: ModuleType) -> Tensor:
     """Return Newton steps (3, B) in the directions in which the cost is curved. A step has at most the length 1e-3 (in mean
     distances), because the solution is near."""
-    xp = module_of(gradient)
     trace = hessian[:, 0, 0] + hessian[:, 1, 1] + hessian[:, 2, 2]
     scale = trace.clip(min=_TINY)
     eigenvalues, vectors = xp.linalg.eigh(hessian / scale[:, None, None])
@@ -149,7 +150,7 @@ def _short_newton(hessian: Tensor, gradient: Tensor) -> Tensor:
 
 
 def _radius(offset: Tensor, epsilon: Tensor) -> Tensor:
-    return module_of(offset).sqrt(dot(offset, offset) + epsilon * epsilon)
+    return (dot(offset, offset) + epsilon * epsilon) ** 0.5
 
 
 def _assemble(vectors: Tensor, eigenvalues: Tensor) -> Tensor:

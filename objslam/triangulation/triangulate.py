@@ -5,7 +5,7 @@ Inputs and outputs are numpy float64 arrays. The work itself is done in numpy or
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -121,7 +121,7 @@ def _triangulate(
 ) -> Triangulation:
     """Triangulate rays that are already checked. The arguments are those of `triangulate`."""
     where, base, bundle = _sorted_bundle(m, n, index, count, noise, position_sigma, backend)
-    xp = module_of(base)
+    xp = bundle.xp
     if settings.consensus:
         jitter = as_tensor(np.random.default_rng(seed).random(settings.hypotheses), backend)
         sure = as_tensor(judged, backend)
@@ -255,7 +255,7 @@ def _bundle(
     origin, direction, noise, objects = (as_tensor(v, backend) for v in (m, n, sigma, index))
     number = as_tensor(np.bincount(index, minlength=count), backend)
     base = group_sum(origin, objects, count) / number[:, None]
-    return where, base, Bundle(origin - base[objects], direction, noise, position_sigma, objects, number)
+    return where, base, Bundle(origin - base[objects], direction, noise, position_sigma, objects, number, module_of(origin))
 
 
 def _sorted_bundle(
@@ -264,12 +264,12 @@ def _sorted_bundle(
     """Return the same as `_bundle`, but with the rays of each object sorted by their distance from its closed-form point. So
     the input order does not affect which pairs are tried."""
     where, base, rays = _bundle(m, n, index, count, sigma, position_sigma, backend)
-    xp = module_of(rays.origin)
+    xp = rays.xp
     points, _ = least_squares(rays)
     objects = rays.index
-    order = xp.argsort(length(Lines.through(rays.origin - points[objects], rays.direction, objects, count).foot))
+    order = xp.argsort(length(Lines.through(rays.origin - points[objects], rays.direction, objects, count, xp).foot))
     order = order[xp.argsort(objects[order], stable=True)]
-    bundle = Bundle(rays.origin[order], rays.direction[order], rays.sigma[order], position_sigma, objects, rays.number)
+    bundle = replace(rays, origin=rays.origin[order], direction=rays.direction[order], sigma=rays.sigma[order])
     return where[as_numpy(order)], base, bundle
 
 

@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from added_errors import add_shared_errors
 from commands import Call, call
 from processes import running
 from quick import HELD, NOTHING_DRAWN, QUICK, ROUGH, options
 from scipy.linalg import block_diag
 from small_log import THINGS, small_log
 from waiting import LIMIT, pause, wait_for
+from wrong_inputs import MISTAKES
 
 from objslam import __version__
 from objslam.config import Odometry, Settings
@@ -29,9 +31,7 @@ from objslam.core.calibration import Calibration
 from objslam.io.calibration_yaml import dump_calibration, load_calibration
 from objslam.io.results.read import load_map, load_trajectory
 from objslam.simulation import preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.trajectory import START
-from objslam.simulation.wrong_inputs import MISTAKES
 from objslam.sources.log_folder import write_log_folder
 
 LEAN = options(*NOTHING_DRAWN)

@@ -4,15 +4,13 @@ import csv
 import json
 import re
 import shutil
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-import objslam
-from objslam.cli import main
+from objslam import ObjectMap, Result, diff, merge
 from objslam.config import Settings
 from objslam.config.settings import change_settings
 from objslam.core.diagnostics import Ledger
@@ -43,23 +41,15 @@ def days(tmp_path_factory):
     return out, objects
 
 
-def call(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    said = capsys.readouterr()
-    return ended.value.code, said.out, said.err
-
-
-def test_diff_tells_what_changed_and_draws_it(days, tmp_path, monkeypatch, capsys):
+def test_diff_tells_what_changed_and_draws_it(days, tmp_path, objslam):
     out, objects = days
     picture = tmp_path / "diff.png"
-    code, said, _ = call(monkeypatch, capsys, "diff", out / "a", out / "b", "-o", picture)
+    code, said, _ = objslam("diff", out / "a", out / "b", "-o", picture)
     assert code == 0
     assert "12 confirmed, 1 moved, 1 gone, 1 new, 0 unconfirmed" in said
     assert len(re.findall("│ confirmed +│", said)) == 12
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    code, said, _ = call(monkeypatch, capsys, "diff", out / "a", out / "b", "--json")
+    code, said, _ = objslam("diff", out / "a", out / "b", "--json")
     told = json.loads(said)
     by = {one["outcome"]: one for one in told["changes"]}
     np.testing.assert_allclose(by["gone"]["position"], objects[TAKEN][1], atol=0.05)
@@ -67,7 +57,7 @@ def test_diff_tells_what_changed_and_draws_it(days, tmp_path, monkeypatch, capsy
     np.testing.assert_allclose(by["moved"]["moved_from"], objects[MOVED][1], atol=0.05)
     np.testing.assert_allclose(by["new"]["position"], ADDED, atol=0.05)
     np.testing.assert_allclose(np.array(told["a_T_b"]) @ UNKNOWN, np.eye(4), atol=0.05)
-    maps = [objslam.ObjectMap.load(out / name) for name in ("a", "b")]
+    maps = [ObjectMap.load(out / name) for name in ("a", "b")]
     for one in told["changes"]:  # Each id is one of the map that it is said to be of.
         labels = [
             next((o.label for o in m if o.id == one[key]), None) for m, key in zip(maps, ("id_a", "id_b"), strict=True)
@@ -77,48 +67,48 @@ def test_diff_tells_what_changed_and_draws_it(days, tmp_path, monkeypatch, capsy
     assert told["warnings"] == []
 
 
-def test_diff_says_what_a_live_result_cannot_tell_and_what_to_do(days, tmp_path, monkeypatch, capsys):
+def test_diff_says_what_a_live_result_cannot_tell_and_what_to_do(days, tmp_path, objslam):
     out, _ = days
     live = tmp_path / "live"
     shutil.copytree(out / "b", live)
     (live / "views.parquet").unlink()
     (live / "journal.objslam").write_bytes(b"")
-    code, said, warned = call(monkeypatch, capsys, "diff", out / "a", live)
+    code, said, warned = objslam("diff", out / "a", live)
     assert code == 0
     assert "12 confirmed, 0 moved, 0 gone, 2 new, 2 unconfirmed" in said
     assert "nothing can be called gone or moved" in warned
     assert f"objslam run {live} -o {live}_again, then objslam diff {out / 'a'} {live}_again" in warned
-    code, said, warned = call(monkeypatch, capsys, "diff", live, out / "b", "--json")
+    code, said, warned = objslam("diff", live, out / "b", "--json")
     (line,) = json.loads(said)["warnings"]
     assert f"warning: {line}\n" == warned
     assert f"all that only {out / 'b'} has counts as new" in line
 
 
-def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, monkeypatch, capsys):
+def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, objslam):
     out, _ = days
-    code, said, _ = call(monkeypatch, capsys, "merge", out / "a", out / "b", "-o", tmp_path / "site")
+    code, said, _ = objslam("merge", out / "a", out / "b", "-o", tmp_path / "site")
     assert code == 0
     assert "14 objects (1 gone) from 2 sessions: 12 confirmed, 1 moved, 1 new, 0 unconfirmed" in said
-    site = objslam.ObjectMap.load(tmp_path / "site")
+    site = ObjectMap.load(tmp_path / "site")
     assert [len(site), len(site.gone)] == [14, 1]
     assert {o.life.state for o in site} == {"confirmed", "moved", "new"}
     assert (tmp_path / "site" / "map.png").is_file()
-    code, _, error = call(monkeypatch, capsys, "view", tmp_path / "site")
+    code, _, error = objslam("view", tmp_path / "site")
     assert code == 1
     assert "this is the map of a site, which has no recording.rrd (look at map.png" in error
-    reported(call, monkeypatch, capsys, tmp_path / "site", site)
-    exported(call, monkeypatch, capsys, tmp_path / "site", site)
-    again = objslam.merge([tmp_path / "site", out / "b"])
+    reported(objslam, tmp_path / "site", site)
+    exported(objslam, tmp_path / "site", site)
+    again = merge([tmp_path / "site", out / "b"])
     assert len(again) == 1
     assert {o.id for o in again[0].objects} == {o.id for o in site}
     assert all(o.life.sessions_seen >= 2 for o in again[0].objects)
-    found = objslam.diff(objslam.Result.load(out / "a"), tmp_path / "site")
+    found = diff(Result.load(out / "a"), tmp_path / "site")
     assert found.registration.accepted
 
 
-def reported(call, monkeypatch, capsys, folder, site):
+def reported(objslam, folder, site):
     """The page has a line for each object and each session. A summary of a wrong shape is one clear line."""
-    assert call(monkeypatch, capsys, "report", folder)[0] == 0
+    assert objslam("report", folder)[0] == 0
     page = (folder / "report.html").read_text()
     lines = [re.sub(r"<[^>]+>", " ", line).split() for line in page.splitlines() if line.startswith("<tr")]
     states = {o.id: o.life.state for o in (*site, *site.gone)}
@@ -133,16 +123,16 @@ def reported(call, monkeypatch, capsys, folder, site):
     summary = folder / "summary.json"
     text = summary.read_text()
     summary.write_text(re.sub(r'"yaw_deg": [^,\n]+', '"yaw_deg": "east"', text))
-    code, _, error = call(monkeypatch, capsys, "report", folder)
+    code, _, error = objslam("report", folder)
     assert code == 1
     assert "not what objslam writes" in error
     summary.write_text(text)
 
 
-def exported(call, monkeypatch, capsys, folder, site):
+def exported(objslam, folder, site):
     """The files of other tools say what became of each object. There is no path to export."""
     for to in ("csv", "geojson", "mcap", "ply"):
-        assert call(monkeypatch, capsys, "export", folder, "--to", to)[0] == 0
+        assert objslam("export", folder, "--to", to)[0] == 0
     states = {o.id: o.life.state for o in (*site, *site.gone)}
     rows = list(csv.DictReader((folder / "objects.csv").read_text().splitlines()))
     assert {int(row["id"]): row["state"] for row in rows} == states
@@ -158,34 +148,34 @@ def exported(call, monkeypatch, capsys, folder, site):
         ((_, _, data),) = reader.messages([markers])
         texts = [m.text for m in reader.deserialize(data, markers.msgtype).markers if m.text]
     assert sorted(text.rpartition(", ")[2] for text in texts) == sorted(states[o.id] for o in site if o.status == "ok")
-    code, _, error = call(monkeypatch, capsys, "export", folder, "--to", "g2o")
+    code, _, error = objslam("export", folder, "--to", "g2o")
     assert code == 1
     assert "which has no path" in error
 
 
-def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, monkeypatch, capsys):
+def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, objslam):
     out, _ = days
     (tmp_path / "empty.json").write_text('{"format": "objslam.objects/2", "frame": "map", "objects": []}')
-    code, said, _ = call(monkeypatch, capsys, "diff", out / "a", tmp_path / "empty.json")
+    code, said, _ = objslam("diff", out / "a", tmp_path / "empty.json")
     assert code == 1
     assert said == f"not registered: too little evidence, because {tmp_path / 'empty.json'} has 0 resolved objects\n"
-    code, _, warned = call(monkeypatch, capsys, "merge", out / "a", tmp_path / "empty.json", "-o", tmp_path / "site")
+    code, _, warned = objslam("merge", out / "a", tmp_path / "empty.json", "-o", tmp_path / "site")
     assert code == 0
     assert "2 islands without objects in common" in warned
     assert (tmp_path / "site" / "island_2" / "objects.json").is_file()
-    code, _, warned = call(monkeypatch, capsys, "merge", out / "a", "-o", tmp_path / "site")
+    code, _, warned = objslam("merge", out / "a", "-o", tmp_path / "site")
     assert code == 0
     assert f"{tmp_path / 'site' / 'island_2'} is of an earlier merge" in warned
     with pytest.raises(ValueError, match="at least one"):
-        objslam.merge([])
+        merge([])
 
 
-def test_a_map_that_lies_on_its_side_is_named(days, tmp_path, monkeypatch, capsys):
+def test_a_map_that_lies_on_its_side_is_named(days, tmp_path, objslam):
     """The second day as visual SLAM gives it, in the frame of the first camera."""
     a, lying = days[0] / "a", tmp_path / "lying"
     shutil.copytree(days[0] / "b", lying)
     y_down = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    objects = objslam.ObjectMap.load(lying)
+    objects = ObjectMap.load(lying)
     turned = (
         o if o.status != "ok" else replace(o, position=y_down @ o.position, covariance=y_down @ o.covariance @ y_down.T)
         for o in objects
@@ -195,10 +185,10 @@ def test_a_map_that_lies_on_its_side_is_named(days, tmp_path, monkeypatch, capsy
     (lying / "summary.json").write_text(json.dumps({**summary, "up": "-y"}))
     why = f"{lying} lies on its side (up is -y); maps are matched only with z up"
     for command in (["register", lying, a], ["diff", a, lying]):
-        code, said, _ = call(monkeypatch, capsys, *command)
+        code, said, _ = objslam(*command)
         assert code == 1
         assert f"not registered: {why}" in said
-    code, said, _ = call(monkeypatch, capsys, "register", a, lying / "objects.json")
+    code, said, _ = objslam("register", a, lying / "objects.json")
     assert f"not registered: {lying / 'objects.json'} lies on its side" in said
-    code, _, warned = call(monkeypatch, capsys, "merge", a, lying, "-o", tmp_path / "site")
+    code, _, warned = objslam("merge", a, lying, "-o", tmp_path / "site")
     assert why in warned

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+from outlines import from_axes, looking_at, outline_box
 
 from objslam.core.bodies.body import SHAPES
 from objslam.core.bodies.box_centres import beside_centres, image_axes
 from objslam.core.camera import Camera, project, undistort
 from objslam.core.geometry import make_pose
 from objslam.core.rotation import rotation_from_vector
-from objslam.simulation.outlines import looking_at, outline_box
-from objslam.triangulation.bodies.ellipsoid import from_axes
 
 MATRIX = np.array([[400.0, 0, 320], [0, 400, 240], [0, 0, 1]])
 PINHOLE = Camera("front", 640, 480, MATRIX)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +24,6 @@ from objslam.frontend.surface_ranges import measured_ranges
 from objslam.graph.factors.odometry import motions
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.simulation import DepthNoise, make_camera, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 SETTINGS = load_settings(
     None, ("mode=joint", "calibration.focal=0.01", "calibration.translation=0.01", "calibration.centre=0.01")

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from numpy.testing import assert_allclose
 
 from objslam.core.geometry import lift_se2
 from objslam.core.trajectory import travel
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.corrected_log import OdometryCorrection, corrected_odometry
-from objslam.simulation.shared_errors import add_shared_errors
 
 SLIP = {"odometry.turn_slip": 0.08}
 

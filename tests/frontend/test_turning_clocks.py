@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from scipy.spatial.transform import Rotation
 from turning_drive import drive, errors_of
 
@@ -11,7 +12,6 @@ from objslam.core.geometry import inverse, make_pose
 from objslam.core.types import Trajectory
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.simulation.shared_errors import add_shared_errors
 
 
 def clock_of(errors: SharedErrors, theta: np.ndarray) -> float:

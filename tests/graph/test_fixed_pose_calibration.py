@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 
@@ -28,7 +29,6 @@ from objslam.graph.calibration.fixed_pose_calibration import (
 )
 from objslam.graph.fixed_pose_triangulation import noise_of_poses, triangulate_at
 from objslam.simulation import PoseNoise, make_camera, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 HELD = ("calibration.translation=0", "calibration.focal=0", "calibration.centre=0")
 ERRORS = {"front.clock": 0.12, "front.roll": 0.015, "front.tilt": -0.02, "front.yaw": 0.03}

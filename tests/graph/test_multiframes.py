@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from drives import drive_of
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
@@ -24,7 +25,6 @@ from objslam.graph.multiframes import TOGETHER, Multiframes
 from objslam.graph.optimizers import build_graph
 from objslam.graph.variables import L0, X0, make_values
 from objslam.simulation import DepthNoise, PoseNoise, make_camera, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 RIG = (
     make_camera("front", position=(0.25, 0.0, 0.3)),

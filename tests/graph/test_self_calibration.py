@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from drives import circle_log, drive_of
 from numpy.testing import assert_allclose
 from scipy.stats import chi2
@@ -26,7 +27,6 @@ from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.variables import make_values, read_poses, with_points
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 ERRORS = {
     "odometry.scale": -0.03,

@@ -3,7 +3,6 @@
 import errno
 import importlib
 import json
-import sys
 import threading
 from types import SimpleNamespace
 
@@ -12,7 +11,6 @@ import pytest
 from quick import HELD, NOTHING_DRAWN, options
 from waiting import LIMIT
 
-from objslam.cli import main
 from objslam.config import Odometry, load_settings
 from objslam.errors import LogError, SolveError
 from objslam.io.results.read import load_map
@@ -171,14 +169,12 @@ def test_a_journal_that_cannot_be_closed_costs_no_map(log, tmp_path, monkeypatch
 
 
 @pytest.fixture
-def command(monkeypatch, capsys):
+def command(objslam):
     """`objslam live` in this process: exit code, and the lines on stderr."""
 
     def call(source, out, *more):
-        monkeypatch.setattr(sys, "argv", ["objslam", "live", str(source), "-o", str(out), *QUIET, *more])
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        return exit_.value.code, capsys.readouterr().err.strip().splitlines()
+        ended = objslam("live", source, "-o", out, *QUIET, *more)
+        return ended.code, ended.err.strip().splitlines()
 
     return call
 

@@ -4,10 +4,8 @@ import io
 import json
 
 import numpy as np
-import pytest
 from test_journal_segments import often, pose, segmented, write  # noqa: F401 - `often` is a fixture
 
-from objslam.cli import main
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
 from objslam.live.adapters.stdin import StdinAdapter
@@ -15,18 +13,6 @@ from objslam.simulation import make_camera
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import CameraMessage, FrameMessage, MountMessage, NoteMessage, encode
-
-
-@pytest.fixture
-def objslam(monkeypatch, capsys):
-    def call(*words):
-        monkeypatch.setattr("sys.argv", ["objslam", *map(str, words)])
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        told = capsys.readouterr()
-        return exit_.value.code, told.out, told.err
-
-    return call
 
 
 def test_verify_and_repair(objslam, tmp_path):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from driving import feed
 from test_mixed_paths import ORDERS, heard
 from test_mixed_paths import drive as hear
@@ -23,7 +24,6 @@ from objslam.live.calibration.recalibration import recalibrate
 from objslam.live.session.session import Session
 from objslam.simulation import PoseNoise, preset, simulate
 from objslam.simulation.settings import DepthNoise
-from objslam.simulation.shared_errors import add_shared_errors
 
 ERRORS = {"odometry.scale": 0.05, "odometry.turn_scale": -0.06, "front.clock": 0.12, "front.yaw": 0.03}
 QUIET = Odometry(x_per_m=0.005, yaw_per_m=0.005, yaw_per_rad=0.01)

@@ -1,6 +1,7 @@
 """Simulated drives between large objects, as logs with boxes and a truth."""
 
 import numpy as np
+from outlines import from_axes, outline_box, visible_box
 
 from objslam.config import load_settings
 from objslam.core.camera import Camera
@@ -9,8 +10,7 @@ from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
-from objslam.simulation.outlines import outline_box, visible_box
-from objslam.triangulation.bodies.ellipsoid import from_axes, half_axes, heading
+from objslam.triangulation.bodies.ellipsoid import half_axes, heading
 
 FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.8], [0, 0, 0, 1]])
 """A camera that looks ahead, 0.8 m above the floor."""

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from quick import NOTHING_DRAWN
 from scipy.spatial.transform import Rotation
 from small_log import small_log
+from wrong_inputs import MISTAKES, join
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
@@ -18,14 +20,12 @@ from objslam.errors import LogError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.agreement import bounded_part
 from objslam.mapping.checks.diagnosis import diagnose
-from objslam.mapping.checks.hypotheses.every import hypotheses
-from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis
+from objslam.mapping.checks.hypotheses.every import hypotheses, with_frame_stamps, with_poses
+from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_cameras
 from objslam.mapping.checks.hypotheses.trials import Trial, verdict
 from objslam.mapping.checks.path import check_path
 from objslam.mapping.checks.stamps import check_stamps
 from objslam.simulation import DepthNoise, PoseNoise, make_camera, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
-from objslam.simulation.wrong_inputs import MISTAKES, join, with_cameras, with_frame_stamps, with_poses
 from objslam.sources import read
 from objslam.sources.log_folder import write_log_folder
 

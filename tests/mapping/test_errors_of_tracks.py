@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from bench_robots import robot
 from log_parts import without_names
 from turning_drive import drive, errors_of
@@ -14,7 +15,6 @@ from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
 from objslam.mapping.joint_alternation import JointState
-from objslam.simulation.shared_errors import add_shared_errors
 
 TURN_SCALE, TURN_BIAS, CLOCK = "odometry.turn_scale", "odometry.turn_bias", "front.clock"
 

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from numpy.testing import assert_allclose
 
 from objslam.config import Odometry, load_settings
@@ -16,7 +17,6 @@ from objslam.core.types import Log
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.mapping import pipeline
 from objslam.simulation import make_camera, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 SEEDS = range(3)
 HELD = "calibration.use=false"

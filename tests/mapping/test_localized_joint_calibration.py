@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from scipy.stats import chi2
 
 from objslam.config import load_settings
@@ -13,7 +14,6 @@ from objslam.graph.calibration import self_calibration
 from objslam.mapping import pipeline
 from objslam.mapping.checks.assessment import Evidence, assess, evidence_of
 from objslam.simulation import preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 TURNS, PLACE, LENS = (
     {"roll": 0.02, "tilt": 0.02, "yaw": 0.03},

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from scipy.spatial.transform import Rotation
 
 from objslam.config import load_settings
@@ -15,7 +16,6 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.mapping.checks.diagnosis import diagnose
 from objslam.simulation import preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 PRIORS = {"clock": 0.1, "roll": 0.02, "tilt": 0.02, "yaw": 0.03, "focal": 0.02, "cx": 0.02, "cy": 0.02}
 PRIORS |= {"x": 0.05, "y": 0.05, "z": 0.05}

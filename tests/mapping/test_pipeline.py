@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from quick import HELD
 from small_log import THINGS, crowded, small_log
 
@@ -19,7 +20,6 @@ from objslam.errors import LogError, SolveError
 from objslam.frontend.parts import PARTS
 from objslam.mapping import pipeline
 from objslam.simulation import DepthNoise, make_camera, pair, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 from objslam.simulation.trajectory import START
 
 MODES = ["fixed", "joint"]

@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
+from wrong_inputs import MISTAKES, join
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
@@ -22,8 +24,6 @@ from objslam.mapping.checks.hypotheses.trials import Trial, clear
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
 from objslam.mapping.refuted import without_refuted
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
-from objslam.simulation.wrong_inputs import MISTAKES, join
 
 SETTINGS = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false", "bodies.use=false"))
 

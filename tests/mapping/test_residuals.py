@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 
 import pytest
+from added_errors import add_shared_errors
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.mapping import pipeline
 from objslam.simulation import PoseNoise, preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 NO_BODIES = "bodies.use=false"
 """Rays of small things miss their objects as far with bodies. That bodies warn of nothing is seen on clean drives."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 
 from objslam.config import load_settings
 from objslam.core.arrays import Floats, Ints
@@ -17,7 +18,6 @@ from objslam.frontend.known_errors import shared_errors
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.merge_and_split import split_at_gaps
 from objslam.mapping.solution import seen_something
-from objslam.simulation.shared_errors import add_shared_errors
 
 BASE_T_CAMERA = make_pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 1.0]))
 WAY = [(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (9.0, 0.0, np.pi / 2), (9.0, 4.0, np.pi / 2), (9.0, 4.0, np.pi), (0.0, 4.0, np.pi)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from added_errors import add_shared_errors
 from scipy.spatial.transform import Rotation, Slerp
 
 from objslam.config import load_settings
@@ -13,7 +14,6 @@ from objslam.core.trajectory import rates
 from objslam.core.types import Trajectory
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
-from objslam.simulation.shared_errors import add_shared_errors
 
 _HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "turn_slip", "range_scale"))
 _ANGLES = ("yaw", "tilt", "roll")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from outlines import from_axes
 from triangulation.true_boxes import (
     CAMERAS,
     box_around,
@@ -20,7 +21,6 @@ from objslam.core.camera import project
 from objslam.mapping.bodies.fitting import repeated_error
 from objslam.triangulation.bodies.choice import shapes_disagree, with_shares_of_shapes
 from objslam.triangulation.bodies.edges import BoxEdges, contacts
-from objslam.triangulation.bodies.ellipsoid import from_axes
 from objslam.triangulation.bodies.fit import Prior, Weights, fit, sums_of_products
 from objslam.triangulation.bodies.prior import weak_prior
 from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals, touched_points

@@ -3,11 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+from outlines import from_axes, visible_box
 from triangulation.true_boxes import CAMERAS, edges_of, looking_at, outline_box, views_of
 
-from objslam.simulation.outlines import visible_box
 from objslam.triangulation.bodies.edges import LEFT, RIGHT
-from objslam.triangulation.bodies.ellipsoid import from_axes
 from objslam.triangulation.bodies.fit import Prior, Weights, fit
 from objslam.triangulation.bodies.prior import weak_prior
 from objslam.triangulation.bodies.residuals import at_edges, edge_gaps, nominal_noise, residuals

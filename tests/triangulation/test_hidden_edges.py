@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from outlines import from_axes
 from triangulation.true_boxes import CAMERAS, edges_of, random_bodies, views_of
 
 from objslam.core.camera import undistort
 from objslam.mapping.bodies.fitting import repeated_error
-from objslam.triangulation.bodies.ellipsoid import from_axes, half_axes
+from objslam.triangulation.bodies.ellipsoid import half_axes
 from objslam.triangulation.bodies.residuals import residuals
 from objslam.triangulation.bodies.shapes import ELLIPSOID
 from objslam.triangulation.bodies.solve import solve_bodies

@@ -1,11 +1,10 @@
 """Boxes of ellipsoids and cuboids by their outlines, without the tangent planes that the fit uses."""
 
 import numpy as np
+from outlines import from_axes, looking_at, outline_box
 
 from objslam.core.camera import Camera, project
-from objslam.simulation.outlines import looking_at, outline_box
 from objslam.triangulation.bodies.edges import BoxEdges, tangent_planes
-from objslam.triangulation.bodies.ellipsoid import from_axes
 
 CAMERAS = {
     "pinhole": Camera("c", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])),

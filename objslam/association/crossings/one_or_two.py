@@ -75,9 +75,9 @@ class Crossings:
 def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
     """Compare one thing and two things as explanations of each landmark whose rays come in two bundles.
 
-    Things of a class lie anywhere in the mapped space, as dense as its landmarks. The second thing of a landmark may also be
-    another landmark that fits the bundle's rays. Only bundles whose boxes have sizes are compared. Without sizes, only the
-    bearings tell how far away the thing is, and the rays of one stretch of the path share errors.
+    The things of a class may lie anywhere in the mapped space, with the density of its landmarks. The second thing of a
+    landmark may also be another landmark that fits the bundle's rays. Only bundles whose boxes have sizes are compared.
+    Without sizes, only the bearings tell how far away the thing is, and the rays of one stretch of the path share errors.
 
     sized: (R,) whether the camera of each ray observes sizes. fewest: the number of such boxes that a bundle must have.
     """

@@ -23,7 +23,7 @@ _NEAREST, _FURTHEST = 0.03, 2.0
 @dataclass(frozen=True)
 class FreeFit:
     """Points that fit the bearings of G bundles best, at any distance. position: (G, 3) m. log_volume: (G,) ln of the
-    volume, m^3, of each position, as of `fit_points`. along: (G,) m, the largest standard deviation of each position over
+    volume, m^3, of each position, as in `fit_points`. along: (G,) m, the largest standard deviation of each position over
     all directions.
     """
 

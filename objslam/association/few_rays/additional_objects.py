@@ -40,8 +40,8 @@ streets. A larger number takes longer."""
 _FIRST = 0.7
 """The noise of the places in the first search, as a share of the noise in the settings. With wide gates, near objects become
 one, and then they show no errors of places. On 30 simulated streets with the right noise in the settings, 0.7 and 1 give the
-same objects. With 1.2 times the true noise in the settings, 0.7 is better. With a smaller share, errors of more than usual
-size are not found."""
+same objects. With 1.2 times the true noise in the settings, 0.7 is better. With a smaller share, unusually large errors
+are not found."""
 _SAMPLE = 512  # The most rays of one label in a search. The time grows with the square of this number.
 _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair. A larger angle finds fewer, surer points.
 
@@ -51,12 +51,16 @@ def add_few_ray_objects(
 ) -> Association:
     """Add the objects that can be found from a few unassigned rays. They come after the other objects.
 
-    The association stays as it is if the poses are not localised, if the settings do not allow the search, or if the
-    association has no probability that its objects exist.
+    The association stays as it is if the poses are not localised, if the settings do not allow the search, if the
+    association has no probability that its objects exist, or if too few rays are free for another object.
 
     positions: (N, 3) m of the objects, NaN where unknown. seed: the seed of the random pairs of rays.
     """
     if association.existence is None or not (settings.association.few_rays and of.keyframes.localized_every):
+        return association
+    free = np.flatnonzero(_free(association))
+    enough = np.bincount(of.rays.label[free]).max(initial=0) > 1  # Two rays of one label, as `_plausible` asks.
+    if not enough and not np.isfinite(of.rays.range[free]).any():
         return association
     few, ray = _few(of, settings, association, positions)
     few, found = few.search(settings.association.min_existence, seed)
@@ -135,11 +139,14 @@ def _few(of: PosedRays, settings: config.Settings, association: Association, pos
     state = State(obs, view, held, np.append(np.where(known, np.cumsum(known) - 1, -1), -1)[association.object[ray]])
     ratio = learn_ratio(obs, obs.frame, obs.track, association.object[ray], labels)
     state = replace(state, landmarks=replace(held, noise=state.noise), ratio=ratio)
-    free = association.object[ray] < 0
-    if association.refuted is not None:
-        free &= ~association.refuted[ray]
     strays = Strays.of(obs, view, labels)
-    return _Few(state, np.flatnonzero(free), strays, gate_limit(settings.association.gate)), ray
+    return _Few(state, np.flatnonzero(_free(association)[ray]), strays, gate_limit(settings.association.gate)), ray
+
+
+def _free(association: Association) -> Bools:
+    """Return which rays (R,) may show further objects: those without an object, unless their object was refuted."""
+    free = association.object < 0
+    return free if association.refuted is None else free & ~association.refuted
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,7 @@ def _judge(obs: Observations, points: Floats, free: Bools, search: SparseSearch)
         np.maximum(off2, 0.0, out=off2)
         odds, density = ray_odds(obs, strays, search.number, off2, distance, 1.0, search.gate)
         odds[depth <= MIN_DEPTH] = -np.inf
-        # Most rays have no positive odds at a point, so the rest is computed only for those that have.
+        # Most rays have no positive odds at a point, so the rest is computed only for rays with positive odds.
         point, ray = np.nonzero(odds > 0)
         best = np.maximum.reduceat(odds, begin, axis=1)[point, of_frame[ray]]
         point, ray = (some[odds[point, ray] == best] for some in (point, ray))

@@ -55,7 +55,7 @@ class Motions:
     def costs(self, k: int, grid: Grid) -> tuple[Cells, Cells, Cells]:
         """Return the costs of motion `k`, as three arrays: by x (2 X - 1, Y), by y (2 X - 1, Y) and by yaw (2 Y - 1,).
 
-        The first axis is the step from the state before to the state after, in increasing order. The second axis is the yaw
+        The first axis is the step from the previous state to the next one, in increasing order. The second axis is the yaw
         of the states, because a step in x or y depends on it. The drift in x, y and yaw counts as independent.
         """
         shifts, turns = (np.arange(1 - len(axis), len(axis)) for axis in (grid.shifts, grid.turns))
@@ -109,7 +109,7 @@ def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
 
     Args:
         total: (Y, X, X) of the states before.
-        x, y, yaw: as of `Motions.costs`.
+        x, y, yaw: as in `Motions.costs`.
     """
     below = total < _SLIP
     turns, east, north = (_extent(np.any(below, axis=others, keepdims=True).ravel()) for others in ((1, 2), (0, 2), (0, 1)))

@@ -43,8 +43,8 @@ _SQUARES = 2 * gammaincinv(1.5, (np.arange(50) + 0.5) / 50)
 gives the expectation of a weighted squared residual. More steps give it more exactly."""
 _STILL = 1e-6
 """The largest step (m, rad) that ends the solve. A larger value ends it sooner. With Cauchy's weights, each step is about
-half of the step before. So at the end the positions are wrong by about this much, which is a thousandth of the errors of the
-best maps."""
+half of the previous step. So at the end the positions are wrong by about this much, which is a thousandth of the errors of
+the best maps."""
 
 
 @dataclass(frozen=True)

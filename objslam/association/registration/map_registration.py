@@ -44,7 +44,7 @@ alarms more often than the log odds say."""
 _FITS = 2
 """The number of rounds of matching and fitting in each stage. A larger number takes longer."""
 _SAME_SHIFT, _SAME_TURN = 0.5, 0.1
-"""Two transforms are one place if they differ by less than this shift (m, at the centre of the map) and this turn (rad).
+"""Two transforms count as the same if they differ by less than this shift (m, at the centre of the map) and this turn (rad).
 Larger values hide repetitions."""
 
 

@@ -1,4 +1,5 @@
-"""The shape of a map: how its objects lie to each other, and which of their errors a transform of the map can absorb.
+"""The shape of a map: where its objects lie relative to each other, and which of their errors a transform of the map can
+absorb.
 
 The error of object i is o_i + L_i e. o_i is its own, and e has the seven numbers that all objects of the map share
 (`core.maps.shared_covariance`): g is a shift and a yaw, and d is a tilt and a size. With J_i and D_i for the columns of L_i

@@ -78,9 +78,9 @@ def moved(shared: Floats, b_T_a: Floats) -> Floats:
     return turn @ shared @ turn.T
 
 
-def root_of(shared: Floats) -> Floats:
-    """Return a matrix (7, 7) whose product with its own transpose is the covariance (7, 7) of a shared error."""
-    size, axes = np.linalg.eigh((shared + shared.T) / 2)
+def root_of(covariance: Floats) -> Floats:
+    """Return a matrix (n, n) whose product with its own transpose is the covariance (n, n)."""
+    size, axes = np.linalg.eigh((covariance + covariance.T) / 2)
     return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 

@@ -85,7 +85,7 @@ class InnerSolve(Linearised):
     def solved(self) -> Self:
         """Return the state after at most `_INNER` steps, or `_damped` if a step does not lower the cost.
 
-        A step takes the normal equations of the step before (chord method). Between steps, only the robust weights and the
+        A step takes the normal equations of the previous step (chord method). Between steps, only the robust weights and the
         directions change a little. The gradient is fresh, so the steps lead to the same optimum as those of Gauss-Newton. If
         a chord step does not lower the cost, the step is taken with fresh normal equations instead.
         """

@@ -14,7 +14,8 @@ _TIMES = tuple(2.0**k for k in range(8))
 """The tried times (s) for which errors last. A shorter one hardly differs from new errors in each pose, and a longer one
 from a shift of the whole map. More times are finer and slower."""
 _FINE = np.geomspace(_TIMES[0], _TIMES[-1], 200)
-"""Times (s) between which a mean of several of `_TIMES` is interpolated. More are finer."""
+"""The times (s) at which a table is computed. The time that belongs to a mean of several of `_TIMES` is interpolated in this
+table. More times are finer."""
 _SHARES = (0.0, 0.1, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99, 1.0)
 """The tried shares of an error that last. More shares are finer and slower."""
 _STEPS = (0.8, 0.3, 0.1)
@@ -205,7 +206,7 @@ def most_likely(data: ComparedPoses) -> PoseErrors:
     """
     most = _MOST_FACTOR if data.free else 0.0
     usual, cost_usual = _searched(data, _begun(data, PoseErrors(), 0.0), 0.0, ())
-    # Too large an error of the prediction is a local optimum, so the search also begins at that of the odometry's noise.
+    # A search may end at too large a prediction error. So another search begins at the error by the odometry's noise.
     begun = {_begun(data, replace(usual, predicted=predicted), most) for predicted in (0.0, usual.predicted)}
     best, least = min((_searched(data, start, most, ()) for start in begun), key=lambda found: found[1])
     lasting, cost = _searched(data, _begun_lasting(data, best), most, (_BOTH,))

@@ -147,7 +147,7 @@ def misfit_at_shared_errors(
 ) -> float:
     """Return the misfit of a joint solution at the shared errors that fit it best, with their squared deviations.
 
-    It compares solutions at the noise of `errors`. The search begins at theta (P,). SolveError as of `calibrate`.
+    It compares solutions at the noise of `errors`. The search begins at theta (P,). SolveError as in `calibrate`.
     """
     state = InnerSolve(measure(*errors.at(theta)), association, found.map_T_camera, found.positions, found.used)
     at = _Fit(errors, measure, None).shared_errors(state.ordered(found.near), theta, _NEARLY)

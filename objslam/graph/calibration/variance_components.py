@@ -29,8 +29,9 @@ _PROBES, _FEWEST_PROBES = 12, 4
 """The most and the fewest random probes. With n independent residuals, the relative error of the redundancy is
 sqrt(2 / (n * probes)). More probes are slower."""
 _PRODUCTS = 3000
-"""The sufficient product of independent residuals and probes. With it, the redundancy has a standard deviation of 3 %, and a
-factor has half of that. So a long log needs fewer probes than `_PROBES`. A larger number is more exact, and slower."""
+"""A sufficient product of two numbers: of independent residuals, and of probes. With it, the redundancy has a standard
+deviation of 3 %, and a factor has half of that. So a long log needs fewer probes than `_PROBES`. A larger number is more
+exact, and slower."""
 _ITERATIONS = 20
 """The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 5 to 12."""
 _CONVERGED = 0.01

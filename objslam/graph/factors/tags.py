@@ -8,7 +8,7 @@ from objslam.graph.variables import L0, TAG0, TAG_SIZE0
 
 TIE = 1e-3
 """The standard deviation of the tie between a corner and the pose of its tag, as a share of their distance. A larger share
-lets a square bend. A smaller share conditions the linear system worse. Printed tags are about this exact. The noise of
+lets a square bend. A smaller share conditions the linear system worse. Printed tags have about this error. The noise of
 detected corners is at least a hundred times larger."""
 
 

@@ -16,7 +16,7 @@ from objslam.graph.least_squares.normal_equations import NormalEquations, elimin
 
 _SLOW = 0.5
 """The normal equations are computed again if the predicted decrease of the cost is more than this share of the decrease that
-the step before predicted. With a larger share, they are computed more rarely, and a solve takes more steps. With old
+the previous step predicted. With a larger share, they are computed more rarely, and a solve takes more steps. With old
 equations, a step takes a fifth of the time."""
 
 OnStep = Callable[[float, Floats, Floats], None]
@@ -52,7 +52,7 @@ def gauss_newton(
 ) -> Solution:
     """Minimise the cost of a graph. The landmarks start at the means `graph.weak` of their priors.
 
-    A step reuses the normal equations of the step before (chord method), as long as the cost decreases quickly. They are
+    A step reuses the normal equations of the previous step (chord method), as long as the cost decreases quickly. They are
     still nearly right, because only robust weights and directions change between steps. Each step computes the gradient
     again, so the optimum is the same.
 

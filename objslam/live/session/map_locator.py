@@ -176,6 +176,6 @@ def _recent_objects(m: MapState, rows: Ints) -> tuple[ObjectMap, Floats]:
 
 
 def _apart(a: Floats, b: Floats, points: Floats) -> float:
-    """Return the distance (m) between the two places to which transforms (4, 4) move the middle of points (n, 3)."""
+    """Return the distance (m) between the middle of points (n, 3) moved by `a` (4, 4), and the same middle moved by `b`."""
     middle = np.append(points.mean(axis=0), 1.0)
     return float(np.linalg.norm((a @ middle - b @ middle)[:3]))

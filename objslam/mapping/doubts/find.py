@@ -30,7 +30,7 @@ maps are good."""
 _LOST = (0.1, 0.5)
 """Two shares. A group of boxes that became no object counts in the assessment if it has at least the first share of all
 boxes of its label. It also counts if it has at least the second share of the boxes that an object of its label has (median).
-False boxes of a detector at one place are rarer. With larger shares, more maps are good."""
+False boxes of a detector at one place are usually fewer. With larger shares, more maps are good."""
 _FEWEST_LOST = 5
 """The fewest boxes of a group that counts in the assessment. With a larger number, more maps are good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")

@@ -23,9 +23,9 @@ _LEAST = 0.2
 0.13. A larger value finds fewer mixed objects."""
 
 _TURNED = np.cos(np.radians(20.0))
-"""The cosine of the largest angle between the vertical as a box shows it and its mean over the boxes of the object. From
-other sides, the same thing has another height in the image: within 20 deg, the height of a flat thing changes by 6 %. A
-larger angle judges more objects of cameras that are not level."""
+"""The cosine of the largest angle between the direction of the vertical in one box and the mean of this direction over the
+boxes of the object. From other sides, the same thing has another height in the image: within 20 deg, the height of a flat
+thing changes by 6 %. A larger angle judges more objects of cameras that are not level."""
 
 
 def mixed_sizes(result: RunResult) -> list[Doubt]:

@@ -33,8 +33,8 @@ def with_errors_of_tracks(state: JointState) -> JointState:
 
     A track is a chain of boxes in images that follow each other (`frontend.tracks`). Nobody needs to know which tracks show
     the same thing: at the right clocks, turns and rotations of cameras, the rays of each track meet in one point. So the
-    tracks are solved as landmarks, with the odometry and the priors of all errors. The noise stays that of the settings: many
-    landmarks with few rays hardly tell it.
+    tracks are solved as landmarks, with the odometry and the priors of all errors. The noise stays that of the settings,
+    because many landmarks with few rays hardly tell it.
 
     The first association of a drive takes these errors as given. With a gyroscope that turns by 0.2 degrees a second too
     much, the rays of one minute meet nowhere.
@@ -77,7 +77,7 @@ def _excerpt(state: JointState) -> JointState:
 
 
 def _apart(stamps: Floats, camera: Ints) -> Bools:
-    """Return a mask (K,) of keyframes of which each camera has one in each span of `_APART`. stamps: (K,) s. camera: (K,)."""
+    """Return a mask (K,) of keyframes of which each camera has one in each span of `_APART`. stamps: (K,) s."""
     span = np.stack([camera, np.floor((stamps - stamps.min()) / _APART).astype(np.int64)])
     _, first = np.unique(span, axis=1, return_index=True)
     keep = np.zeros(len(stamps), dtype=bool)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import angles_off
@@ -228,26 +228,30 @@ def _first_trial(
     An association that allows for the uncertainty of ray directions because of the errors is right if things are far apart.
     In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong distance. Then a
     narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the associations are compared
-    by how likely the rays are after a calibration. A narrower one has to be clearly better. Also return whether it is.
+    by how likely the rays are after a calibration. A narrower one has to be clearly better than the widest. The widest
+    association with an object is taken at once if it fits. Also return whether a narrower one is taken.
 
     at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
     of the errors.
     """
-    wide = _tried(at, now, errors, calibration, now.associate(told), trace)
-    best = wide
-    missed, least = wide.left()
-    if missed <= _FITS:
-        return wide, False
-    least -= _CLEARLY
-    for share in _NARROWER:
-        association = now.associate(share * told)
-        if np.array_equal(association.object, wide.association.object):
-            continue  # It leaves the same.
-        narrow = _tried(at, now, errors, calibration, association, trace)
-        _, left = narrow.left()
-        if left < least:
-            best, least = narrow, left
-    return best, best is not wide
+    wide = now.associate(told)
+    best: _Trial | None = None
+    least, narrower = float("inf"), False
+    tried: list[Ints] = []
+    for share in (1.0, *_NARROWER):
+        association = wide if share == 1.0 else now.associate(share * told)
+        # Without an object, nothing is calibrated. The rays of an earlier association leave the same again.
+        if not association.count or any(np.array_equal(association.object, earlier) for earlier in tried):
+            continue
+        tried.append(association.object)
+        trial = _tried(at, now, errors, calibration, association, trace)
+        missed, left = trial.left()
+        if best is None or left < least:
+            best, narrower = trial, share < 1.0
+            least = left - _CLEARLY if share == 1.0 else left
+        if len(tried) == 1 and missed <= _FITS:
+            break
+    return best or _tried(at, now, errors, calibration, wide, trace), narrower
 
 
 def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.fixed.pose_noise import noise_in_frames
 from objslam.mapping.progress import Progress
+from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -54,7 +55,7 @@ class FixedPoses:
     def without(self, errors: SharedErrors, theta: Floats) -> FixedPoses:
         """Return the same input, corrected for the shared errors theta (P,)."""
         frames, rays, _ = errors.take(self.frames, self.rays).at(theta, drift=False)
-        seen, rays_seen, _ = errors.at(theta, drift=False)
+        seen, rays_seen = seen_something(frames, rays)
         corrected = replace(self, frames=frames, rays=rays, seen=seen, rays_seen=rays_seen)
         return corrected.with_noise_of_poses(self.seen.pose_noise)
 

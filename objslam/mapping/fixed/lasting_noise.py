@@ -63,7 +63,7 @@ class Cells:
     def covariances(self, variances: Floats) -> tuple[Ints, Floats]:
         """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 of each by errors that last.
 
-        variances: (2, T) as of `lasting_variances`.
+        variances: (2, T) as in `lasting_variances`.
         """
         objects, first = np.unique(self.owner, return_index=True)
         found = np.zeros((len(objects), 3, 3))
@@ -91,7 +91,7 @@ class LastingNoise:
 
     @classmethod
     def of(cls, cells: Cells, variances: Floats, yaw: float, place: float) -> "LastingNoise":
-        """Return the errors with squared factors (2, T), as of `lasting_variances`, on noise of `yaw` rad and `place` m."""
+        """Return the errors with squared factors (2, T), as in `lasting_variances`, on noise of `yaw` rad and `place` m."""
         turned, moved = np.sqrt(variances.sum(axis=1)).tolist()
         weight = variances.sum(axis=0)
         seconds = float(np.exp(weight @ np.log(TIMES) / weight.sum())) if weight.sum() > 0 else 0.0

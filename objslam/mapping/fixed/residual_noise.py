@@ -68,8 +68,8 @@ def noise_of_residuals(searched: Searched, unknown: tuple[bool, bool, bool], pri
 
 
 def gain_of_shared_places(searched: Searched) -> float:
-    """Return the log odds that all rays of one moment have the same error of their place, against an own error for each
-    ray."""
+    """Return the log odds of two explanations: all rays of one moment share one error of their place, or each ray has
+    another error."""
     if not len(searched.found.owner):
         return 0.0
     residuals = _Residuals.of(searched)

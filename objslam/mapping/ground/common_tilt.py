@@ -155,7 +155,8 @@ class CommonTilt:
     def lasting(self) -> Uneven:
         """Return the ground with the time for which its tilt lasts, and with the size of the tilt if it lasts that long.
 
-        Tilt that lasts lifts a thing in all its rays, so rays show less of it, and its size is larger than it seems.
+        A tilt that lasts moves all rays of a thing up or down together, so the rays still meet. They show only a part of the
+        tilt, and the tilt is larger than this part.
         """
         poses = np.unique(self.pose)
         every = -(-len(poses) // _MOST_LASTING)

@@ -22,7 +22,7 @@ _ROUNDS = 5
 _SAME = 0.05
 """The rounds end if the noise by the ground changes by at most this share. A larger share ends sooner."""
 _FEWEST = 60
-"""The fewest boxes of a log that tell of the ground. Fewer boxes agree by chance."""
+"""The fewest boxes of a log from which the ground is estimated. Fewer boxes agree by chance."""
 _CROWD = 5.0
 """In a larger crowd (`Part.crowd`), rays meet anywhere, and show nothing. A larger value examines more logs."""
 _LEAST = 0.5

@@ -1,4 +1,5 @@
-"""Place the frames of many sessions: which sessions share objects, how they lie to each other, and which objects are one.
+"""Place the frames of many sessions: which sessions share objects, the transforms between them, and which
+objects are the same.
 
 A session is registered to the map of all sessions that are placed so far, not to each of these sessions. So a session costs
 one registration, however many sessions there are. The map also gives more evidence: it has more objects than any single

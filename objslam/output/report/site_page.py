@@ -42,7 +42,7 @@ def write_site_report(out: Path) -> Path:
 
 
 def _date(life: Life | None) -> str:
-    """Return when an object was last updated, as a date or as a stamp, s. Nothing without a history."""
+    """Return when an object was last updated, as a date or as a stamp, s. The text is empty without a history."""
     if life is None:
         return ""
     return (

@@ -88,14 +88,6 @@ def heading(values: Floats) -> Floats:
     return np.asarray(0.5 * np.arctan2(values[:, 5], values[:, 4]))
 
 
-def from_axes(centre: Floats, half: Floats, yaw: Floats) -> Floats:
-    """Return ellipsoids (N, 7) from centres (N, 3), half axes (N, 3) along x, y, z before the turn, m, and yaws (N,)."""
-    log = np.log(half)
-    aspect = (log[:, 0] - log[:, 1]) / 2
-    flat = [(log[:, 0] + log[:, 1]) / 2, aspect * np.cos(2 * yaw), aspect * np.sin(2 * yaw)]
-    return np.column_stack([centre, *flat, log[:, 2]])
-
-
 def axes_jacobian(values: Floats) -> Floats:
     """Return the derivatives (N, 7, 7) of centre, half axes and yaw by the parameters of ellipsoids (N, 7).
 

@@ -1,7 +1,6 @@
 """Bags on the command line: info, convert and run, and the options that choose."""
 
 import json
-import sys
 
 import cv2
 import numpy as np
@@ -10,27 +9,11 @@ from bag_writer import write_bag
 from drive_bag import nanoseconds, rows_of, simulated
 from quick import QUICK
 
-from objslam.cli import main
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.io.camera_yaml import write_camera
 from objslam.io.results.read import load_map
 from objslam.sources.log_folder import read_log_folder
-
-
-@pytest.fixture
-def objslam(capsys, monkeypatch):
-    """The entry point of the console script: exit code, stdout, stderr."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["objslam", *map(str, arguments)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as exit_:
-            main()
-        captured = capsys.readouterr()
-        return exit_.value.code, captured.out, captured.err
-
-    return call
 
 
 @pytest.fixture(scope="module")

@@ -185,7 +185,7 @@ def _from_degrees(poses: Floats) -> Floats:
     robot turns evenly, and it drives in the direction of its heading.
     """
     said = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
-    steps = np.unwrap(np.append(0.0, np.diff(said)))  # Each step is near the step before.
+    steps = np.unwrap(np.append(0.0, np.diff(said)))  # Each step is near the previous one.
     yaw = np.radians(np.cumsum(steps))
     way = np.diff(poses[:, :2, 3], axis=0) @ [1, 1j] * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
     return make_pose(_about_z(yaw + np.angle(way.sum())), poses[:, :3, 3])

@@ -9,14 +9,11 @@ from scipy.spatial.transform import Rotation
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.geometry import exp_se3, inverse, make_pose
-from objslam.core.types import CameraLog, Detections, Log, Trajectory
+from objslam.core.types import CameraLog, Detections, Log
+from objslam.mapping.checks.hypotheses.every import with_frame_stamps, with_poses
+from objslam.mapping.checks.hypotheses.hypothesis import with_cameras
 
 Mistake = Callable[[Log], Log]
-
-
-def with_cameras(log: Log, change: Callable[[CameraLog], CameraLog]) -> Log:
-    """Return the log with each of its cameras changed."""
-    return replace(log, cameras=tuple(change(one) for one in log.cameras))
 
 
 def with_boxes(log: Log, change: Callable[[Floats, Camera], Floats]) -> Log:
@@ -25,27 +22,6 @@ def with_boxes(log: Log, change: Callable[[Floats, Camera], Floats]) -> Log:
     def changed(one: CameraLog) -> CameraLog:
         found = one.detections
         return one if found is None else replace(one, detections=replace(found, boxes=change(found.boxes, one.camera)))
-
-    return with_cameras(log, changed)
-
-
-def with_poses(log: Log, change: Callable[[Floats], Floats]) -> Log:
-    """Return the log with the poses (N, 4, 4) of its odometry and its localisation changed."""
-
-    def changed(path: Trajectory | None) -> Trajectory | None:
-        return None if path is None else Trajectory(path.stamps, change(path.poses))
-
-    return replace(log, odometry=changed(log.odometry), localization=changed(log.localization))
-
-
-def with_frame_stamps(log: Log, change: Callable[[Floats], Floats]) -> Log:
-    """Return the log with the stamps (F,) of the frames of each camera changed."""
-
-    def changed(one: CameraLog) -> CameraLog:
-        found = one.detections
-        if found is None:
-            return one
-        return replace(one, detections=replace(found, frame_stamps=change(found.frame_stamps)))
 
     return with_cameras(log, changed)
 

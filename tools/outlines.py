@@ -1,4 +1,4 @@
-"""Compute exact boxes around ellipsoids from the outlines of their images. Tests and benchmarks of bodies use them."""
+"""Compute exact boxes around ellipsoids from the outlines of their images."""
 
 from __future__ import annotations
 
@@ -14,6 +14,14 @@ _ANGLES = 90  # The number of points of an outline from which the search begins.
 _POINTS = 720  # The number of points of an outline that is clipped. More are more exact and slower.
 _STEPS = 8  # The number of steps of the search for an extreme pixel. More are more exact and slower.
 _NEAREST = 0.05  # The least depth, m, of an outline. A larger value drops closer bodies.
+
+
+def from_axes(centre: Floats, half: Floats, yaw: Floats) -> Floats:
+    """Return ellipsoids (N, 7) from centres (N, 3), half axes (N, 3) along x, y, z before the turn, m, and yaws (N,)."""
+    log = np.log(half)
+    aspect = (log[:, 0] - log[:, 1]) / 2
+    flat = [(log[:, 0] + log[:, 1]) / 2, aspect * np.cos(2 * yaw), aspect * np.sin(2 * yaw)]
+    return np.column_stack([centre, *flat, log[:, 2]])
 
 
 def looking_at(place: Floats, target: Floats) -> Floats:
