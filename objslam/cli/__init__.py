@@ -11,6 +11,11 @@ _YOUNG = 400_000
 objects that stay, most of them in imports. One search of 200,000 objects takes 0.11 s, a tenth of the CPU of such a run, and
 found 6,000 to free. A larger number leaves garbage in memory for longer."""
 
+_BLAS_THREADS = "1"
+"""The number of threads of OpenBLAS, which multiplies the matrices of numpy and scipy, unless the user sets it. The matrices
+of a map are small. With more threads, they wait for each other in loops that keep the cores busy: on two cores, 30 minutes
+of a real robot took 8.1 s with two threads and 5.2 s with one."""
+
 _MEANT = {"--mount": "the pose of a camera: --camera-info FILE with base_T_camera in it"}
 """Options that newcomers try, and what does the same."""
 
@@ -24,6 +29,8 @@ def main() -> NoReturn:
     from objslam.errors import ObjslamError, is_out_of_memory, one_line
 
     atexit.register(gc.freeze)  # At its exit, Python would search all objects once more, which takes 0.08 s after a run.
+    if "OMP_NUM_THREADS" not in os.environ:  # It holds for OpenBLAS too.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", _BLAS_THREADS)  # Before the imports: numpy starts the threads.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # Damaged images are counted, and OpenCV need not print them.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # It would search all installed packages for plugins.
     debug = "--debug" in sys.argv

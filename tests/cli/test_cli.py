@@ -267,6 +267,25 @@ def imported_by(*arguments: str, depth: int = 2) -> set[str]:
 
 
 @pytest.mark.parametrize(
+    ("asked", "found"),
+    [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3"), ({"OMP_NUM_THREADS": "2"}, None)],
+)
+def test_a_command_has_one_thread_for_matrices_unless_the_user_asks_for_more(objslam, monkeypatch, asked, found):
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.setenv(name, "")  # So that what the command sets is gone after the test.
+        monkeypatch.delenv(name)
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    assert objslam("--version").code == 0
+    assert os.environ.get("OPENBLAS_NUM_THREADS") == found
+
+
+def test_numpy_is_imported_after_the_number_of_its_threads_is_set():
+    code = "import sys; import objslam.cli; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
     "arguments",
     [
         ("--help",),
