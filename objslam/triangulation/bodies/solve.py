@@ -10,7 +10,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES
 from objslam.triangulation.bodies.choice import log_evidence, shapes_disagree, with_shares_of_shapes
-from objslam.triangulation.bodies.cuboid_fits import best_cuboids, cuboid_starts, mixed_fit
+from objslam.triangulation.bodies.cuboid_fits import OtherCuboids, all_headings, best_cuboids, cuboid_starts, mixed_fit
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Fit, Prior, Weights, fit
 from objslam.triangulation.bodies.hidden_edges import hidden_edges, with_hidden
@@ -99,7 +99,7 @@ class _State:
 
     fitted: for each shape, its bodies (N, 7), which are the starts of the next fit. evidence, shape: see `Bodies`. best: the
     best of the solid shapes, None before the first round. solid: (N,) the shape of `best`. covariance: (N, 7, 7) of `best`.
-    sized: (N,) whether the size is known, so that no sphere is chosen.
+    sized: (N,) whether the size is known, so that no sphere is chosen. others: less probable cuboids of the last round.
     """
 
     factors: Floats
@@ -112,6 +112,7 @@ class _State:
     best: Fit | None
     covariance: Floats
     sized: Bools
+    others: OtherCuboids
 
 
 def solve_bodies(
@@ -146,11 +147,11 @@ def solve_bodies(
     starts = dot_prior(weak).mean, sphere_prior(weak).mean, *[weak.mean] * len(_SOLID)
     nothing = np.zeros((len(SHAPES), count)), none, none, None, np.zeros((count, 7, 7))
     sized = np.array([name in (sizes or {}) for name in names])
-    now = _State(np.ones(2), np.full(2, share), weak, starts, *nothing, sized)
+    now = _State(np.ones(2), np.full(2, share), weak, starts, *nothing, sized, OtherCuboids.none(count))
     hidden = np.zeros((len(edges), 4), dtype=bool)
     for number in range(_ROUNDS + 1):
         some = with_hidden(edges, hidden).take(few)
-        now = _round(some, sides_of(some, points, _counted(some, now)), now, side[few], label)
+        now = _round(some, sides_of(some, points, _counted(some, now)), now, side[few], label, turn=number == _ROUNDS)
         best = now.best
         assert best is not None
         # An object that fits a point best has no size to learn from, such as a mark that is always drawn at one size.
@@ -173,7 +174,8 @@ def solve_bodies(
             now = replace(now, factors=factors, share=found)
         if bent:
             edges = measure(touched_points(edges, _of_shapes(now.fitted, solid), solid))
-    between = shapes_disagree(now.evidence, _axes_of_shapes(now), now.shape) + doubt.between
+    every = np.concatenate([now.evidence, now.others.evidence]), np.concatenate([_axes_of_shapes(now), now.others.axes])
+    between = shapes_disagree(*every, now.shape) + doubt.between
     edges = with_hidden(edges, hidden)
     bodies = _finished(edges, sides_of(edges, points, _counted(edges, now)), now, between)
     others = None if more is None else more(bodies)
@@ -187,8 +189,9 @@ def _counted(edges: BoxEdges, now: _State) -> Floats | None:
     return residuals_of_shapes(edges, now.best.values, now.solid).use[:, :4]
 
 
-def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints) -> _State:
-    """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
+def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints, *, turn: bool) -> _State:
+    """Return the state with the best body of each shape, and for each object the shape with the most evidence. turn: whether
+    cuboids are also tried at other headings (`all_headings`)."""
     weights, first = weights_of(edges, sides, now.factors, now.share), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
     ball_prior = sphere_prior(now.prior)
@@ -199,16 +202,16 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints
     square, square_prior = best_cuboids(edges, starts, now.prior, weights, side)
     start = rounds.values if first else now.fitted[_CYLINDER]
     tube = fit(edges, start, now.prior, weights, CYLINDER, still=ENOUGH, most=STEPS)
-    evidence = np.stack(
-        [
-            dot_evidence,
-            log_evidence(edges, ball, ball_prior, weights, side) - np.log(_RARE) - 1e9 * now.sized,
-            log_evidence(edges, rounds, now.prior, weights, side),
-            log_evidence(edges, square, square_prior, weights, side),
-            log_evidence(edges, tube, now.prior, weights, side),
-        ]
-    )
-    evidence = with_shares_of_shapes(evidence, label)
+    round_evidence = log_evidence(edges, rounds, now.prior, weights, side)
+    tube_evidence = log_evidence(edges, tube, now.prior, weights, side)
+    square_evidence, others = log_evidence(edges, square, square_prior, weights, side), now.others
+    if turn:
+        rival = np.maximum(round_evidence, tube_evidence)
+        square, square_evidence, others = all_headings(edges, square, square_evidence, rival, now.prior, weights, side)
+    ball_evidence = log_evidence(edges, ball, ball_prior, weights, side) - np.log(_RARE) - 1e9 * now.sized
+    alone = np.stack([dot_evidence, ball_evidence, round_evidence, square_evidence, tube_evidence])
+    evidence = with_shares_of_shapes(alone, label)
+    others = replace(others, evidence=others.evidence + (evidence - alone)[_CUBOID])
     solid = np.array(_SOLID)[evidence[list(_SOLID)].argmax(axis=0)]
     best = mixed_fit(solid == _CUBOID, edges.body, square, rounds)
     best = mixed_fit(solid == _CYLINDER, edges.body, tube, best)
@@ -220,6 +223,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints
         solid=solid,
         best=best,
         covariance=covariance_of(edges, best, sides, now.factors, now.share),
+        others=others,
     )
 
 
