@@ -20,6 +20,7 @@ from objslam.triangulation.bodies.shapes import CYLINDER, ELLIPSOID, KINDS, rows
 from objslam.triangulation.bodies.shared import (
     Sides,
     covariance_of,
+    covariance_with_unlike,
     share_of,
     sides_of,
     some_of_each_side,
@@ -56,7 +57,7 @@ class Bodies:
     of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus that to the centre of its
     predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on each axis, as in `hidden_edges`.
     between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes, about the chosen one. It is not
-    in `covariance`.
+    in `covariance`. unlike: (N, 7, 7) what is added to `covariance` because no thing has exactly the shape of its body.
     """
 
     values: Floats
@@ -69,6 +70,7 @@ class Bodies:
     to_centre: Floats
     hidden: Ints
     between_shapes: Floats
+    unlike: Floats
 
     @property
     def axes(self) -> Floats:
@@ -238,19 +240,19 @@ def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> 
     use = residuals_of_shapes(both, start, shape).use[:, :4]
     state = replace(now, prior=prior, fitted=(start,) * len(SHAPES), shape=shape)
     again = _finished(both, sides_of(both, start[:, :3], use), state, found.between_shapes[mine])
-    values, covariance, weight, to_centre = (
-        getattr(found, name).copy() for name in ("values", "covariance", "weight", "to_centre")
-    )
-    values[mine], covariance[mine] = again.values, again.covariance
-    weight[at], to_centre[at] = again.weight[: len(at)], again.to_centre[: len(at)]
-    return replace(found, values=values, covariance=covariance, weight=weight, to_centre=to_centre)
+    new = {name: getattr(found, name).copy() for name in ("values", "covariance", "unlike", "weight", "to_centre")}
+    for name in ("values", "covariance", "unlike"):
+        new[name][mine] = getattr(again, name)
+    for name in ("weight", "to_centre"):
+        new[name][at] = getattr(again, name)[: len(at)]
+    return replace(found, **new)
 
 
 def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bodies:
     """Return the bodies of the chosen shapes from all boxes. between: (N, 6, 6), see `Bodies.between_shapes`."""
     weights = weights_of(edges, sides, now.factors, now.share)
     count, boxes = len(now.shape), len(edges)
-    values, covariance = np.zeros((count, 7)), np.zeros((count, 7, 7))
+    values, (covariance, unlike) = np.zeros((count, 7)), np.zeros((2, count, 7, 7))
     shift, weight = np.zeros((boxes, 2)), np.zeros(boxes)
     for shape in np.unique(now.shape).tolist():
         mine = np.flatnonzero(now.shape == shape)
@@ -266,11 +268,13 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bo
         if tight is not loose:  # A sphere may really be an ellipsoid, so its covariance is that of an ellipsoid.
             best = fit(own, best.values, loose, some, kind, most=0)
         values[mine] = best.values
-        covariance[mine] = covariance_of(own, best, sides_of(own, best.values[:, :3]), now.factors, now.share)
+        own_sides = sides_of(own, best.values[:, :3])
+        covariance[mine], unlike[mine] = covariance_with_unlike(own, best, own_sides, now.factors, now.share)
         shift[at], weight[at] = shifts_of(own, best.found), (best.weight * some.variance)[:, :4].max(axis=1)
     to_centre = np.where((now.shape != _POINT)[edges.body, None], directions_to_centres(edges, values[:, :3], shift), 0.0)
     bound = edges.bound.reshape(boxes, 2, 2).sum(axis=1)
-    return Bodies(values, covariance, now.shape, now.evidence, weight, now.share, now.factors, to_centre, bound, between)
+    noise = now.share, now.factors
+    return Bodies(values, covariance, now.shape, now.evidence, weight, *noise, to_centre, bound, between, unlike)
 
 
 def _axes_of_shapes(now: _State) -> Floats:
