@@ -104,7 +104,7 @@ def measured(unit: Floats, name: str, options: argparse.Namespace, arc: float) -
     points, side = rng.normal(0, 0.05, (many, 3)), np.full(len(boxes), 277.0)
     found = solve_bodies(lambda _: edges, points, half[:, [0, 2]], (name,) * many, side=side, share=0.1, bent=False)
     repeated = np.array([repeated_error(found.share[0], axes) for axes in found.axes[:, 3:6]])
-    covariance = found.centre_covariance + repeated[:, None, None] ** 2 * np.eye(3)
+    covariance = found.centre_covariance + found.unlike[:, :3, :3] + repeated[:, None, None] ** 2 * np.eye(3)
     off = found.axes[:, :3]
     return off, np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off)
 

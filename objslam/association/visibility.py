@@ -142,12 +142,13 @@ def detection_history(
     own, furthest = (np.nan_to_num(quantile) for quantile in grouped_quantiles(distance[held], index, count, (0.5, 1.0)))
     near, far = np.minimum(own, near[label]), np.maximum(own, far[label])
     reach = np.maximum(furthest, far)
+    boxed = [None if one else extent for one in _whole_boxes(obs, view)]
     pairs = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)))]
     for number, camera in enumerate(view.cameras):
         frames = np.flatnonzero(view.camera == number)
         step = max(1, _PAIRS_AT_ONCE // max(count, 1))
         for begin in range(0, len(frames), step):
-            pairs.append(_in_image(position, extent, reach, camera, frames[begin : begin + step], view))
+            pairs.append(_in_image(position, boxed[number], reach, camera, frames[begin : begin + step], view))
     obj, frame, away, pixel = (np.concatenate(column) for column in zip(*pairs, strict=True))
     inside = np.bincount(obj, minlength=count)
     usual = (away >= near[obj]) & (away <= far[obj])
@@ -192,12 +193,13 @@ def count_looks(
     """
     near, far = (np.array([getattr(one, name) for one in known]) for name in ("near", "far"))
     found = np.zeros(len(position), dtype=np.int64)
+    boxed = [None if one else np.nan_to_num(extent) for one in _whole_boxes(obs, view)]
     for number, camera in enumerate(view.cameras):
         frames = np.flatnonzero(view.camera == number)
         step = max(1, _PAIRS_AT_ONCE // max(len(position), 1))
         for begin in range(0, len(frames), step):
             some = frames[begin : begin + step]
-            obj, frame, away, pixel = _in_image(position, np.nan_to_num(extent), far, camera, some, view)
+            obj, frame, away, pixel = _in_image(position, boxed[number], far, camera, some, view)
             usual = away >= near[obj]
             usual &= _from_known_sides(obj, view.map_T_camera[frame, :3, 3] - position[obj], known)
             obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
@@ -251,10 +253,13 @@ def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, ca
 
 
 def _in_image(
-    position: Floats, extent: Floats, reach: Floats, camera: Camera, frames: Ints, view: CameraFrames
+    position: Floats, extent: Floats | None, reach: Floats, camera: Camera, frames: Ints, view: CameraFrames
 ) -> tuple[Ints, Ints, Floats, Floats]:
-    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box inside an image. reach: (N,) m,
-    the distance up to which each object counts."""
+    """Return object (V,), frame (V,), distance (V,) m and pixel (V, 2) of each object box inside an image.
+
+    extent: (N, 2) m, None if only the centre of a box must be inside. reach: (N,) m, the distance up to which each object
+    counts.
+    """
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, (poses[:, :3, 3] - centre).T, poses[:, :3, 2].T
@@ -267,11 +272,24 @@ def _in_image(
     apart = position.take(n, axis=0) - poses[:, :3, 3].take(f, axis=0)
     local = np.einsum("vji,vj->vi", poses[:, :3, :3].take(f, axis=0), apart)
     half = np.zeros((len(n), 2))
-    if view.margin >= 0:
+    if view.margin >= 0 and extent is not None:
         box = extent[n] * np.diag(camera.matrix)[:2] / depths(camera, local)[:, None]
         half = box / 2 + np.maximum(view.margin, view.margin_share * box)
     inside, pixel = in_view(camera, local, half, camera.size - 1 - half)
     return n[inside], frames[f[inside]], np.linalg.norm(local[inside], axis=1), pixel
+
+
+def _whole_boxes(obs: Observations, view: CameraFrames) -> Bools:
+    """Return of which cameras (C,) the boxes go around whole objects, also where the image's edge cuts an object off.
+
+    Such boxes reach beyond the image. A detector that draws them, such as one of the poses of objects, should find an object
+    wherever its centre is in the image.
+    """
+    sizes = np.array([camera.size for camera in view.cameras]).reshape(-1, 2)
+    camera, low, high = view.camera[obs.frame], obs.box[:, :2], obs.box[:, 2:]
+    margin = np.maximum(view.margin, view.margin_share * (high - low))
+    beyond = ((low < -margin) | (high > sizes[camera] - 1 + margin)).any(axis=1)
+    return np.bincount(camera[beyond], minlength=len(sizes)) > 0
 
 
 def _mean_size(extent: Floats) -> Floats:

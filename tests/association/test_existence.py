@@ -94,6 +94,19 @@ def camera_pixels(scene, j):
     return 460 * point[:, 0] / point[:, 2] + 319.5
 
 
+def test_a_detector_of_whole_objects_misses_a_thing_that_the_edge_of_the_image_cuts_off():
+    """A false thing of wrong boxes, each larger than the image, was never missed, so a few such boxes were a proof of it."""
+    scene = watch(np.array([[2.0, 0.0, 0.3], [2.0, 0.4, 0.3]]), straight(), missed=0.4, seed=2)
+    box = scene.rays.box.copy()
+    box[scene.whose == 1] += [-400, -400, 400, 400]
+    of_image = state_of(scene, replace(scene.rays, box=np.clip(box, 0, [639, 479, 639, 479]))).history
+    whole = state_of(scene, replace(scene.rays, box=box)).history
+    inside = [int((np.abs(camera_pixels(scene, j) - 319.5) < 320).sum()) for j in range(2)]
+    assert of_image.expected[1] <= of_image.seen[1] + 6  # Hardly an image holds all of it, so misses are not known.
+    assert np.abs(whole.expected - inside).max() <= 6
+    assert abs((whole.seen / whole.expected).mean() - 0.6) < 0.1
+
+
 def test_what_a_closer_box_hides_is_not_missed():
     points = np.array([[3.0, 0.0, 0.3], [1.2, 0.0, 0.3], [2.9, 0.5, 0.3]])
     scene = watch(points, straight(), label=np.array([0, 1, 0]), names=("cup", "screen"))

@@ -6,13 +6,16 @@ from outlines import from_axes
 from triangulation.true_boxes import (
     CAMERAS,
     box_around,
+    boxes_of_outlines,
     corner_box,
     corners_of,
     edges_of,
+    inside,
     looking_at,
     outline_box,
     random_bodies,
     ring_of,
+    solved,
     views_of,
 )
 
@@ -26,7 +29,6 @@ from objslam.triangulation.bodies.prior import weak_prior
 from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals, touched_points
 from objslam.triangulation.bodies.shapes import CUBOID, CYLINDER, ELLIPSOID
 from objslam.triangulation.bodies.shared import covariance_of, sides_of
-from objslam.triangulation.bodies.solve import solve_bodies
 
 
 def plain(count):
@@ -148,21 +150,6 @@ def test_the_covariance_is_that_of_repeated_boxes():
     assert np.abs(np.sqrt(np.linalg.eigvalsh(spread)) - 1).max() < 0.1
 
 
-def solved(camera, boxes, poses, points, half):
-    """The bodies of as many objects as points, whose boxes come in their order."""
-    body = np.repeat(np.arange(len(points)), len(boxes) // len(points))
-    side = np.full(len(boxes), 277.0)
-    return solve_bodies(
-        lambda _: edges_of(camera, boxes, poses, body, sigma=2.0),
-        points,
-        half,
-        ("thing",) * len(points),
-        side=side,
-        share=0.05,
-        bent=False,
-    )
-
-
 def test_the_error_that_boxes_of_one_side_share_is_found():
     """Shifts of 8 % of half the size for each side, and none of the sizes. Half of the bodies have few sides."""
     rng, camera, share, each = np.random.default_rng(7), CAMERAS["pinhole"], 0.08, 30
@@ -243,21 +230,6 @@ def test_from_one_side_the_depth_stays_near_its_prior_and_says_so():
     assert sigma[3 + depth] > 0.15 * half[depth]
 
 
-def boxes_of_outlines(camera, outlines, rng, each, arc):
-    """Boxes with a noise of 2 px of upright things on the floor, and the poses, as a robot sees them from a height of 0.7 m.
-
-    outlines: points (P, 3) of each thing around its centre.
-    """
-    boxes, poses = [], []
-    for outline in outlines:
-        centre, start = np.array([0.0, 0.0, -outline[:, 2].min()]), rng.uniform(0, 6)
-        for azimuth in start + np.linspace(0, arc, each):
-            away = rng.uniform(2, 4)
-            poses.append(looking_at(np.array([away * np.cos(azimuth), away * np.sin(azimuth), 0.7]), centre))
-            boxes.append(box_around(camera, centre + outline, poses[-1]))
-    return np.array(boxes) + rng.normal(0, 2, (len(boxes), 4)), np.array(poses)
-
-
 def test_cuboids_and_cylinders_are_told_apart():
     rng, camera, many, each = np.random.default_rng(8), CAMERAS["pinhole"], 20, 24
     half = rng.uniform(0.15, 0.3, (many, 3))
@@ -282,11 +254,6 @@ def turned_things(camera, bottom, top, arc):
     true = np.column_stack([np.zeros((many, 2)), half[:, 2]])
     found = solved(camera, boxes, poses, true + rng.normal(0, 0.05, true.shape), np.full((many, 2), 0.25))
     return found, found.axes[:, :3] - true
-
-
-def inside(off, covariance):
-    """The share of errors (N, 3) inside the 95 % ellipsoids of covariances (N, 3, 3)."""
-    return np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off) < 7.81)
 
 
 def test_no_shape_is_surer_than_the_choice_between_shapes():

@@ -5,6 +5,7 @@ from outlines import from_axes, looking_at, outline_box
 
 from objslam.core.camera import Camera, project
 from objslam.triangulation.bodies.edges import BoxEdges, tangent_planes
+from objslam.triangulation.bodies.solve import solve_bodies
 
 CAMERAS = {
     "pinhole": Camera("c", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])),
@@ -96,3 +97,38 @@ def edges_of(camera, boxes, poses, body, sigma=1.0, contact=None):
         flat + 1,
         flat,
     )
+
+
+def boxes_of_outlines(camera, outlines, rng, each, arc):
+    """Boxes with a noise of 2 px of upright things on the floor, and the poses, as a robot sees them from a height of 0.7 m.
+
+    outlines: points (P, 3) of each thing around its centre.
+    """
+    boxes, poses = [], []
+    for outline in outlines:
+        centre, start = np.array([0.0, 0.0, -outline[:, 2].min()]), rng.uniform(0, 6)
+        for azimuth in start + np.linspace(0, arc, each):
+            away = rng.uniform(2, 4)
+            poses.append(looking_at(np.array([away * np.cos(azimuth), away * np.sin(azimuth), 0.7]), centre))
+            boxes.append(box_around(camera, centre + outline, poses[-1]))
+    return np.array(boxes) + rng.normal(0, 2, (len(boxes), 4)), np.array(poses)
+
+
+def solved(camera, boxes, poses, points, half):
+    """The bodies of as many objects as points, whose boxes come in their order."""
+    body = np.repeat(np.arange(len(points)), len(boxes) // len(points))
+    side = np.full(len(boxes), 277.0)
+    return solve_bodies(
+        lambda _: edges_of(camera, boxes, poses, body, sigma=2.0),
+        points,
+        half,
+        ("thing",) * len(points),
+        side=side,
+        share=0.05,
+        bent=False,
+    )
+
+
+def inside(off, covariance):
+    """The share of errors (N, 3) inside the 95 % ellipsoids of covariances (N, 3, 3)."""
+    return np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariance), off) < 7.81)

@@ -42,9 +42,9 @@ shape of its body. The centres of simulated pots, cones, seats, monitors and peo
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
     """Return a solution with a body for each object whose boxes show one. The points and their covariances do not change.
 
-    The covariance of a centre contains the noise of the boxes and the errors that they share. The covariance of the point
-    may be larger than the noise of its rays explains, because solved poses have noise, or because errors of given poses
-    last. This excess is added too.
+    The covariance of a centre contains the noise of the boxes and the errors that they share, also those of a thing that has
+    not exactly the shape of its body. The covariance of the point may be larger than the noise of its rays explains, because
+    solved poses have noise, or because errors of given poses last. This excess is added too.
     """
     if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution
@@ -194,7 +194,7 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
     """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the centre is the
     position."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
-    covariance = found.covariance[at].copy()
+    covariance = found.covariance[at] + found.unlike[at]
     covariance[:3, :3] += repeated_error(found.share[0], half) ** 2 * np.eye(3)
     covariance[[3, 6], [3, 6]] += found.share[1] ** 2
     to_size = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # from half axes to sizes

@@ -15,14 +15,16 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import lift_se2, make_pose, quaternion
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.errors import printable
-from objslam.output.plot.style import captions, ellipsoid, label_colours
+from objslam.output.plot.style import DrawnShape, captions, drawn_shape, ellipsoid, label_colours
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-_SPHERE, _TEXT, _ADD, _DELETE_ALL = 2, 9, 0, 3  # Types and actions of visualization_msgs/Marker.
+_TEXT, _ADD, _DELETE_ALL = 9, 0, 3  # A type and actions of visualization_msgs/Marker.
+_TYPES: dict[DrawnShape, int] = {"cuboid": 1, "ellipsoid": 2, "cylinder": 3}
+"""The type of marker of each shape: CUBE, SPHERE and CYLINDER. Their three sizes may differ."""
 LAST_STAMP = 2.0**31  # builtin_interfaces/Time overflows at this stamp, s.
-_MIN_SIZE = 0.05  # The least diameter of a marker, m. A smaller one would be invisible at the scale of a room.
+_MIN_SIZE = 0.05  # The least diameter, m, of an object without a body. A smaller one would be invisible in a room.
 _TEXT_SIZE = 0.15  # The height of a label's text, m.
 
 
@@ -90,9 +92,11 @@ class MapMessages:
         return self.make("vision_msgs/Detection3D", self.header(stamp), results, box, str(o.id))
 
     def markers(self, stamp: float, objects: ObjectMap, clear_first: bool = False) -> Any:
-        """Make a visualization_msgs/MarkerArray: a ball, a 2-sigma ellipsoid and a caption for each resolved object.
+        """Make a visualization_msgs/MarkerArray: a shape, a 2-sigma ellipsoid and a caption for each resolved object.
 
-        In the map of a site, the caption also says the state of the object.
+        The shape is that in which pictures show the body (`drawn_shape`), with its size and yaw. An object without a body is
+        an ellipsoid of the size of its boxes, at least `_MIN_SIZE`. In the map of a site, the caption also says the state of
+        the object.
 
         Args:
             clear_first: whether the first marker deletes all earlier markers.
@@ -106,10 +110,14 @@ class MapMessages:
             name = name if o.life is None else f"{name}, {o.life.state}"
             colour = colours[o.label]
             turn, size = _upright(o)
-            size = np.maximum(size, _MIN_SIZE)
+            shape: DrawnShape = "ellipsoid"
+            if o.body is None:
+                size = np.maximum(size, _MIN_SIZE)
+            else:
+                shape = drawn_shape(o.body)
             at = make_pose(turn, o.position)
             above = make_pose(np.eye(3), o.position + np.array([0.0, 0.0, size[2] / 2 + _TEXT_SIZE]))
-            made.append(self._marker(stamp, "objects", number, at, size, (*colour, 0.9)))
+            made.append(self._marker(stamp, "objects", number, at, size, (*colour, 0.9), shape=shape))
             made.append(self._marker(stamp, "labels", number, above, np.full(3, _TEXT_SIZE), (*colour, 1.0), name))
             axes = ellipsoid(o)
             if axes is not None:
@@ -126,6 +134,7 @@ class MapMessages:
         size: Floats,
         colour: tuple[float, ...],
         text: str = "",
+        shape: DrawnShape = "ellipsoid",
     ) -> Any:
         make, header, nothing = self.make, self.header(stamp), np.zeros(0, dtype=np.uint8)
         marker: Any = self.store.types["visualization_msgs/msg/Marker"]
@@ -134,7 +143,7 @@ class MapMessages:
             header=header,
             ns=namespace,
             id=number,
-            type=_TEXT if namespace == "labels" else _SPHERE,
+            type=_TEXT if namespace == "labels" else _TYPES[shape],
             action=_ADD,
             pose=self.pose(pose),
             scale=self._vector("Vector3", np.maximum(size, 1e-3)),

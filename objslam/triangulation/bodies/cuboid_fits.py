@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
@@ -11,6 +13,38 @@ from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Fit, Prior, Weights,
 from objslam.triangulation.bodies.prior import cuboid_prior
 from objslam.triangulation.bodies.residuals import Residuals
 from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
+
+_TURNS = np.radians([0.0, 22.5, 45.0, 67.5])
+"""The headings (rad) at which square cuboids are fitted, from that of the best one so far. A square repeats after a quarter
+turn. In simulations of things seen over 30 degrees, four headings always found the best cuboid, and two missed it for one
+thing in 20. More headings are slower."""
+_ONE_SIDE = np.radians(35.0)
+"""A thing was seen from one side if no view is farther (rad) from the mean view. In simulations, cuboids seen over 60
+degrees and more had one clear heading. A larger angle searches at more things."""
+_RIVAL = 15.0
+"""The largest ln of the evidence by which a cuboid may be less probable than another shape, if its other headings are tried.
+Another heading has raised it by up to 11. A larger number searches at more things."""
+_SAME = 0.005
+"""Two cuboids are one if no centre and no half axis differs by more than this (m). A larger length merges more of them."""
+
+
+@dataclass(frozen=True)
+class OtherCuboids:
+    """M other cuboids of each of N bodies. values: (M, N, 7). evidence: (M, N) the logarithm of their evidence, -inf for a
+    cuboid that is missing or the same as another one."""
+
+    values: Floats
+    evidence: Floats
+
+    @property
+    def axes(self) -> Floats:
+        """(M, N, 6) their centres and half axes, m."""
+        axes = [np.column_stack([one[:, :3], CUBOID.half_axes(one)]) for one in self.values]
+        return np.stack(axes) if axes else np.zeros((*self.evidence.shape, 6))
+
+    @classmethod
+    def none(cls, count: int) -> OtherCuboids:
+        return cls(np.zeros((0, count, 7)), np.zeros((0, count)))
 
 
 def cuboid_starts(rounds: Floats) -> tuple[Floats, Floats]:
@@ -44,6 +78,66 @@ def best_cuboids(
         best = mixed_fit(turned, edges.body, found, best[0]), Prior(mean, information), np.maximum(evidence, best[2])
     assert best is not None
     return best[0], best[1]
+
+
+def seen_from_one_side(edges: BoxEdges, centre: Floats) -> Bools:
+    """Return which bodies (N,) with centres (N, 3), m, were seen from one side only, as seen from above."""
+    towards = (centre[edges.body] - edges.origin)[:, :2]
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    mean = np.stack([np.bincount(edges.body, part, len(centre)) for part in towards.T], axis=1)
+    mean = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+    beside = (towards * mean[edges.body]).sum(axis=1) < np.cos(_ONE_SIDE)
+    return np.asarray(np.bincount(edges.body, beside, len(centre)) == 0)
+
+
+def all_headings(
+    edges: BoxEdges, found: Fit, evidence: Floats, rival: Floats, prior: Prior, weights: Weights, side: Floats
+) -> tuple[Fit, Floats, OtherCuboids]:
+    """Search for better cuboids at other headings, for things that were seen from one side.
+
+    The boxes of such a thing fit cuboids with several headings and depths. A fit ends at one of them, and it may be far less
+    probable than another.
+
+    Args:
+        found: the fits of the cuboids so far.
+        evidence: (N,) the logarithm of their evidence.
+        rival: (N,) that of the best other shape.
+        prior: the prior of ellipsoids.
+        side: (B,) as in `log_evidence`.
+
+    Returns:
+        The best cuboids, their evidence (N,), and the other cuboids.
+    """
+    which = np.flatnonzero((evidence > rival - _RIVAL) & seen_from_one_side(edges, found.values[:, :3]))
+    if not len(which):
+        return found, evidence, OtherCuboids.none(len(evidence))
+    boxes = np.flatnonzero(np.isin(edges.body, which))
+    some = replace(edges.take(boxes), body=np.searchsorted(which, edges.body[boxes]))
+    its_prior, its_side = Prior(prior.mean[which], prior.information[which]), side[boxes]
+    its_weights = Weights(weights.variance[boxes], weights.spread[boxes], weights.robust)
+    others = OtherCuboids(np.tile(found.values, (1 + len(_TURNS), 1, 1)), np.full((1 + len(_TURNS), len(evidence)), -np.inf))
+    others.evidence[0] = evidence
+    for at, turn in enumerate(_TURNS, start=1):
+        start = found.values[which].copy()
+        start[:, 4] = 0.0
+        start[:, 5] += turn
+        tried, _ = best_cuboids(some, (start,), its_prior, its_weights, its_side)
+        others.values[at, which] = tried.values
+        others.evidence[at, which] = log_evidence(some, tried, cuboid_prior(its_prior, start), its_weights, its_side)
+    chosen = others.evidence.argmax(axis=0), np.arange(len(evidence))
+    own = cuboid_prior(prior, others.values[chosen])
+    found = fit(edges, others.values[chosen], own, weights, CUBOID, most=0)
+    best_evidence = others.evidence[chosen]
+    others.evidence[_repeated(others, chosen[0])] = -np.inf
+    return found, best_evidence, others
+
+
+def _repeated(others: OtherCuboids, chosen: Ints) -> Bools:
+    """Return which cuboids (M, N) are the chosen one, or the same as the chosen one or an earlier one."""
+    axes = others.axes
+    same = np.abs(axes[:, None] - axes[None]).max(axis=3) < _SAME  # (M, M, N)
+    repeated = np.array([same[at, :at].any(axis=0) for at in range(len(axes))])
+    return repeated | same[chosen, :, np.arange(len(chosen))].T
 
 
 def mixed_fit(which: Bools, body: Ints, first: Fit, second: Fit) -> Fit:

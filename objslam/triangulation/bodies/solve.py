@@ -10,7 +10,7 @@ import numpy as np
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES
 from objslam.triangulation.bodies.choice import log_evidence, shapes_disagree, with_shares_of_shapes
-from objslam.triangulation.bodies.cuboid_fits import best_cuboids, cuboid_starts, mixed_fit
+from objslam.triangulation.bodies.cuboid_fits import OtherCuboids, all_headings, best_cuboids, cuboid_starts, mixed_fit
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Fit, Prior, Weights, fit
 from objslam.triangulation.bodies.hidden_edges import hidden_edges, with_hidden
@@ -20,6 +20,7 @@ from objslam.triangulation.bodies.shapes import CYLINDER, ELLIPSOID, KINDS, rows
 from objslam.triangulation.bodies.shared import (
     Sides,
     covariance_of,
+    covariance_with_unlike,
     share_of,
     sides_of,
     some_of_each_side,
@@ -56,7 +57,7 @@ class Bodies:
     of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus that to the centre of its
     predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on each axis, as in `hidden_edges`.
     between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes, about the chosen one. It is not
-    in `covariance`.
+    in `covariance`. unlike: (N, 7, 7) what is added to `covariance` because no thing has exactly the shape of its body.
     """
 
     values: Floats
@@ -69,6 +70,7 @@ class Bodies:
     to_centre: Floats
     hidden: Ints
     between_shapes: Floats
+    unlike: Floats
 
     @property
     def axes(self) -> Floats:
@@ -99,7 +101,7 @@ class _State:
 
     fitted: for each shape, its bodies (N, 7), which are the starts of the next fit. evidence, shape: see `Bodies`. best: the
     best of the solid shapes, None before the first round. solid: (N,) the shape of `best`. covariance: (N, 7, 7) of `best`.
-    sized: (N,) whether the size is known, so that no sphere is chosen.
+    sized: (N,) whether the size is known, so that no sphere is chosen. others: less probable cuboids of the last round.
     """
 
     factors: Floats
@@ -112,6 +114,7 @@ class _State:
     best: Fit | None
     covariance: Floats
     sized: Bools
+    others: OtherCuboids
 
 
 def solve_bodies(
@@ -146,11 +149,11 @@ def solve_bodies(
     starts = dot_prior(weak).mean, sphere_prior(weak).mean, *[weak.mean] * len(_SOLID)
     nothing = np.zeros((len(SHAPES), count)), none, none, None, np.zeros((count, 7, 7))
     sized = np.array([name in (sizes or {}) for name in names])
-    now = _State(np.ones(2), np.full(2, share), weak, starts, *nothing, sized)
+    now = _State(np.ones(2), np.full(2, share), weak, starts, *nothing, sized, OtherCuboids.none(count))
     hidden = np.zeros((len(edges), 4), dtype=bool)
     for number in range(_ROUNDS + 1):
         some = with_hidden(edges, hidden).take(few)
-        now = _round(some, sides_of(some, points, _counted(some, now)), now, side[few], label)
+        now = _round(some, sides_of(some, points, _counted(some, now)), now, side[few], label, turn=number == _ROUNDS)
         best = now.best
         assert best is not None
         # An object that fits a point best has no size to learn from, such as a mark that is always drawn at one size.
@@ -173,7 +176,8 @@ def solve_bodies(
             now = replace(now, factors=factors, share=found)
         if bent:
             edges = measure(touched_points(edges, _of_shapes(now.fitted, solid), solid))
-    between = shapes_disagree(now.evidence, _axes_of_shapes(now), now.shape) + doubt.between
+    every = np.concatenate([now.evidence, now.others.evidence]), np.concatenate([_axes_of_shapes(now), now.others.axes])
+    between = shapes_disagree(*every, now.shape) + doubt.between
     edges = with_hidden(edges, hidden)
     bodies = _finished(edges, sides_of(edges, points, _counted(edges, now)), now, between)
     others = None if more is None else more(bodies)
@@ -187,8 +191,9 @@ def _counted(edges: BoxEdges, now: _State) -> Floats | None:
     return residuals_of_shapes(edges, now.best.values, now.solid).use[:, :4]
 
 
-def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints) -> _State:
-    """Return the state with the best body of each shape, and for each object the shape with the most evidence."""
+def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints, *, turn: bool) -> _State:
+    """Return the state with the best body of each shape, and for each object the shape with the most evidence. turn: whether
+    cuboids are also tried at other headings (`all_headings`)."""
     weights, first = weights_of(edges, sides, now.factors, now.share), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
     ball_prior = sphere_prior(now.prior)
@@ -199,16 +204,16 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints
     square, square_prior = best_cuboids(edges, starts, now.prior, weights, side)
     start = rounds.values if first else now.fitted[_CYLINDER]
     tube = fit(edges, start, now.prior, weights, CYLINDER, still=ENOUGH, most=STEPS)
-    evidence = np.stack(
-        [
-            dot_evidence,
-            log_evidence(edges, ball, ball_prior, weights, side) - np.log(_RARE) - 1e9 * now.sized,
-            log_evidence(edges, rounds, now.prior, weights, side),
-            log_evidence(edges, square, square_prior, weights, side),
-            log_evidence(edges, tube, now.prior, weights, side),
-        ]
-    )
-    evidence = with_shares_of_shapes(evidence, label)
+    round_evidence = log_evidence(edges, rounds, now.prior, weights, side)
+    tube_evidence = log_evidence(edges, tube, now.prior, weights, side)
+    square_evidence, others = log_evidence(edges, square, square_prior, weights, side), now.others
+    if turn:
+        rival = np.maximum(round_evidence, tube_evidence)
+        square, square_evidence, others = all_headings(edges, square, square_evidence, rival, now.prior, weights, side)
+    ball_evidence = log_evidence(edges, ball, ball_prior, weights, side) - np.log(_RARE) - 1e9 * now.sized
+    alone = np.stack([dot_evidence, ball_evidence, round_evidence, square_evidence, tube_evidence])
+    evidence = with_shares_of_shapes(alone, label)
+    others = replace(others, evidence=others.evidence + (evidence - alone)[_CUBOID])
     solid = np.array(_SOLID)[evidence[list(_SOLID)].argmax(axis=0)]
     best = mixed_fit(solid == _CUBOID, edges.body, square, rounds)
     best = mixed_fit(solid == _CYLINDER, edges.body, tube, best)
@@ -220,6 +225,7 @@ def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints
         solid=solid,
         best=best,
         covariance=covariance_of(edges, best, sides, now.factors, now.share),
+        others=others,
     )
 
 
@@ -234,19 +240,19 @@ def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> 
     use = residuals_of_shapes(both, start, shape).use[:, :4]
     state = replace(now, prior=prior, fitted=(start,) * len(SHAPES), shape=shape)
     again = _finished(both, sides_of(both, start[:, :3], use), state, found.between_shapes[mine])
-    values, covariance, weight, to_centre = (
-        getattr(found, name).copy() for name in ("values", "covariance", "weight", "to_centre")
-    )
-    values[mine], covariance[mine] = again.values, again.covariance
-    weight[at], to_centre[at] = again.weight[: len(at)], again.to_centre[: len(at)]
-    return replace(found, values=values, covariance=covariance, weight=weight, to_centre=to_centre)
+    new = {name: getattr(found, name).copy() for name in ("values", "covariance", "unlike", "weight", "to_centre")}
+    for name in ("values", "covariance", "unlike"):
+        new[name][mine] = getattr(again, name)
+    for name in ("weight", "to_centre"):
+        new[name][at] = getattr(again, name)[: len(at)]
+    return replace(found, **new)
 
 
 def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bodies:
     """Return the bodies of the chosen shapes from all boxes. between: (N, 6, 6), see `Bodies.between_shapes`."""
     weights = weights_of(edges, sides, now.factors, now.share)
     count, boxes = len(now.shape), len(edges)
-    values, covariance = np.zeros((count, 7)), np.zeros((count, 7, 7))
+    values, (covariance, unlike) = np.zeros((count, 7)), np.zeros((2, count, 7, 7))
     shift, weight = np.zeros((boxes, 2)), np.zeros(boxes)
     for shape in np.unique(now.shape).tolist():
         mine = np.flatnonzero(now.shape == shape)
@@ -262,11 +268,13 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bo
         if tight is not loose:  # A sphere may really be an ellipsoid, so its covariance is that of an ellipsoid.
             best = fit(own, best.values, loose, some, kind, most=0)
         values[mine] = best.values
-        covariance[mine] = covariance_of(own, best, sides_of(own, best.values[:, :3]), now.factors, now.share)
+        own_sides = sides_of(own, best.values[:, :3])
+        covariance[mine], unlike[mine] = covariance_with_unlike(own, best, own_sides, now.factors, now.share)
         shift[at], weight[at] = shifts_of(own, best.found), (best.weight * some.variance)[:, :4].max(axis=1)
     to_centre = np.where((now.shape != _POINT)[edges.body, None], directions_to_centres(edges, values[:, :3], shift), 0.0)
     bound = edges.bound.reshape(boxes, 2, 2).sum(axis=1)
-    return Bodies(values, covariance, now.shape, now.evidence, weight, now.share, now.factors, to_centre, bound, between)
+    noise = now.share, now.factors
+    return Bodies(values, covariance, now.shape, now.evidence, weight, *noise, to_centre, bound, between, unlike)
 
 
 def _axes_of_shapes(now: _State) -> Floats:

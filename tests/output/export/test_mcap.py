@@ -8,13 +8,16 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 
+from objslam.core.bodies.body import Body
 from objslam.core.geometry import quaternion
+from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.types import Trajectory
 from objslam.errors import OutputError
 from objslam.io.results.read import load_map, load_trajectory
 from objslam.output.export import write_export
 from objslam.output.export.content import load_content
 from objslam.output.export.formats.mcap_file import EXPORT
+from objslam.output.export.map_messages import MapMessages
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +99,23 @@ def test_the_markers(messages, result):
         rotation = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
         # the diameters of the 2-sigma ellipsoid
         np.testing.assert_allclose(rotation @ np.diag((axes / 4) ** 2) @ rotation.T, o.covariance, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "yaw_sigma", "expected"),
+    [("ellipsoid", 0.02, "SPHERE"), ("cylinder", 0.02, "CYLINDER"), ("cuboid", 0.02, "CUBE"), ("cuboid", 0.9, "CYLINDER")],
+)
+def test_the_marker_of_a_body_has_its_shape_size_and_yaw(shape, yaw_sigma, expected):
+    size = np.array([0.8, 0.02, 0.5])  # A flat thing, such as a picture. Its marker must not be thicker.
+    body = Body(shape, size, 0.6, np.full(3, 0.01), yaw_sigma)
+    thing = MapObject(
+        3, "cabinet", np.array([1.0, 2.0, 0.25]), 1e-4 * np.eye(3), "ok", 40, 40, 50.0, 0.5, 0.0, 9.0, body=body
+    )
+    (marker,) = [m for m in MapMessages("map").markers(0.0, ObjectMap((thing,))).markers if m.ns == "objects"]
+    turn = marker.pose.orientation
+    assert marker.type == getattr(marker, expected)
+    assert [marker.scale.x, marker.scale.y, marker.scale.z] == size.tolist()
+    np.testing.assert_allclose([turn.x, turn.y, turn.z, turn.w], [0, 0, np.sin(0.3), np.cos(0.3)], atol=1e-12)
 
 
 def test_the_path_and_the_pose_over_time(messages, result):
