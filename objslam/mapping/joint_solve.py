@@ -43,10 +43,10 @@ if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _CLEAR = 0.98
-"""The share of agreeing rays below which the rounds of an explored log without ranges also begin at the poses of its odometry.
-On good odometry, an exploration can go wrong where the first association of the whole log does not. With a larger share, more
-logs take this time. Of 15 simulated robots, right maps had 0.99 and more, and maps with doubles at most 0.975. Ranges make the
-exploration right without this, and double its time."""
+"""The share of agreeing rays below which the rounds of a log without ranges also begin at the poses of its odometry. On good
+odometry, an exploration can go wrong where the first association of the whole log does not. With a larger share, more logs
+take this time. Of 15 simulated robots, right maps had 0.99 and more, and maps with doubles at most 0.975. With ranges, the
+explorations were right without this, and it would double their time."""
 
 
 def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
