@@ -8,7 +8,6 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
-from objslam.core.maps.shared_covariance import root_of
 from objslam.core.noise import NoiseFactors
 from objslam.core.types import Keyframes, Rays
 
@@ -71,7 +70,8 @@ class Calibration:
     @property
     def root(self) -> Floats:
         """(P, P) a matrix whose product with its own transpose is the covariance."""
-        return root_of(self.covariance)
+        size, axes = np.linalg.eigh(self.covariance)
+        return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
     @property
     def expected(self) -> Floats:
