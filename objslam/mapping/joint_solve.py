@@ -21,7 +21,7 @@ from objslam.mapping.doubted_labels import (
     has_several,
     needs_noisy_boxes,
 )
-from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
+from objslam.mapping.exploration.errors_of_tracks import along, with_errors_of_tracks
 from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
 from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
 from objslam.mapping.fixed.camera_calibration import associate_at_poses
@@ -43,10 +43,11 @@ if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
 
 _CLEAR = 0.98
-"""The share of agreeing rays below which the rounds of a log without ranges also begin at the poses of its odometry. On good
-odometry, an exploration can go wrong where the first association of the whole log does not. With a larger share, more logs
-take this time. Of 15 simulated robots, right maps had 0.99 and more, and maps with doubles at most 0.975. With ranges, the
-explorations were right without this, and it would double their time."""
+"""The least share of agreeing rays of a clear map from bearings alone. With a larger share, more logs are tried from other
+starts, which takes time. Of 15 simulated robots, right maps had 0.99 and more, and most maps with doubles at most 0.975."""
+_NOISIER = 1.5
+"""The largest factor on the noise of rays of a clear map. Rays that are given to wrong objects make it large: 12 in a
+simulated map with doubles. With a smaller factor, more logs are tried from other starts."""
 
 
 def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
@@ -95,7 +96,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         if doubtful or has_lasting_errors(state):
             state = without_phantoms(_anew(state.split()))
     else:
-        begin = with_errors_of_tracks(state)
+        begin, path = with_errors_of_tracks(state)
         start, sure = explored(begin)
         first = _from_start(*solved_if_sure(begin, start, sure))
         state = _improved(first, JointState.relocalized)
@@ -105,8 +106,10 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
             if not finds_same_objects(state, other.association):
                 attempt = _from_start(*solved_if_sure(noisier, other, sure))
                 state = state.better(_improved(attempt, JointState.relocalized))
-        if not np.isfinite(state.rays.range).any() and state.agree.mean() < _CLEAR:
-            attempt = _from_start(begin.attempt(), None)
+        for other_start in (lambda: None, lambda: explored(along(begin, path))[0]):  # The first one takes less time.
+            if not _unclear(state):
+                break
+            attempt = _from_start(begin.attempt(), other_start())
             state = state.better(_improved(attempt, JointState.relocalized))
         state = _improved(state, JointState.split)
     assert state.association is not None
@@ -116,6 +119,17 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
     return _with_few_rays(state)
+
+
+def _unclear(state: JointState) -> bool:
+    """Return whether a map from bearings alone may be wrong, so that other starts are worth their time.
+
+    Explorations go wrong by chance, each in another place. With ranges, they were right without another start.
+    """
+    if np.isfinite(state.rays.range).any():
+        return False
+    noise = 1.0 if state.errors is None else state.errors.noise.rays
+    return bool(state.agree.mean() < _CLEAR or noise > _NOISIER)
 
 
 def _with_few_rays(state: JointState) -> JointState:

@@ -27,7 +27,8 @@ def begin(log, *overrides):
 
 
 def found(state):
-    state = with_errors_of_tracks(state)
+    state, path = with_errors_of_tracks(state)
+    assert path.shape == state.keyframes.map_T_base.shape
     assert state.estimate is None  # The tracks are no map.
     assert len(state.keyframes) == len(state.errors.keyframes)
     return dict(zip(state.errors.names, state.theta.tolist(), strict=True))
@@ -69,14 +70,14 @@ def test_a_log_without_tracks_keeps_what_is_expected():
     every = np.flatnonzero(detections.frame % 7 == 0)  # More than a second lies between the others.
     camera = replace(log.cameras[0], detections=detections.take(every))
     state = begin(replace(log, cameras=(camera,)))
-    assert with_errors_of_tracks(state) is state
+    assert with_errors_of_tracks(state)[0] is state
 
 
 def test_turns_that_are_held_stay():
     log = add_shared_errors(drive(), {TURN_SCALE: 0.08})
     assert TURN_SCALE not in found(begin(log, "calibration.turn_scale=0"))
     state = begin(log, "calibration.use=false")
-    assert with_errors_of_tracks(state) is state
+    assert with_errors_of_tracks(state)[0] is state
 
 
 def test_a_gyroscope_with_a_bias_is_mapped_without_names():

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.core.geometry import inverse
+from objslam.core.trajectory import correct_poses
 from objslam.errors import SolveError
 from objslam.frontend.tracks import associate_tracks
 
@@ -28,8 +30,11 @@ _BLOCK = 50
 ends where its block ends. With a larger number, fewer tracks are cut, and fewer parts of the drive are heard."""
 
 
-def with_errors_of_tracks(state: JointState) -> JointState:
+def with_errors_of_tracks(state: JointState) -> tuple[JointState, Floats]:
     """Return the state that begins at the shared errors which the tracks of boxes show.
+
+    Also return the poses (K, 4, 4) map_T_base on the path that the tracks correct. Wheels that slip turn the robot within a
+    track, so the track shows it.
 
     A track is a chain of boxes in images that follow each other (`frontend.tracks`). Nobody needs to know which tracks show
     the same thing: at the right clocks, turns and rotations of cameras, the rays of each track meet in one point. So the
@@ -40,7 +45,7 @@ def with_errors_of_tracks(state: JointState) -> JointState:
     much, the rays of one minute meet nowhere.
     """
     if state.errors is None or not state.errors.names or state.keyframes.odom_T_base is None:
-        return state
+        return state, state.keyframes.map_T_base
     tracked = _excerpt(state)
     for _ in range(_ROUNDS):
         association = associate_tracks(tracked.keyframes, tracked.rays)
@@ -50,10 +55,19 @@ def with_errors_of_tracks(state: JointState) -> JointState:
             tracked = tracked.solve("association", association)
         except SolveError:  # No track tells anything.
             break
-    if tracked.theta is None:
-        return state
+    if tracked.estimate is None or tracked.theta is None:
+        return state, state.keyframes.map_T_base
     keyframes, rays, _ = state.errors.at(tracked.theta)
-    return replace(state, theta=tracked.theta, keyframes=keyframes, rays=rays)
+    at, solved = tracked.keyframes, tracked.estimate.map_T_base
+    path = correct_poses(keyframes.stamps, keyframes.map_T_base, at.stamps, at.map_T_base, solved)
+    return replace(state, theta=tracked.theta, keyframes=keyframes, rays=rays), path
+
+
+def along(state: JointState, path: Floats) -> JointState:
+    """Return the state whose odometry is a path (K, 4, 4), for an exploration only: a solve would count the tracks twice."""
+    assert state.keyframes.odom_T_base is not None
+    odom_T_base = state.keyframes.odom_T_base[0] @ inverse(path[0]) @ path
+    return replace(state, keyframes=replace(state.keyframes, map_T_base=path, odom_T_base=odom_T_base))
 
 
 def _excerpt(state: JointState) -> JointState:
