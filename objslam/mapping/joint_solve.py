@@ -109,8 +109,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         for other_start in (lambda: None, lambda: explored(along(begin, path))[0]):  # The first one takes less time.
             if not _unclear(state):
                 break
-            attempt = _from_start(begin.attempt(), other_start())
-            state = state.better(_improved(attempt, JointState.relocalized))
+            state = _or_from(begin, other_start, state)
         state = _improved(state, JointState.split)
     assert state.association is not None
     if state.unsettled:
@@ -119,6 +118,18 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
     return _with_few_rays(state)
+
+
+def _or_from(begin: JointState, start: Callable[[], InitialEstimate | None], state: JointState) -> JointState:
+    """Return the state, or one whose rounds begin at another start, if this explains the log better.
+
+    begin: before the first association. start: finds the start. A start from which nothing can be solved changes nothing.
+    """
+    try:
+        attempt = _improved(_from_start(begin.attempt(), start()), JointState.relocalized)
+    except SolveError:  # The map of the state is there, whatever is wrong with the other start.
+        return state
+    return state.better(attempt)
 
 
 def _unclear(state: JointState) -> bool:

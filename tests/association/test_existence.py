@@ -107,6 +107,17 @@ def test_a_detector_of_whole_objects_misses_a_thing_that_the_edge_of_the_image_c
     assert abs((whole.seen / whole.expected).mean() - 0.6) < 0.1
 
 
+def test_a_few_wrong_boxes_beyond_the_image_do_not_change_what_counts_as_missed():
+    scene = watch(np.array([[2.0, 0.0, 0.3], [2.0, 0.4, 0.3]]), straight(), missed=0.4, seed=2)
+    box = scene.rays.box.copy()
+    box[scene.whose == 1] += [-400, -400, 400, 400]
+    cut = np.clip(box, 0, [639, 479, 639, 479])
+    few = cut.copy()
+    few[np.flatnonzero(scene.whose == 1)[:2]] = box[np.flatnonzero(scene.whose == 1)[:2]]
+    history = state_of(scene, replace(scene.rays, box=few)).history
+    assert history.expected[1] <= history.seen[1] + 6  # If only centres had to be in the image, 29 more would be expected.
+
+
 def test_what_a_closer_box_hides_is_not_missed():
     points = np.array([[3.0, 0.0, 0.3], [1.2, 0.0, 0.3], [2.9, 0.5, 0.3]])
     scene = watch(points, straight(), label=np.array([0, 1, 0]), names=("cup", "screen"))

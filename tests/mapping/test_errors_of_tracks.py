@@ -11,10 +11,12 @@ from turning_drive import drive, errors_of
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
 from objslam.mapping.joint_alternation import JointState
+from objslam.mapping.joint_solve import _or_from
 
 TURN_SCALE, TURN_BIAS, CLOCK = "odometry.turn_scale", "odometry.turn_bias", "front.clock"
 
@@ -87,3 +89,11 @@ def test_a_gyroscope_with_a_bias_is_mapped_without_names():
     compared = evaluate(result.map, log.truth, align="se2", radius=0.5).to_dict()
     assert tuple(compared[name] for name in ("matched", "false", "missed")) == (12, 0, 0)
     assert result.summary["assessment"]["level"] == "good"
+
+
+def test_a_start_from_which_nothing_is_solved_loses_no_map():
+    def nowhere():
+        raise SolveError("no object has enough rays")
+
+    state = begin(drive(1))
+    assert _or_from(state, nowhere, state) is state

@@ -20,8 +20,8 @@ _ROUNDS = 2
 """The number of times that tracks are found and solved. In the second round, the odometry expects each box at the place that
 the first round corrected. More rounds change the errors by less than their sigmas."""
 _APART = 0.15
-"""The least time (s) between two images that are solved. A track needs no more images to be linked, and more of them tell
-little more. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
+"""In each span of this time (s), one image of each camera is solved. A track needs no more images to be linked, and more of
+them tell little more. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
 _MOST = 3000
 """About the largest number of rays that are solved. The errors of more rays would be known better than an exploration needs,
 and would take longer."""
