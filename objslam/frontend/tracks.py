@@ -11,6 +11,9 @@ thing, and the next box is not where the odometry expects it."""
 _NEAR = np.radians(6.0)
 """The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
 moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
+_IMAGES = 3
+"""The number of images before a ray in which its track may have its last ray. With 1, each missed box ends a track: of boxes
+that are missed in one of five images, tracks then have 5 rays on average. A larger number joins neighbours more often."""
 _FEWEST = 3
 """The fewest rays of a track. Two rays nearly always meet. With a larger number, fewer tracks tell anything."""
 
@@ -18,8 +21,8 @@ _FEWEST = 3
 def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
     """Return an association with an object for each track of at least three rays.
 
-    A ray continues a track of the image before if both are the nearest of their label to each other. Rays of shorter tracks
-    have no object.
+    A ray continues a track if it and the last ray of the track are the nearest of their label to each other. The images
+    before are asked one after the other, because a detector misses boxes. Rays of shorter tracks have no object.
 
     keyframes: with odometry, which tells where each ray is expected in the next image.
     """
@@ -37,34 +40,41 @@ def _tracks(keyframes: Keyframes, rays: Rays) -> Ints:
     assert keyframes.odom_T_base is not None
     odom_R_camera = (keyframes.odom_T_base @ keyframes.base_T_camera)[:, :3, :3]
     direction = np.einsum("rij,rj->ri", odom_R_camera[rays.keyframe], rays.direction)
-    one, two = _neighbours(keyframes, rays)
-    cosine = np.einsum("pi,pi->p", direction[one], direction[two])
-    near = np.flatnonzero(cosine > np.cos(_NEAR))
-    one, two, cosine = one[near], two[near], cosine[near]
-    forward, backward = np.full((2, len(rays)), -1.0)
-    np.maximum.at(forward, one, cosine)
-    np.maximum.at(backward, two, cosine)
-    linked = (cosine == forward[one]) & (cosine == backward[two])
     root = np.arange(len(rays))
-    root[two[linked]] = one[linked]
+    last, first = np.ones((2, len(rays)), dtype=bool)  # Whether a ray is the last of its track so far, and the first.
+    for gap in range(1, _IMAGES + 1):
+        one, two = _neighbours(keyframes, rays, gap)
+        cosine = np.einsum("pi,pi->p", direction[one], direction[two])
+        near = np.flatnonzero((cosine > np.cos(_NEAR)) & last[one] & first[two])
+        one, two, cosine = one[near], two[near], cosine[near]
+        forward, backward = np.full((2, len(rays)), -1.0)
+        np.maximum.at(forward, one, cosine)
+        np.maximum.at(backward, two, cosine)
+        linked = (cosine == forward[one]) & (cosine == backward[two])
+        root[two[linked]] = one[linked]
+        last[one[linked]], first[two[linked]] = False, False
     while (root[root] != root).any():
         root = root[root]
     return root
 
 
-def _neighbours(keyframes: Keyframes, rays: Rays) -> tuple[Ints, Ints]:
-    """Return the pairs (P,) of rays of one label in images of one camera that follow each other."""
+def _neighbours(keyframes: Keyframes, rays: Rays, gap: int) -> tuple[Ints, Ints]:
+    """Return the pairs (P,) of rays of one label in images of one camera.
+
+    gap: 1 for images that follow each other, 2 with one image between them, and so on. Only images with a box of this label
+    count."""
     group = rays.label * (int(keyframes.camera.max(initial=0)) + 1) + keyframes.camera[rays.keyframe]
     order = np.lexsort((rays.keyframe, group))
     changes = np.flatnonzero((np.diff(group[order]) != 0) | (np.diff(rays.keyframe[order]) != 0)) + 1
     begin = np.append(0, changes)
     end = np.append(changes, len(order))
     first = order[begin]
-    apart = np.diff(keyframes.stamps[rays.keyframe[first]])
-    follow = np.flatnonzero((np.diff(group[first]) == 0) & (apart > 0) & (apart <= _LONGEST))
-    many, more = (end - begin)[follow], (end - begin)[follow + 1]
+    stamps, kind = keyframes.stamps[rays.keyframe[first]], group[first]
+    apart = stamps[gap:] - stamps[:-gap]
+    follow = np.flatnonzero((kind[gap:] == kind[:-gap]) & (apart > 0) & (apart <= _LONGEST))
+    many, more = (end - begin)[follow], (end - begin)[follow + gap]
     pair = np.repeat(np.arange(len(follow)), many * more)
     step = np.arange(len(pair)) - np.repeat(np.cumsum(many * more) - many * more, many * more)
     one = begin[follow][pair] + step // more[pair]
-    two = begin[follow + 1][pair] + step % more[pair]
+    two = begin[follow + gap][pair] + step % more[pair]
     return order[one], order[two]

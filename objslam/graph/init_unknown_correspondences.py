@@ -25,9 +25,9 @@ from objslam.core.geometry import adjoint, inverse
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
-from objslam.graph.loop_closure import Closure, Landmarks, distribute_correction, find_closure
+from objslam.graph.loop_closure import Closure, Landmarks, closed_path, covariances_at, find_closure
 from objslam.graph.optimizers import build_graph, levenberg_marquardt
-from objslam.graph.robust_cost import FLOOR, ray_information, truncated_cost
+from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import add_values, make_values, read_points, read_poses
 
 HORIZON = 0.1
@@ -112,7 +112,7 @@ def initialize_unknown(
             values, solved = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4).values, (end, len(known))
             map_T_camera[:end] = read_poses(values)
             known.position = read_points(values)
-            known.covariance = _covariances(rays, owner, known.position, map_T_camera)
+            known.covariance = covariances_at(rays, owner, known.position, map_T_camera)
         if (held := int((owner >= 0).sum())) >= 2 * taught:
             ratio, taught = learn_ratio(rays, rays.keyframe, rays.track_id, owner, len(rays.label_names)), held
         pairs_left += _PAIRS * (end - begin)
@@ -139,10 +139,8 @@ def _close(
 ) -> tuple[gtsam.NonlinearFactorGraph, Landmarks, Ints, Floats] | None:
     """Return graph, landmarks, landmark of each ray, and poses after a loop closure. None if the cost rises too much."""
     now, old, rays = found.now, found.before, measured.rays
-    back = int(known.first[now].min())
-    left = int(np.minimum(known.last[old], back).max())
     end = len(map_T_camera)
-    poses = distribute_correction(map_T_camera, found.correction, min(left, max(back - 1, 0)), back, heading[:end])
+    poses = closed_path(found, known, map_T_camera, heading[:end])
     into = np.arange(len(known))
     into[now] = old
     kept = np.flatnonzero(into == np.arange(len(known)))
@@ -163,7 +161,7 @@ def _close(
     poses, merged.position = read_poses(values), read_points(values)
     if truncated_cost(rays, owned, merged.position, poses, *measured.odometry()) > before + _STRAIN * len(now):
         return None
-    merged.covariance = _covariances(rays, owned, merged.position, poses)
+    merged.covariance = covariances_at(rays, owned, merged.position, poses)
     return graph, merged, owned, poses
 
 
@@ -267,13 +265,3 @@ def _drifted(keyframes: Keyframes, since: int) -> Floats:
     to_camera = adjoint(inverse(odom_T_base @ keyframes.base_T_camera))
     gathered = np.where((np.arange(len(drift)) >= since)[:, None, None], drift - drift[since], 0.0)
     return to_camera @ gathered @ np.swapaxes(to_camera, 1, 2)
-
-
-def _covariances(rays: Rays, owner: Ints, position: Floats, map_T_camera: Floats) -> Floats:
-    """Return the covariances (N, 3, 3) of landmarks from their rays, at fixed poses."""
-    held = np.flatnonzero(owner >= 0)
-    origins, n = rays.take(held).in_map(map_T_camera)
-    across = np.linalg.norm(position[owner[held]] - origins, axis=1) * rays.sigma[held]
-    along = np.where(np.isfinite(rays.range[held]), rays.range_sigma[held] ** -2, 0.0)
-    information = ray_information(n, across**-2, along, owner[held], len(position))
-    return np.linalg.inv(information + 1e-6 * np.eye(3)) + FLOOR**2 * np.eye(3)

@@ -1,4 +1,4 @@
-"""Close loops during initialisation: find recent landmarks that are the same as old landmarks, and correct the path."""
+"""Close loops: find landmarks that are the same as older landmarks, and correct the path."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -12,6 +12,7 @@ from objslam.config import AssociationSettings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, exp_se3, inverse, log_se3
 from objslam.core.types import Rays
+from objslam.graph.robust_cost import FLOOR, ray_information
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
@@ -22,6 +23,14 @@ more than a Gaussian allows. Larger factors find loops after a slip, and more wr
 _EPOCH = 40
 """An epoch is this number of consecutive keyframes. The drift since an epoch is computed from only one of its keyframes, so
 a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
+
+_BENDS = ((0.5, 0.5, 0.1), (2.0, 2.0, 0.5))
+"""Standard deviations of the bends of a solved path that missed a loop: in x, y (m) and yaw (rad). They were chosen: the
+first is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated drive). Larger
+values propose more loops, and a solve judges each."""
+_CUTS = 20
+"""The most keyframes that divide a path into a part before a missed loop and a part after it. A loop shows at most of the
+keyframes near it, so few are enough. A larger number takes longer."""
 
 
 @dataclass
@@ -49,8 +58,8 @@ class Landmarks:
 class Closure:
     """A loop: recent landmarks that are the same as old landmarks.
 
-    correction: (4, 4) moves the current poses in map to where they should be. now: (P,) the recent landmarks. before: (P,)
-    for each of these the old landmark. evidence: the log odds of the loop.
+    correction: (4, 4) moves the later poses in map to where they should be. now: (P,) the recent landmarks. before: (P,) for
+    each of these the old landmark. evidence: the log odds of the loop.
     """
 
     correction: Floats
@@ -114,6 +123,71 @@ def find_closure(
             if found is not None and found.is_sure(settings) and (best is None or found.evidence > best.evidence):
                 best = Closure(found.correction, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.evidence)
     return best, compared
+
+
+def find_missed_closures(
+    landmarks: Landmarks, middle: Floats, rays: Rays, owner: Ints, map_T_camera: Floats
+) -> list[Closure]:
+    """Return loops that a whole solved path may have missed, those with the most evidence first.
+
+    A search during initialisation allows for the drift that the odometry says. Landmarks may be confused after an unlikely
+    slip, which bends the path by more than that. So this search allows for large bends (`_BENDS`) at keyframes where a
+    landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with those seen mostly before
+    it. The loops are proposals, and a solve must judge them.
+
+    middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. owner: (R,) the
+    landmark of each ray, or -1. map_T_camera: (K, 4, 4) the solved poses.
+    """
+    counts = np.flatnonzero(np.isfinite(middle))
+    if len(counts) < 2 * MIN_LANDMARKS:
+        return []
+    together = seen_together(rays.keyframe, owner, len(landmarks))
+    possible = (landmarks.label[:, None] == landmarks.label) & ~together
+    density = np.zeros(len(landmarks))
+    density[counts] = label_densities(landmarks.position[counts], landmarks.label[counts])
+    found: dict[tuple[tuple[int, ...], tuple[int, ...]], Closure] = {}
+    begins = np.unique(landmarks.first[counts])
+    for cut in begins[np.unique(np.linspace(0, len(begins) - 1, _CUTS).round().astype(int))]:
+        pairs = possible & (middle >= cut)[:, None] & (middle < cut)
+        one, two = np.flatnonzero(pairs.any(axis=1)), np.flatnonzero(pairs.any(axis=0))
+        if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
+            continue
+        pivot = map_T_camera[cut, :2, 3]
+        a, b = (
+            neighbourhood(landmarks.position[which], landmarks.covariance[which], landmarks.label[which], pivot)
+            for which in (one, two)
+        )
+        for bend in _BENDS:
+            loop = recognise_place(a, b, pivot, np.diag(bend) ** 2, density[one], pairs[np.ix_(one, two)])
+            if loop is None or loop.evidence <= 0:
+                continue
+            closure = Closure(loop.correction, one[loop.pairs[:, 0]], two[loop.pairs[:, 1]], loop.evidence)
+            same = tuple(closure.now.tolist()), tuple(closure.before.tolist())
+            if same not in found or found[same].evidence < closure.evidence:
+                found[same] = closure
+    return sorted(found.values(), key=lambda closure: -closure.evidence)
+
+
+def closed_path(closure: Closure, landmarks: Landmarks, map_T_camera: Floats, drift: Floats) -> Floats:
+    """Return the path (K, 4, 4) after a loop closure.
+
+    The correction is spread over the keyframes from the last one that saw an old landmark of the loop to the first one that
+    saw a recent landmark of it. drift: (K,) as for `distribute_correction`."""
+    back = int(landmarks.first[closure.now].min())
+    left = int(np.minimum(landmarks.last[closure.before], back).max())
+    return distribute_correction(map_T_camera, closure.correction, min(left, max(back - 1, 0)), back, drift)
+
+
+def covariances_at(rays: Rays, owner: Ints, position: Floats, map_T_camera: Floats) -> Floats:
+    """Return the covariances (N, 3, 3), m^2, of landmarks from their rays, at fixed poses (K, 4, 4).
+
+    owner: (R,) the landmark of each ray, or -1. position: (N, 3) m."""
+    held = np.flatnonzero(owner >= 0)
+    origins, n = rays.take(held).in_map(map_T_camera)
+    across = np.linalg.norm(position[owner[held]] - origins, axis=1) * rays.sigma[held]
+    along = np.where(np.isfinite(rays.range[held]), rays.range_sigma[held] ** -2, 0.0)
+    information = ray_information(n, across**-2, along, owner[held], len(position))
+    return np.linalg.inv(information + 1e-6 * np.eye(3)) + FLOOR**2 * np.eye(3)
 
 
 def seen_together(frame: Ints, owner: Ints, count: int) -> Bools:

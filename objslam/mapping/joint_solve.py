@@ -12,6 +12,7 @@ import numpy as np
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.geometry import inverse
 from objslam.errors import SolveError
+from objslam.frontend.tracks import associate_tracks
 from objslam.frontend.turning_clocks import clocks_of_turns
 from objslam.mapping.doubted_labels import (
     CLEAR_ODDS,
@@ -36,6 +37,7 @@ from objslam.mapping.labels import (
     shows_second_object,
     warn_of_noise,
 )
+from objslam.mapping.moves.missed_loops import with_missed_loops
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
 from objslam.mapping.solution import seen_something
 
@@ -99,17 +101,22 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         begin, path = with_errors_of_tracks(state)
         start, sure = explored(begin)
         first = _from_start(*solved_if_sure(begin, start, sure))
-        state = _improved(first, JointState.relocalized)
+        state = _searched(first)
         noisier = with_loose_odometry(first, begin.theta, sure)
         if noisier is not None:
             other, sure = explored(noisier)
             if not finds_same_objects(state, other.association):
                 attempt = _from_start(*solved_if_sure(noisier, other, sure))
-                state = state.better(_improved(attempt, JointState.relocalized))
-        for other_start in (lambda: None, lambda: explored(along(begin, path))[0]):  # The first one takes less time.
+                state = state.better(_searched(attempt))
+        starts = (
+            lambda: _from_tracks(begin),
+            lambda: _from_start(begin.attempt(), None),
+            lambda: _from_start(begin.attempt(), explored(along(begin, path))[0]),
+        )
+        for other_start in starts:  # The first ones take less time.
             if not _unclear(state):
                 break
-            state = _or_from(begin, other_start, state)
+            state = _or_from(other_start, state)
         state = _improved(state, JointState.split)
     assert state.association is not None
     if state.unsettled:
@@ -120,13 +127,24 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     return _with_few_rays(state)
 
 
-def _or_from(begin: JointState, start: Callable[[], InitialEstimate | None], state: JointState) -> JointState:
-    """Return the state, or one whose rounds begin at another start, if this explains the log better.
+def _searched(state: JointState) -> JointState:
+    """Return the state after searches for a more likely path through its map, and for loops that it missed."""
+    return with_missed_loops(_improved(state, JointState.relocalized))
 
-    begin: before the first association. start: finds the start. A start from which nothing can be solved changes nothing.
-    """
+
+def _from_tracks(begin: JointState) -> JointState:
+    """Return the state after a solve of the tracks of boxes as landmarks, and closures of the loops between them.
+
+    No gate of an exploration takes part, so this finds the drives of wheels that slip more than their odometry says."""
+    found = associate_tracks(begin.keyframes, begin.rays)
+    return with_missed_loops(begin.attempt().counted(found).solve("association", found))
+
+
+def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
+    """Return the state, or one from another start, if this explains the log better. A start from which nothing can be
+    solved changes nothing."""
     try:
-        attempt = _improved(_from_start(begin.attempt(), start()), JointState.relocalized)
+        attempt = _searched(start())
     except SolveError:  # The map of the state is there, whatever is wrong with the other start.
         return state
     return state.better(attempt)

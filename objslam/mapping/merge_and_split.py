@@ -9,7 +9,7 @@ import numpy as np
 from objslam.association.appearance.evidence import Looks, learn_ratio
 from objslam.association.crossings.bundles import second_bundle
 from objslam.association.duplicates import near_pairs, seen_as_two
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.statistics import SAME_POINT
 from objslam.core.types import Association, Rays
 
@@ -53,6 +53,11 @@ def merge_unseen_together(rays: Rays, association: Association, estimate: Estima
             continue
         keep, drop = (i, j) if len(frames[i]) >= len(frames[j]) else (j, i)
         into[drop], taken[i], taken[j] = keep, True, True
+    return joined(association, into)
+
+
+def joined(association: Association, into: Ints) -> Association:
+    """Return the association after joins of objects. into: (N,) the object that each object becomes, or itself."""
     kept = np.flatnonzero(into == np.arange(association.count))
     number = np.searchsorted(kept, into)
     weights, existence = association.label_weights, association.existence

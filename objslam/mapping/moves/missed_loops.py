@@ -1,0 +1,99 @@
+"""Loops that an exploration missed: a visit whose landmarks are copies of older ones is moved onto them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from objslam.core.statistics import grouped_median
+from objslam.errors import SolveError
+from objslam.mapping.merge_and_split import joined
+
+if TYPE_CHECKING:
+    from objslam.core.arrays import Floats, Ints
+    from objslam.graph.loop_closure import Closure, Landmarks
+    from objslam.mapping.joint_alternation import JointState
+
+_TRIED = 4
+"""The most loops that are tried before the search ends, those with the most evidence first. Each takes a solve. A larger
+number closes more loops, and takes longer on maps that have missed none."""
+
+
+def with_missed_loops(state: JointState) -> JointState:
+    """Return the state after closures of loops that the exploration missed, if the log is then better explained.
+
+    An unlikely slip, or one landmark that was taken for another, bends the path by more than the exploration allows for. All
+    later visits then have landmarks of their own, all rays agree, and no round of association and solve brings the visits
+    together. The copies of the landmarks still have the relative positions of the first ones, which tell the loop.
+
+    A closure joins landmarks and is solved at once, at held shared errors. The rounds of association follow after the last
+    closure, because before it they would give the rays of other visits away. state: without a localisation.
+    """
+    held = replace(state, hold=state.errors is not None)
+    best = held
+    while (closed := _with_a_loop(best)) is not None:
+        best = closed
+    if best is held:
+        return state
+    try:
+        best = state.better(best.released(state.hold))
+        if best is state:
+            return state
+        assert best.association is not None
+        assert best.estimate is not None
+        turns = best.attempt().alternated(best.estimate.map_T_base, (best.association, best.estimate.positions))
+    except SolveError:  # The map before is there.
+        return best
+    return best.better(turns)
+
+
+def _with_a_loop(state: JointState) -> JointState | None:
+    """Return the state after the closure of one loop that explains the log better. None without one."""
+    from objslam.graph.loop_closure import find_missed_closures
+
+    landmarks, middle, owner = _landmarks(state)
+    for closure in find_missed_closures(landmarks, middle, state.rays, owner, state.solved_poses)[:_TRIED]:
+        closed = _closed(state, closure, landmarks)
+        if closed is not None and closed.explained > state.explained:
+            return closed
+    return None
+
+
+def _landmarks(state: JointState) -> tuple[Landmarks, Floats, Ints]:
+    """Return the landmarks of the state, the median keyframe of the rays of each (N,), NaN without enough rays, and the
+    landmark of each ray (R,), or -1."""
+    from objslam.graph.loop_closure import Landmarks, covariances_at
+
+    assert state.association is not None
+    assert state.estimate is not None
+    owner, count = np.where(state.agree, state.association.object, -1), state.association.count
+    held = np.flatnonzero(owner >= 0)
+    mine, keyframe = owner[held], state.rays.keyframe[held]
+    first, last = np.full(count, len(state.keyframes)), np.full(count, -1)
+    np.minimum.at(first, mine, keyframe)
+    np.maximum.at(last, mine, keyframe)
+    position = np.nan_to_num(state.estimate.positions)
+    enough = (np.bincount(mine, minlength=count) >= state.settings.association.min_rays) & state.estimate.solved
+    middle = np.where(enough, grouped_median(keyframe.astype(float), mine, count), np.nan)
+    covariance = covariances_at(state.rays, owner, position, state.solved_poses)
+    return Landmarks(position, covariance, state.association.label, first, last), middle, owner
+
+
+def _closed(state: JointState, closure: Closure, landmarks: Landmarks) -> JointState | None:
+    """Return an attempt after the solve of a closure. None if it has no solution."""
+    from objslam.graph.loop_closure import closed_path
+
+    assert state.association is not None
+    assert state.keyframes.drift is not None
+    into = np.arange(state.association.count)
+    into[closure.now] = closure.before
+    found = joined(state.association, into)
+    heading = np.maximum.accumulate(np.linalg.eigvalsh(state.keyframes.drift[:, :3, :3])[:, -1])
+    poses = closed_path(closure, landmarks, state.solved_poses, heading)
+    attempt = state.attempt().counted(found)
+    try:
+        return attempt.solve("merge", found, poses)
+    except SolveError:  # The closure bends the path too far.
+        return None
