@@ -1,13 +1,15 @@
-"""Covariances between two poses of a path, which a loop closure needs, against closed forms."""
+"""Covariances between two poses of a path against closed forms, and loops that a bent path missed."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
 import pytest
 
 from objslam.core.geometry import lift_se2
-from objslam.graph.loop_closure import POSE_FLOOR, relative_covariances
+from objslam.graph.loop_closure import POSE_FLOOR, Landmarks, closed_path, find_missed_closures, relative_covariances
 from objslam.graph.variables import X0
 
 
@@ -50,3 +52,40 @@ def test_an_anchor_without_a_covariance_leaves_the_others():
     left = relative_covariances(Unsure(marginals, 5), poses, [0, 5], 9)
     assert len(left) == len(every) / 2
     np.testing.assert_allclose(left, every[: len(left)])
+
+
+def two_visits(seed, turn, shift):
+    """Eight places, and the same places as a second visit finds them: turned by `turn` (rad) and moved by `shift` (m)."""
+    rng = np.random.default_rng(seed)
+    places = np.column_stack([rng.uniform(0, 8, (8, 2)), rng.uniform(0, 1.5, 8)])
+    moved = places @ gtsam.Rot3.Rz(turn).matrix().T + [*shift, 0.0]
+    position = np.concatenate([places, moved]) + rng.normal(0, 0.03, (16, 3))
+    number = np.arange(16)
+    landmarks = Landmarks(position, np.tile(0.05**2 * np.eye(3), (16, 1, 1)), 0 * number, 10 * number, 10 * number + 9)
+    rays = SimpleNamespace(keyframe=np.repeat(10 * number, 5))
+    return landmarks, rays, np.repeat(number, 5), np.tile(np.eye(4), (160, 1, 1))
+
+
+def test_the_second_visit_is_found_through_a_bend_of_the_path():
+    landmarks, rays, owner, path = two_visits(1, np.radians(25), (1.5, -1.0))
+    found = find_missed_closures(landmarks, landmarks.first + 4.5, rays, owner, path)
+    best = found[0]
+    assert dict(zip(best.now.tolist(), best.before.tolist(), strict=True)) == {8 + i: i for i in range(8)}
+    moved = landmarks.position[8:] @ best.correction[:3, :3].T + best.correction[:3, 3]
+    assert np.abs(moved - landmarks.position[:8]).max() < 0.2
+    assert best.evidence == max(closure.evidence for closure in found) > 0
+    path = closed_path(best, landmarks, path, np.arange(160.0))
+    np.testing.assert_allclose(path[:78], np.tile(np.eye(4), (78, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(path[80:], np.tile(best.correction, (80, 1, 1)), atol=1e-9)
+
+
+def test_landmarks_that_one_frame_shows_are_no_copies():
+    landmarks, rays, owner, path = two_visits(1, np.radians(25), (1.5, -1.0))
+    rays.keyframe = np.zeros(len(owner), dtype=np.int64)
+    assert find_missed_closures(landmarks, landmarks.first + 4.5, rays, owner, path) == []
+
+
+def test_few_landmarks_are_no_loop():
+    landmarks, rays, owner, path = two_visits(1, 0.0, (0.0, 0.0))
+    middle = np.where(np.arange(16) < 3, landmarks.first, np.nan)
+    assert find_missed_closures(landmarks, middle, rays, owner, path) == []

@@ -1,0 +1,61 @@
+"""Loops that an exploration missed, on two laps of which the second has landmarks of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from log_parts import without_names
+from turning_drive import errors_of
+
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import exp_se3, inverse
+from objslam.core.types import Association
+from objslam.mapping.joint_alternation import JointState
+from objslam.mapping.moves.missed_loops import with_missed_loops
+from objslam.simulation import preset, simulate
+
+SLIP = np.array([0.0, 0.0, np.radians(25), 0.3, -0.2, 0.0])
+"""What the odometry misses between the laps: a rotation vector, rad, and a way, m."""
+
+
+@pytest.fixture(scope="module")
+def laps():
+    """The log of two laps, whose odometry misses a slip between them, its things, and when the second lap begins."""
+    places = simulate(preset("demo"), 0).truth.objects
+    named = tuple((f"thing_{i}", tuple(one.position.tolist())) for i, one in enumerate(places))
+    log = simulate(preset("demo", laps=2, frames=160, false=0.0, objects=0, placed=named), 0)
+    poses = log.odometry.poses.copy()
+    half = len(poses) // 2
+    poses[half:] = poses[half] @ exp_se3(SLIP) @ inverse(poses[half]) @ poses[half:]
+    log = replace(log, localization=None, odometry=replace(log.odometry, poses=poses))
+    return log, len(log.truth.objects), log.odometry.stamps[half]
+
+
+def solved(laps, *, apart):
+    """The state with the true things. apart: each thing is another one in the second lap."""
+    log, _, between = laps
+    named, errors = errors_of(log), errors_of(without_names(log))
+    things = named.rays.label
+    second = errors.keyframes.stamps[errors.rays.keyframe] > between
+    _, owner = np.unique(things + 100 * second if apart else things, return_inverse=True)
+    of_log = errors.keyframes, errors.rays
+    cameras = tuple(one.camera for one in log.cameras)
+    state = JointState(*of_log, *of_log, cameras, errors.settings, Ledger(), lambda *_: None, None, errors)
+    return state.solve("labels", Association(owner, np.zeros(owner.max() + 1, dtype=np.int64)))
+
+
+def test_the_laps_come_together(laps):
+    log, things, _ = laps
+    state = solved(laps, apart=True)
+    assert state.association.count > 1.5 * things
+    found = with_missed_loops(state)
+    assert found.association.count == things
+    assert found.explained > state.explained
+    same = solved(laps, apart=False).association.object
+    pairs = np.unique(np.stack([same, found.association.object])[:, found.agree], axis=1)
+    assert pairs.shape[1] == things  # Each thing is one object.
+
+
+def test_a_map_without_missed_loops_stays(laps):
+    state = solved(laps, apart=False)
+    assert with_missed_loops(state) is state
