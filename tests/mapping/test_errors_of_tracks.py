@@ -96,4 +96,4 @@ def test_a_start_from_which_nothing_is_solved_loses_no_map():
         raise SolveError("no object has enough rays")
 
     state = begin(drive(1))
-    assert _or_from(state, nowhere, state) is state
+    assert _or_from(nowhere, state) is state

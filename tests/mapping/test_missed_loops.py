@@ -45,7 +45,7 @@ def solved(laps, *, apart):
 
 
 def test_the_laps_come_together(laps):
-    log, things, _ = laps
+    _, things, _ = laps
     state = solved(laps, apart=True)
     assert state.association.count > 1.5 * things
     found = with_missed_loops(state)
