@@ -46,7 +46,7 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 def test_demo(objslam: Objslam, attempts: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulation, "preset", partial(simulation.preset, frames=200))  # Half of them tell as much here.
+    monkeypatch.setattr(simulation, "preset", partial(simulation.preset, frames=130))  # A third of them tells as much here.
     write_log_folder(small_log(), tmp_path / "demo" / "log")
     (tmp_path / "demo" / ".objslam-demo").touch()  # The log of an older demo may be replaced.
     done = objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1)
