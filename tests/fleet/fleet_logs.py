@@ -30,7 +30,7 @@ def _write(folder: Path, number: int, site: int, robot: str, day: str) -> Path:
     truth = simulate(preset("demo", objects=14), 50 + site).truth
     assert truth is not None
     things = tuple((o.label, tuple(o.position)) for o in truth.objects)
-    log = simulate(preset("demo", objects=0, placed=things, frames=120), 1000 + number)
+    log = simulate(preset("demo", objects=0, placed=things, frames=200), 1000 + number)
     log = moved_log(later(log, number * HOUR), lift_se2(np.random.default_rng(number).uniform(-3, 3, 3)))
     path = folder / f"site_{site}" / robot / day / f"log_{number}"
     write_log_folder(replace(log, truth=None), path)
