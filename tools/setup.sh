@@ -132,11 +132,19 @@ needs_cuda() {
     "$venv/bin/python" -c 'import importlib.metadata as m, sys; sys.exit(not any("nvidia" in r for r in m.requires("torch") or ()))'
 }
 
+# pip uses one core. So torch, the largest package, is installed beside the others, and while the packages of the tests are
+# installed, Python imports large ones for the first time, which compiles them. That takes seconds.
 install_all() {
-    small_torch
-    pinned run | install_pinned || return
+    small_torch &
+    pinned run | awk '/^[^ ]/{here = !/^torch==/} here' | install_pinned || return
+    wait
+    pinned run | install_pinned || return # torch, if there was no CPU build of it
     if needs_cuda; then pinned cuda | install_pinned || return; fi
-    if [ "$want" = dev ]; then { pinned dev; pinned docs; } | install_pinned || return; fi
+    if [ "$want" = dev ]; then
+        "$venv/bin/python" -c 'import open3d, rerun, scipy.stats, torch' >/dev/null 2>&1 &
+        { pinned dev; pinned docs; } | install_pinned || return
+        wait
+    fi
     pip_install --no-index --no-deps --no-build-isolation --editable "$root" &&
         "$venv/bin/python" -m pip check --disable-pip-version-check >&2
 }

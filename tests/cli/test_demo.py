@@ -46,7 +46,7 @@ def attempts(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 def test_demo(objslam: Objslam, attempts: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulation, "preset", partial(simulation.preset, frames=200))  # Half of them tell as much here.
+    monkeypatch.setattr(simulation, "preset", partial(simulation.preset, frames=130))  # A third of them tells as much here.
     write_log_folder(small_log(), tmp_path / "demo" / "log")
     (tmp_path / "demo" / ".objslam-demo").touch()  # The log of an older demo may be replaced.
     done = objslam("demo", "-o", tmp_path / "demo", "--boxes", "--seed", 1)
@@ -76,11 +76,11 @@ def test_a_demo_replaces_no_log_of_others(objslam: Objslam, tmp_path: Path) -> N
 def test_demo_from_images(objslam: Objslam, attempts: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises.
 
-    Half of the images have to meet them too, because rendering takes most of the time. An object then needs to be in half as
-    many, so that the room is that of the whole demo. The objects do not depend on the surface, so it is made of fewer depth
-    images.
+    A third of the images have to meet them too, because rendering takes most of the time. An object then needs to be in a
+    third as many, so that the room is that of the whole demo. The objects do not depend on the surface, so it is made of
+    fewer depth images.
     """
-    monkeypatch.setattr(render, "RenderSettings", partial(RenderSettings, frames=110, min_views=9))
+    monkeypatch.setattr(render, "RenderSettings", partial(RenderSettings, frames=80, min_views=7))
     monkeypatch.setattr(demo, "settings_of", lambda mode, file, told: settings_of(mode, file, [*told, FEW_DEPTHS]))
     done = objslam("demo", "-o", tmp_path / "demo")
     assert done.code == 0, done.err

@@ -19,6 +19,9 @@ from objslam.live.bodies.request import BodyRequest
 from objslam.live.session.session import Session
 from objslam.live.worker import Worker
 
+ALONE = ("calibration.use=false", "checks.use=false")
+"""Bodies of a session depend on neither."""
+
 
 @pytest.fixture(scope="module")
 def log():
@@ -27,7 +30,7 @@ def log():
 
 def session_of(log, *changes):
     """A session that has mapped a whole log and still runs."""
-    session = Session(load_settings(None, ("calibration.use=false", *changes)), patient=True).start()
+    session = Session(load_settings(None, (*ALONE, *changes)), patient=True).start()
     ReplayAdapter(session, log, None, session.wait).run(threading.Event())
     return session
 
@@ -147,7 +150,7 @@ def test_bearings_to_the_centres_of_bodies_bend_neither_map_nor_path(laps, turne
 
 
 def test_a_resumed_session_turns_the_same_bearings(laps, tmp_path):
-    settings = load_settings(None, ("calibration.use=false",))
+    settings = load_settings(None, ALONE)
     pushes = list(events(laps))
     whole = feed(Session(settings, tmp_path / "whole", patient=True).start(), laps, 0, 440)
     killed = feed(Session(settings, tmp_path / "killed", patient=True).start(), laps, 0, 360)

@@ -27,11 +27,13 @@ from objslam.simulation.settings import DepthNoise
 
 ERRORS = {"odometry.scale": 0.05, "odometry.turn_scale": -0.06, "front.clock": 0.12, "front.yaw": 0.03}
 QUIET = Odometry(x_per_m=0.005, yaw_per_m=0.005, yaw_per_rad=0.01)
+ALONE = ("output.recording=false", "checks.use=false", "bodies.use=false")
+"""Shared errors are found without bodies and without checks of the input."""
 
 
 def settings_of(*more):
     noise = ("odometry.x_per_m=0.005", "odometry.yaw_per_m=0.005", "odometry.yaw_per_rad=0.01")
-    return load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "output.recording=false", *noise, *more))
+    return load_settings(None, ("mode=joint", "rays.pixel_sigma=2", *ALONE, *noise, *more))
 
 
 @pytest.fixture(scope="module")

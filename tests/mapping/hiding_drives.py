@@ -6,6 +6,7 @@ that no solid in front covers. So the boxes know nothing of the bodies that objs
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -39,12 +40,12 @@ class Solid:
         cos, sin = np.cos(self.yaw), np.sin(self.yaw)
         return self.centre[:2] + (flat * self.half[:2]) @ np.array([[cos, sin], [-sin, cos]])
 
-    @property
+    @cached_property
     def footprint(self):
         """The convex outline (P, 2), m, on the floor."""
         return self.turned(np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) if self.shape == "cuboid" else _RING)
 
-    @property
+    @cached_property
     def points(self):
         """Points (P, 3), m, whose convex hull is the solid."""
         levels = ((-1.0, 1.0), (1.0, 1.0))

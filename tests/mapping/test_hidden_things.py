@@ -17,7 +17,7 @@ from objslam.mapping.solution import CentreShift
 from objslam.triangulation.bodies import solve
 from objslam.triangulation.bodies.hidden_edges import Hidden
 
-SETTINGS = load_settings(None, ("mode=fixed", "output.recording=false"))
+SETTINGS = load_settings(None, ("mode=fixed", "output.recording=false", "checks.use=false"))
 
 
 def mapped(log):

@@ -134,7 +134,7 @@ def test_lasting_errors_are_the_same_with_any_axis_up_and_reach_heights_in_3d(mo
 def test_poses_that_err_for_seconds_are_named_and_auto_solves_them_too():
     """Headings err by 2 degrees for eight seconds at a time. In fixed mode the map says so, and is off. Mode auto is joint
     mode then, and as exact. A localisation as the settings say stays as it is."""
-    log = simulate(preset("demo", objects=12, classes=12, frames=300, false=0.0, pixel_sigma=1.0), 3)
+    log = simulate(preset("demo", objects=12, classes=12, frames=200, false=0.0, pixel_sigma=1.0), 3)
     bad = with_lasting(log, 7.0, 8.0, 3)
     place = {item.label: item.position for item in log.truth.objects}
 

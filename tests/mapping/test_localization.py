@@ -27,7 +27,7 @@ def settings(mode="fixed"):
 def another_day(first, seed):
     """Another drive through the room of the first, in the same frame."""
     objects = tuple((o.label, tuple(o.position)) for o in first.truth.objects)
-    return simulate(preset("demo", objects=0, placed=objects, path=(3, 2), frames=250), seed)
+    return simulate(preset("demo", objects=0, placed=objects, path=(3, 2), frames=160), seed)
 
 
 @pytest.fixture(scope="module")

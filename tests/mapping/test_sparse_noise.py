@@ -63,7 +63,8 @@ def test_a_street_with_default_settings_is_mapped_with_the_noise_that_it_has():
 @pytest.mark.usefixtures("few_tried")
 def test_joint_mode_maps_a_street_too(told):
     street = simulate_street(3)
-    result = pipeline.run(street.log, street.settings(told).model_copy(update={"mode": "joint"}), Ledger())
+    settings = street.settings(told).model_copy(update={"mode": "joint", "bodies": FIXED.bodies})
+    result = pipeline.run(street.log, settings, Ledger())
     points = np.array([item.position[:2] for item in result.map.resolved()])
     (right, found, twice, of), _ = street_counts(street, points)
     assert right >= 0.85 * found

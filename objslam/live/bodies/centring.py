@@ -107,7 +107,7 @@ class BodyCentring(Rounds[BodiesMessage, BodiesMessage]):
     def _take_up(self, correction: BodiesMessage) -> None:
         m = self._mapper.state
         if turn_to_centres(m, correction):
-            m.solve_corrected()
+            m.rebuild_in_slices()  # Bearings turn by little, so the next frame need not wait for a solve.
             self._counters.accept("turns to the centres of bodies")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 
 _FLAT = 1e-12
 """The least component of a ray's direction along an axis. A larger value distorts rays along a face."""
@@ -26,14 +26,18 @@ def _local(values: Floats, vectors: Floats) -> Floats:
     return np.stack([cos * x + sin * y, cos * y - sin * x, z + 0 * cos], axis=-1)
 
 
-def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
+def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the support of cuboids (see `shapes.Kind`): the plane touches the corner that is farthest along its normal."""
-    local, half = _local(values, normals), _half(values)
-    reach, sign = np.abs(local) * half, np.sign(local)
-    a, b, c = np.moveaxis(reach, -1, 0)
-    turned = sign[..., 0] * half[..., 0] * local[..., 1] - sign[..., 1] * half[..., 1] * local[..., 0]
-    corner = _local(values * [1, 1, 1, 1, 1, -1, 1], sign * half)  # back to the map
-    return a + b + c, np.stack([a + b, a - b, turned, c], axis=-1), corner
+    cos, sin = (part(values[:, 5])[body, None] for part in (np.cos, np.sin))
+    half = _half(values).T[:, body, None]
+    x, y, z = np.moveaxis(normals, -1, 0)
+    local = np.stack([cos * x + sin * y, cos * y - sin * x, z])
+    across, along, up = corner = np.sign(local) * half  # in the frame of the cuboid
+    a, b, c = reach = corner * local
+    by, points = np.empty((*z.shape, 4)), np.empty((*z.shape, 3))
+    by[..., 0], by[..., 1], by[..., 2], by[..., 3] = a + b, a - b, across * local[1] - along * local[0], c
+    points[..., 0], points[..., 1], points[..., 2] = cos * across - sin * along, sin * across + cos * along, up
+    return reach.sum(axis=0), by, points
 
 
 def sides(values: Floats, touched: Floats) -> Floats:

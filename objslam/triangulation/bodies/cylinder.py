@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats
-from objslam.triangulation.bodies.ellipsoid import axes_jacobian, half_axes, heading, matrices, section
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.triangulation.bodies.ellipsoid import axes_jacobian, forms, half_axes, heading, matrices, section, touched
 
 __all__ = ["axes_jacobian", "half_axes", "heading", "ranges", "support"]
 
@@ -18,20 +18,21 @@ _FLAT = 1e-12
 """The least component of a ray's direction upwards or across. A larger value distorts rays along a face."""
 
 
-def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
+def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the support of cylinders (see `shapes.Kind`). It is the sum of the supports of the horizontal section and of
     the vertical axis.
 
     The support of a sum of two sets is the sum of their supports (Schneider 2014, Convex Bodies, section 1.7).
     """
+    form, half = forms(values)[:, body, None], np.exp(values[body, None, 6])
     x, y, z = np.moveaxis(normals, -1, 0)
-    squared, by_flat = section(values, x, y, np.zeros_like(z))
-    across, half = np.sqrt(np.maximum(squared, _LEAST**2)), np.exp(values[..., 6])
-    by = by_flat / (2 * across[..., None])
-    by[..., 3] = half * np.abs(z)
-    rim = np.stack([x, y, np.zeros_like(z)], axis=-1) @ matrices(values[:, 0]) / across[..., None]
+    squared, by = section(form, x, y, np.zeros_like(z))
+    across, up = np.sqrt(np.maximum(squared, _LEAST**2)), half * np.abs(z)
+    by /= (2 * across)[..., None]
+    by[..., 3] = up
+    rim = touched(form, x, y, z, across)
     rim[..., 2] = half * np.sign(z)
-    return across + half * np.abs(z), by, rim
+    return across + up, by, rim
 
 
 def sides(values: Floats, touched: Floats) -> Floats:
@@ -61,7 +62,7 @@ def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats,
     point = from_axis + distance[:, None] * flat
     normal = np.einsum("bij,bj->bi", inverse, point)
     slope = np.where(hit & side, (normal * flat).sum(axis=1), 1.0)
-    _, by_section = section(values, normal[:, 0], normal[:, 1], np.zeros(len(values)))
+    _, by_section = section(forms(values), normal[:, 0], normal[:, 1], np.zeros(len(values)))
     zero = np.zeros((len(values), 1))
     tube = np.column_stack([normal, zero, by_section[:, :3] / 2, zero]) / slope[:, None]
     by = np.where(side[:, None], tube, by)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 
 _ROUND = 1e-3
 """A series replaces a division by the aspect, sqrt(q^2 + s^2), below this. With a larger value, the series is less exact."""
@@ -17,13 +17,13 @@ _LEAST = 1e-9
 """The least length (m) of a divisor. A larger length distorts small bodies."""
 
 
-def section(values: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
-    """Return the quadratic form v^T M v (...,) of vectors v = (x, y, z), and its derivatives (..., 4) by p, q, s and k.
+def forms(values: Floats) -> Floats:
+    """Return ten numbers (10, N) of ellipsoids (N, 7).
 
-    values: (..., 7) parameters. M is the matrix of squared half axes. If v is the unit normal of a tangent plane, the square
-    root of the form is the distance of this plane from the centre.
+    The first nine are the factors of x^2 + y^2, of x^2 - y^2 and of 2 x y: first in the horizontal part of v^T M v, then in
+    its derivatives by q and by s. The last one is the factor of z^2 in v^T M v.
     """
-    p, q, s, k = np.moveaxis(values[..., 3:], -1, 0)
+    p, q, s, k = values[:, 3:].T
     aspect2 = q * q + s * s
     aspect = np.sqrt(aspect2)
     round_ = aspect < _ROUND
@@ -31,19 +31,42 @@ def section(values: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Fl
     # sinh(2 a) / a, and its derivative by a divided by a
     gain = np.where(round_, 2 + 4 / 3 * aspect2, np.sinh(2 * safe) / safe)
     slope = np.where(round_, 8 / 3 + 16 / 15 * aspect2, (2 * safe * np.cosh(2 * safe) - np.sinh(2 * safe)) / safe**3)
-    across, along, cross = x * x + y * y, x * x - y * y, 2 * x * y
-    lean, scale, upward = q * along + s * cross, np.exp(2 * p), np.exp(2 * k) * z * z
-    flat = scale * (np.cosh(2 * aspect) * across + gain * lean)
-    common = 2 * gain * across + slope * lean
-    by = np.stack([2 * flat, scale * (common * q + gain * along), scale * (common * s + gain * cross), 2 * upward], axis=-1)
+    level = np.stack([np.cosh(2 * aspect), gain * q, gain * s])
+    by_q = np.stack([2 * gain * q, slope * q * q + gain, slope * q * s])
+    by_s = np.stack([2 * gain * s, slope * q * s, slope * s * s + gain])
+    return np.concatenate([np.exp(2 * p) * np.concatenate([level, by_q, by_s]), np.exp(2 * k)[None]])
+
+
+def section(form: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
+    """Return the quadratic form v^T M v (...,) of vectors v = (x, y, z), and its derivatives (..., 4) by p, q, s and k.
+
+    form: (10, ...) of `forms`, of the ellipsoid of each vector. M is the matrix of squared half axes. If v is the unit
+    normal of a tangent plane, the square root of the form is the distance of this plane from the centre.
+    """
+    across, along, cross, upward = x * x + y * y, x * x - y * y, 2 * x * y, form[9] * z * z
+    by = np.empty((*across.shape, 4))
+    flat, by[..., 1], by[..., 2] = (a * across + b * along + c * cross for a, b, c in (form[:3], form[3:6], form[6:9]))
+    by[..., 0], by[..., 3] = 2 * flat, 2 * upward
     return flat + upward, by
 
 
-def support(values: Floats, normals: Floats) -> tuple[Floats, Floats, Floats]:
+def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the support of ellipsoids (see `shapes.Kind`): the root of n^T M n (the dual quadric)."""
-    squared, by = section(values, *np.moveaxis(normals, -1, 0))
+    form = forms(values)[:, body, None]
+    x, y, z = np.moveaxis(normals, -1, 0)
+    squared, by = section(form, x, y, z)
     distance = np.sqrt(np.maximum(squared, _LEAST**2))
-    return distance, by / (2 * distance[..., None]), normals @ matrices(values[:, 0]) / distance[..., None]
+    by /= (2 * distance)[..., None]
+    return distance, by, touched(form, x, y, z, distance)
+
+
+def touched(form: Floats, x: Floats, y: Floats, z: Floats, distance: Floats) -> Floats:
+    """Return M n (B, 4, 3) of normals n = (x, y, z), each divided by a distance (B, 4). form: as in `section`."""
+    points = np.empty((*distance.shape, 3))
+    points[..., 0] = ((form[0] + form[1]) * x + form[2] * y) / distance
+    points[..., 1] = (form[2] * x + (form[0] - form[1]) * y) / distance
+    points[..., 2] = form[9] * z / distance
+    return points
 
 
 def sides(values: Floats, touched: Floats) -> Floats:
@@ -62,7 +85,7 @@ def ranges(values: Floats, origins: Floats, directions: Floats) -> tuple[Floats,
     distance = np.where(hit, (-b - np.sqrt(np.where(hit, inner, 0.0))) / a, 0.0)
     normal = np.einsum("bij,bj->bi", inverse, start + distance[:, None] * directions)
     slope = np.where(hit, (normal * directions).sum(axis=1), 1.0)
-    _, by = section(values, *normal.T)
+    _, by = section(forms(values), *normal.T)
     return distance, np.where(hit[:, None], np.column_stack([normal, by / 2]) / slope[:, None], 0.0), hit
 
 

@@ -146,11 +146,7 @@ def _steps(
 
 
 def _chosen(which: Bools, new: Residuals, old: Residuals) -> Residuals:
-    return Residuals(
-        np.where(which[:, None], new.value, old.value),
-        np.where(which[:, None, None], new.by, old.by),
-        np.where(which[:, None], new.use, old.use),
-    )
+    return Residuals(np.where(which[:, None, None], new.rows, old.rows), np.where(which[:, None], new.use, old.use))
 
 
 def grouped(group: Ints, rows: Floats, count: int) -> Floats:
@@ -181,7 +177,7 @@ def _weight(now: Residuals, weights: Weights) -> Floats:
 def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the information (N, 7, 7), the gradient (N, 7) and the cost (N,) of the bodies."""
     weighted = now.by * (weight * now.use)[..., None]
-    sums = sums_of_products(body, weighted, np.concatenate([now.by, now.value[..., None]], axis=2), len(values))
+    sums = sums_of_products(body, weighted, now.rows, len(values))
     information = sums[:, :, :PARAMETERS] + prior.information
     gradient = sums[:, :, PARAMETERS] + np.einsum("nij,nj->ni", prior.information, values - prior.mean)
     return information, gradient, _cost(body, now, weight, prior, values)

@@ -16,7 +16,7 @@ from objslam.triangulation.bodies.choice import log_evidence
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Prior, fit
 from objslam.triangulation.bodies.prior import cuboid_prior
-from objslam.triangulation.bodies.residuals import residuals
+from objslam.triangulation.bodies.residuals import beyond_edges
 from objslam.triangulation.bodies.shapes import CUBOID, KINDS, Kind
 from objslam.triangulation.bodies.shared import sides_of, spread_of, weights_of
 
@@ -123,8 +123,7 @@ def _fitted(edges: BoxEdges, start: Floats, kind: Kind, prior: Prior, side: Floa
 def _inside(edges: BoxEdges, values: Floats, kind: Kind, noise: Noise) -> Bools:
     """Return which edges (B, 4) lie clearly inside bodies (N, 7) of one kind."""
     bare = replace(edges, bound=np.ones_like(edges.bound))  # Then the residuals are those of the edges.
-    beyond = residuals(bare, values, kind).value[:, :4]
-    return np.asarray(beyond > _CLEAR * spread_of(bare, noise.factors, noise.share)[:, :4])
+    return np.asarray(beyond_edges(edges, values, kind) > _CLEAR * spread_of(bare, noise.factors, noise.share)[:, :4])
 
 
 def _axes(values: Floats, kind: Kind) -> Floats:

@@ -32,63 +32,81 @@ class Residuals:
 
     value: (B, 5), predicted minus measured: the shift in x and y (px), half of the width and of the height (px), and the
     range (m). If an edge of an axis is a bound, the two edges of this axis replace its shift and its size. by: (B, 5, 7)
-    derivatives of `value` by the parameters of the bodies. use: (B, 5) whether a residual counts. An edge that is a bound
-    counts only while the body does not reach it.
+    derivatives of `value` by the parameters of the bodies. rows: (B, 5, 8) both, the derivatives first. use: (B, 5) whether
+    a residual counts. An edge that is a bound counts only while the body does not reach it.
     """
 
-    value: Floats
-    by: Floats
+    rows: Floats
     use: Floats
+
+    @property
+    def value(self) -> Floats:
+        return self.rows[..., PARAMETERS]
+
+    @property
+    def by(self) -> Floats:
+        return self.rows[..., :PARAMETERS]
 
     def take(self, boxes: Bools | Ints) -> Residuals:
         """Select boxes by a mask or by indices."""
-        return Residuals(self.value[boxes], self.by[boxes], self.use[boxes])
+        return Residuals(self.rows[boxes], self.use[boxes])
 
     def put(self, boxes: Bools | Ints, new: Residuals) -> None:
         """Overwrite the residuals of some boxes."""
-        self.value[boxes], self.by[boxes], self.use[boxes] = new.value, new.by, new.use
+        self.rows[boxes], self.use[boxes] = new.rows, new.use
 
 
 def edge_gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
     """Return the gaps (B, 4), m, by which bodies (N, 7) reach beyond their planes, the derivatives (B, 4, 7), and the points
     (B, 4, 3) in map at which the bodies come closest to the planes."""
-    own = values[edges.body]
-    reach, by_shape, points = kind.support(own[:, None], edges.normal)
-    gap = np.einsum("bei,bi->be", edges.normal, own[:, :3] - edges.origin) + reach
-    return gap, np.concatenate([edges.normal, by_shape], axis=2), own[:, None, :3] + points
+    centre = values[edges.body, :3]
+    reach, by_shape, points = kind.support(values, edges.body, edges.normal)
+    gap = np.einsum("bei,bi->be", edges.normal, centre - edges.origin) + reach
+    return gap, np.concatenate([edges.normal, by_shape], axis=2), centre[:, None] + points
 
 
 def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     """Return the residuals of bodies (N, 7) of one kind. The derivatives treat the distance to touched points as fixed."""
     gap, by_gap, points = edge_gaps(edges, values, kind)
-    away = points - edges.origin[:, None]
-    scale = np.maximum(np.sqrt(np.einsum("bei,bei->be", away, away)) * edges.turn, _LEAST)  # m per px
-    off, by = gap / scale, by_gap / scale[..., None]
-    count = len(off)
-    value, use = np.empty((count, ROWS)), np.ones((count, ROWS))
-    jacobian = np.empty((count, ROWS, PARAMETERS))
-    for out, mixed in ((value, off), (jacobian, by)):
-        low, high = mixed[:, :2], mixed[:, 2:]
-        out[:, :2], out[:, 2:4] = (high - low) / 2, (high + low) / 2
+    half = 0.5 / _scale(edges, points)
+    mixed = np.empty((len(gap), 4, PARAMETERS + 1))  # Half of the rows of single edges.
+    np.multiply(by_gap, half[..., None], out=mixed[..., :PARAMETERS])
+    np.multiply(gap, half, out=mixed[..., PARAMETERS])
+    rows, use = np.empty((len(gap), ROWS, PARAMETERS + 1)), np.ones((len(gap), ROWS))
+    low, high = mixed[:, :2], mixed[:, 2:]
+    np.subtract(high, low, out=rows[:, :2])
+    np.add(high, low, out=rows[:, 2:4])
     row, axis = _axes_with_bound(edges)
     for place in (axis, axis + 2):
-        value[row, place], jacobian[row, place] = off[row, place], by[row, place]
-        use[row, place] = 1.0 - edges.bound[row, place] * (off[row, place] > 0)
-    value[:, 4], jacobian[:, 4], use[:, 4] = 0.0, 0.0, 0.0
+        rows[row, place] = 2 * mixed[row, place]
+        use[row, place] = 1.0 - edges.bound[row, place] * (gap[row, place] > 0)
+    rows[:, 4], use[:, 4] = 0.0, 0.0
     known = np.flatnonzero(np.isfinite(edges.range))
     if len(known):
-        distance, jacobian[known, 4], hit = kind.ranges(
+        distance, rows[known, 4, :PARAMETERS], hit = kind.ranges(
             values[edges.body[known]], edges.origin[known], edges.direction[known]
         )
-        value[known, 4] = np.where(hit, distance - edges.range[known], 0.0)
+        rows[known, 4, PARAMETERS] = np.where(hit, distance - edges.range[known], 0.0)
         use[known, 4] = hit
-    return Residuals(value, jacobian, use)
+    return Residuals(rows, use)
+
+
+def beyond_edges(edges: BoxEdges, values: Floats, kind: Kind) -> Floats:
+    """Return how far (B, 4), px, bodies (N, 7) of one kind reach beyond each edge."""
+    gap, _, points = edge_gaps(edges, values, kind)
+    return gap / _scale(edges, points)
+
+
+def _scale(edges: BoxEdges, points: Floats) -> Floats:
+    """Return the length (B, 4), m, that one pixel has at points (B, 4, 3) of the bodies."""
+    away = points - edges.origin[:, None]
+    return np.maximum(np.sqrt(np.einsum("bei,bei->be", away, away)) * edges.turn, _LEAST)
 
 
 def residuals_of_shapes(edges: BoxEdges, values: Floats, shape: Ints) -> Residuals:
     """Return the residuals of bodies (N, 7) with shapes (N,), indices of `core.bodies.body.SHAPES`."""
     count = len(edges)
-    found = Residuals(np.empty((count, ROWS)), np.empty((count, ROWS, PARAMETERS)), np.empty((count, ROWS)))
+    found = Residuals(np.empty((count, ROWS, PARAMETERS + 1)), np.empty((count, ROWS)))
     for kind, boxes in rows_of_kinds(shape[edges.body]):
         found.put(boxes, residuals(edges.take(boxes), values, kind))
     return found

@@ -24,9 +24,9 @@ PARAMETERS = 7
 class Kind:
     """One kind of bodies.
 
-    support: takes parameters (B, 1, 7) and unit normals (B, 4, 3). Returns the distances (B, 4), m, of tangent planes from
-    the centre, their derivatives (B, 4, 4) by the last four parameters, and the points (B, 4, 3), m, that they touch,
-    relative to the centre.
+    support: takes parameters (N, 7), the body (B,) of each box, and unit normals (B, 4, 3). Returns the distances (B, 4), m,
+    of tangent planes from the centre, their derivatives (B, 4, 4) by the last four parameters, and the points (B, 4, 3), m,
+    that they touch, relative to the centre.
     sides: takes parameters (B, 1, 7) and those points. Returns vectors (B, 4, S, 3), m, along the straight sides of the body
     that end there, to their other ends. In a distorted image, a box may touch a side in its middle.
     ranges: takes parameters (B, 7), origins (B, 3), m, and directions (B, 3) of rays. Returns the distances (B,), m, to the
@@ -35,7 +35,7 @@ class Kind:
     axes_jacobian: the derivatives (N, 7, 7) of centre, half axes and yaw by the parameters.
     """
 
-    support: Callable[[Floats, Floats], tuple[Floats, Floats, Floats]]
+    support: Callable[[Floats, Ints, Floats], tuple[Floats, Floats, Floats]]
     sides: Callable[[Floats, Floats], Floats]
     ranges: Callable[[Floats, Floats, Floats], tuple[Floats, Floats, Bools]]
     half_axes: Callable[[Floats], Floats]

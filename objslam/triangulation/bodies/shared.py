@@ -68,18 +68,26 @@ def sides_of(edges: BoxEdges, centre: Floats, use: Floats | None = None) -> Side
     towards = centre[edges.body] - edges.origin
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     seen = edges.body * SIDES + (towards @ evenly_spread(SIDES).T).argmax(axis=1)
-    seen, cell = np.unique(seen, return_inverse=True)
-    owner = seen // SIDES
-    counted = np.ones((len(edges), ROWS - 1)) if use is None else use
-    number = np.stack([np.bincount(cell, part) for part in counted.T], axis=1).astype(np.float64)
+    boxes = np.bincount(seen, minlength=len(centre) * SIDES)
+    there = np.flatnonzero(boxes)
+    owner, cell = there // SIDES, (np.cumsum(boxes > 0) - 1)[seen]
+    if use is None:
+        number = np.repeat(boxes[there, None], ROWS - 1, axis=1).astype(np.float64)
+    else:
+        number = np.stack([np.bincount(cell, part) for part in use.T], axis=1).astype(np.float64)
     mean = np.stack([np.bincount(cell, part) for part in towards.T], axis=1)
     mean = mean / np.linalg.norm(mean, axis=1, keepdims=True)
-    shared, alike = number.copy(), []
-    bounds = np.searchsorted(owner, np.arange(len(centre) + 1))
-    for begin, end in pairwise(bounds.tolist()):
-        mine = mean[begin:end]
-        alike.append(WITHIN * 0.5 ** (np.arccos(np.clip(mine @ mine.T, -1, 1)) / ALIKE))
-        shared[begin:end] = alike[-1] @ number[begin:end]
+    shared, alike = number.copy(), [np.zeros((0, 0))] * len(centre)
+    many = np.bincount(owner, minlength=len(centre))
+    begin = np.cumsum(many) - many
+    for sides in np.unique(many).tolist():  # Bodies with equal numbers of sides are one array.
+        which = np.flatnonzero(many == sides)
+        mine = begin[which, None] + np.arange(sides)
+        angle = np.arccos(np.clip(mean[mine] @ np.swapaxes(mean[mine], 1, 2), -1, 1))
+        found = WITHIN * 0.5 ** (angle / ALIKE)
+        shared[mine] = found @ number[mine]
+        for body, one in zip(which.tolist(), found, strict=True):
+            alike[body] = one
     return Sides(cell, owner, tuple(alike), shared[cell])
 
 
