@@ -11,7 +11,7 @@ from objslam.association.place_recognition import MIN_LANDMARKS, POSE_FLOOR, lab
 from objslam.config import AssociationSettings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, exp_se3, inverse, log_se3
-from objslam.core.types import Rays
+from objslam.graph.sliding_window import SlidingWindow
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
@@ -26,23 +26,76 @@ a larger number is faster and less exact. A landmark counts as new for this numb
 
 @dataclass
 class Landmarks:
-    """N landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), and first and last keyframe (N,) that saw
-    each."""
+    """N landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), and first and last keyframe (N,) that saw each.
+
+    together: (N, N) whether some frame shows both landmarks.
+    """
 
     position: Floats
     covariance: Floats
     label: Ints
     first: Ints
     last: Ints
+    together: Bools
 
     @classmethod
     def none(cls) -> Self:
         """Return an empty table."""
         nobody = np.zeros(0, dtype=np.int64)
-        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody)
+        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody, np.zeros((0, 0), dtype=bool))
 
     def __len__(self) -> int:
         return len(self.label)
+
+    def and_also(self, position: Floats, covariance: Floats, label: Ints) -> Self:
+        """Return the landmarks and n further ones that no frame has seen yet. position: (n, 3) m. label: (n,)."""
+        return type(self)(
+            np.concatenate([self.position, position]),
+            np.concatenate([self.covariance, covariance]),
+            np.concatenate([self.label, label]),
+            np.append(self.first, np.full(len(label), np.iinfo(np.int64).max)),
+            np.append(self.last, np.full(len(label), -1)),
+            np.pad(self.together, (0, len(label))),
+        )
+
+    def renumbered(self, into: Ints, position: Floats) -> Self:
+        """Return M landmarks of which each takes the place of all landmarks j with its number in into[j] (N,). -1 drops j.
+
+        position: (M, 3) m. The covariances are NaN.
+        """
+        count, kept = len(position), np.flatnonzero(into >= 0)
+        to = into[kept]
+        label, last = np.zeros((2, count), dtype=np.int64)
+        label[to] = self.label[kept]
+        first = np.full(count, np.iinfo(np.int64).max)
+        np.minimum.at(first, to, self.first[kept])
+        np.maximum.at(last, to, self.last[kept])
+        together = np.zeros((count, count), dtype=bool)
+        np.logical_or.at(together, (to[:, None], to), self.together[np.ix_(kept, kept)])
+        return type(self)(position, np.full((count, 3, 3), np.nan), label, first, last, together)
+
+    def see(self, keyframe: Ints, owner: Ints, which: Ints, first_ray: Ints) -> None:
+        """Note that the landmarks own new rays `which` (n,). Rays are sorted by keyframe.
+
+        keyframe, owner: (R,) the keyframe of each ray, and its landmark, or -1. first_ray: (K+1,) of each keyframe.
+        """
+        if not len(which):
+            return
+        np.minimum.at(self.first, owner[which], keyframe[which])
+        np.maximum.at(self.last, owner[which], keyframe[which])
+        seen = np.unique(keyframe[which]).tolist()
+        beside = np.concatenate([np.arange(first_ray[k], first_ray[k + 1]) for k in seen])
+        self.together |= seen_together(keyframe[beside] - seen[0], owner[beside], len(self))
+
+    def last_beside(self) -> Ints:
+        """(N,) the last keyframe before which each landmark, or two landmarks that some frame showed beside it, were seen.
+
+        Two landmarks tell where the robot is, and so where the third one appears.
+        """
+        if len(self) < MIN_LANDMARKS:
+            return self.last
+        beside = np.where(self.together, self.last, -1)
+        return np.maximum(self.last, np.partition(beside, -2, axis=1)[:, -2])
 
 
 @dataclass(frozen=True)
@@ -62,11 +115,7 @@ class Closure:
 def find_closure(
     landmarks: Landmarks,
     active: Bools,
-    rays: Rays,
-    owner: Ints,
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    map_T_camera: Floats,
+    window: SlidingWindow,
     now: int,
     settings: AssociationSettings,
     looks: Looks | None = None,
@@ -78,10 +127,9 @@ def find_closure(
 
     A pair is a recent and an old landmark of one label. It counts once for each tried drift.
 
-    owner: (R,) the landmark of each ray, or -1. graph, values: solved. map_T_camera: (K, 4, 4) the solved poses. now: the
-    newest keyframe. looks: what the landmarks look like, None if this is not known.
+    window: the solved graph. now: the newest keyframe. looks: what the landmarks look like, None if this is not known.
     """
-    together = seen_together(rays.keyframe, owner, len(landmarks))
+    map_T_camera = window.map_T_camera
     density = label_densities(landmarks.position, landmarks.label)
     pivot = map_T_camera[now, :2, 3]
     born = active & (landmarks.first >= now - _EPOCH)
@@ -89,12 +137,12 @@ def find_closure(
     compared = 0
     marginals: gtsam.Marginals | None = None
     for here, there in ((active, ~active), (born, ~born)):
-        possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~together
+        possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~landmarks.together
         one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
         if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
             continue
         try:
-            marginals = marginals or gtsam.Marginals(graph, values)
+            marginals = marginals or gtsam.Marginals(*window.whole())
         except RuntimeError:  # The system is indeterminate, so no loop can be tested.
             return None, compared
         before = np.minimum(landmarks.last[two], landmarks.first[one].min())

@@ -22,7 +22,7 @@ def at_truth(seed: int = 0, **changes) -> tuple[Drive, SlidingWindow]:
     keyframes = replace(drive.keyframes, map_T_base=drive.map_T_base)
     drive = replace(drive, keyframes=keyframes)
     measured = Measurements.of(keyframes, drive.rays, drive.settings)
-    return drive, SlidingWindow(measured, drive.association.object, drive.association.count, 20)
+    return drive, SlidingWindow(measured, drive.association.object, drive.association.count)
 
 
 def extended(drive: Drive, window: SlidingWindow, end: int) -> None:
@@ -50,7 +50,7 @@ def grow(drive: Drive, window: SlidingWindow) -> list[np.ndarray]:
     paths = []
     for end in [*range(1 + STEP, len(drive.keyframes), STEP), len(drive.keyframes)]:
         extended(drive, window, end)
-        window.solve()
+        window.solve(20)
         paths.append(window.map_T_camera[:end].copy())
     return paths
 
@@ -113,7 +113,7 @@ def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
     drive, window = at_truth()
     end = 1 + 4 * STEP
     extended(drive, window, end)
-    window.solve()
+    window.solve(20)
     bad = int(np.flatnonzero(np.isfinite(window.positions[:, 0]))[0])
     taken = []
 
@@ -126,7 +126,7 @@ def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
 
     monkeypatch.setattr(sliding_window, "levenberg_marquardt", collapsing)
     extended(drive, window, end + STEP)
-    window.solve()
+    window.solve(20)
     assert np.isnan(window.positions[bad]).all()
     rays = np.flatnonzero((drive.association.object != bad) & (drive.rays.keyframe > 0))
     for last in [*range(end + 2 * STEP, len(drive.keyframes), STEP), len(drive.keyframes)]:
@@ -134,7 +134,7 @@ def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
         born = np.setdiff1d(np.unique(drive.association.object[some]), np.flatnonzero(np.isfinite(window.positions[:, 0])))
         window.positions[born] = drive.points[born]
         window.extend(last, some, born, np.tile(np.eye(3), (len(born), 1, 1)))
-        window.solve()
+        window.solve(20)
     measured = Measurements.of(drive.keyframes, drive.rays, drive.settings)
     landmarks = np.unique(drive.association.object[rays])
     graph = build_graph(measured.factors(drive.association.object, rays, landmarks, drive.points))
