@@ -163,7 +163,7 @@ class _Exploration:
 
     def _active(self, now: int) -> Bools:
         """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since its last observation."""
-        return np.sqrt(np.maximum(self.heading[now] - self.heading[self.known.last_beside()], 0.0)) < HORIZON
+        return np.sqrt(self.known.turned(self.heading, now)) < HORIZON
 
     def _recognise(self, new: Ints, begin: int, end: int) -> None:
         """Find the landmark of each new ray (n,), and align the poses from `begin` to `end` - 1 with the landmarks."""

@@ -19,6 +19,8 @@ _EPOCHS = 8
 _SLIPS = (1.0, 3.0, 10.0)
 """The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
 more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
+_BESIDE = 0.03
+_STEPS = 10
 _EPOCH = 40
 """An epoch is this number of consecutive keyframes. The drift since an epoch is computed from only one of its keyframes, so
 a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
@@ -87,15 +89,21 @@ class Landmarks:
         beside = np.concatenate([np.arange(first_ray[k], first_ray[k + 1]) for k in seen])
         self.together |= seen_together(keyframe[beside] - seen[0], owner[beside], len(self))
 
-    def last_beside(self) -> Ints:
-        """(N,) the last keyframe before which each landmark, or two landmarks that some frame showed beside it, were seen.
+    def turned(self, heading: Floats, now: int) -> Floats:
+        """Return the variance (N,), rad^2, of the heading at keyframe `now` relative to the part of the map around each landmark.
 
-        Two landmarks tell where the robot is, and so where the third one appears.
+        heading: (K,) the variance of the odometry's heading. The heading drifts since the last observation of a landmark. If
+        two other landmarks were observed later, and frames show both of them beside it, they tell the heading too.
         """
-        if len(self) < MIN_LANDMARKS:
-            return self.last
-        beside = np.where(self.together, self.last, -1)
-        return np.maximum(self.last, np.partition(beside, -2, axis=1)[:, -2])
+        variance = np.maximum(heading[now] - heading[self.last], 0.0)
+        for _ in range(_STEPS if len(self) > MIN_LANDMARKS else 0):
+            beside = np.where(self.together, variance, np.inf)
+            np.fill_diagonal(beside, np.inf)
+            fewer = np.minimum(variance, beside.min(axis=1) + _BESIDE**2)
+            if (fewer == variance).all():
+                break
+            variance = fewer
+        return variance
 
 
 @dataclass(frozen=True)
