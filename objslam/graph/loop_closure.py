@@ -20,9 +20,9 @@ _SLIPS = (1.0, 3.0, 10.0)
 """The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
 more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _BESIDE = 0.03
-"""The standard deviation (rad) of the heading around one landmark, if it is known around another one that some frame showed
-beside it. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after longer ways through
-the map, where its parts may be bent."""
+"""The standard deviation (rad) of the heading around a landmark, if it is known around another one that some frame showed
+beside it. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after longer ways
+through the map, of which parts may be bent."""
 _STEPS = 10
 """The most landmarks on such a way. More than ten add a larger variance than an exploration accepts."""
 _EPOCH = 40
@@ -96,8 +96,8 @@ class Landmarks:
     def turned(self, heading: Floats, now: int) -> Floats:
         """Return the variance (N,), rad^2, of the heading at keyframe `now` in the part of the map around each landmark.
 
-        The heading drifts since the last observation of a landmark. A frame that shows another landmark beside it tells where
-        it is from the other one. So if the other one was observed later, the heading drifts only since then.
+        The heading drifts since the last observation of a landmark. If a frame showed another landmark beside it, the other
+        one tells where it is. So if the other one was observed later, the heading drifts only since then.
 
         heading: (K,) the variance of the odometry's heading.
         """
