@@ -25,6 +25,9 @@ beside it. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, lan
 through the map, of which parts may be bent."""
 _STEPS = 10
 """The most landmarks on such a way. More than ten add a larger variance than an exploration accepts."""
+_MORE = 1.5
+"""Landmarks are compared again when the recent landmark of a pair has this multiple of the rays that it had before. A larger
+number is faster, and finds loops later. With 1, two landmarks that never match would be compared at each step."""
 _EPOCH = 40
 """An epoch is this number of consecutive keyframes. The drift since an epoch is computed from only one of its keyframes, so
 a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
@@ -34,7 +37,8 @@ a larger number is faster and less exact. A landmark counts as new for this numb
 class Landmarks:
     """N landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), and first and last keyframe (N,) that saw each.
 
-    together: (N, N) whether some frame shows both landmarks.
+    rays: (N,) the number of rays of each landmark. together: (N, N) whether some frame shows both landmarks. compared:
+    (N, N) the number of rays of the first landmark when it was last compared with the second one.
     """
 
     position: Floats
@@ -42,13 +46,16 @@ class Landmarks:
     label: Ints
     first: Ints
     last: Ints
+    rays: Ints
     together: Bools
+    compared: Ints
 
     @classmethod
     def none(cls) -> Self:
         """Return an empty table."""
         nobody = np.zeros(0, dtype=np.int64)
-        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody, np.zeros((0, 0), dtype=bool))
+        pairs = np.zeros((0, 0), dtype=bool), np.zeros((0, 0), dtype=np.int64)
+        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody, nobody, *pairs)
 
     def __len__(self) -> int:
         return len(self.label)
@@ -61,7 +68,9 @@ class Landmarks:
             np.concatenate([self.label, label]),
             np.append(self.first, np.full(len(label), np.iinfo(np.int64).max)),
             np.append(self.last, np.full(len(label), -1)),
+            np.append(self.rays, np.zeros(len(label), dtype=np.int64)),
             np.pad(self.together, (0, len(label))),
+            np.pad(self.compared, (0, len(label))),
         )
 
     def renumbered(self, into: Ints, position: Floats) -> Self:
@@ -71,14 +80,16 @@ class Landmarks:
         """
         count, kept = len(position), np.flatnonzero(into >= 0)
         to = into[kept]
-        label, last = np.zeros((2, count), dtype=np.int64)
+        label, last, rays = np.zeros((3, count), dtype=np.int64)
         label[to] = self.label[kept]
+        np.add.at(rays, to, self.rays[kept])
         first = np.full(count, np.iinfo(np.int64).max)
         np.minimum.at(first, to, self.first[kept])
         np.maximum.at(last, to, self.last[kept])
         together = np.zeros((count, count), dtype=bool)
         np.logical_or.at(together, (to[:, None], to), self.together[np.ix_(kept, kept)])
-        return type(self)(position, np.full((count, 3, 3), np.nan), label, first, last, together)
+        compared = np.zeros((count, count), dtype=np.int64)
+        return type(self)(position, np.full((count, 3, 3), np.nan), label, first, last, rays, together, compared)
 
     def see(self, keyframe: Ints, owner: Ints, which: Ints, first_ray: Ints) -> None:
         """Note that the landmarks own new rays `which` (n,). Rays are sorted by keyframe.
@@ -87,6 +98,7 @@ class Landmarks:
         """
         if not len(which):
             return
+        np.add.at(self.rays, owner[which], 1)
         np.minimum.at(self.first, owner[which], keyframe[which])
         np.maximum.at(self.last, owner[which], keyframe[which])
         seen = np.unique(keyframe[which]).tolist()
@@ -139,19 +151,23 @@ def find_closure(
     There are two searches. For a long drift, the recently seen landmarks (`active`, (N,)) are matched with all others. For a
     slip or a push, only the new landmarks (first seen in the last `_EPOCH` keyframes) are matched with all others.
 
-    A pair is a recent and an old landmark of one label. It counts once for each tried drift.
+    A search is made only if it has a new pair, or more rays of the recent landmark of a pair (`_MORE`). A pair is a recent
+    and an old landmark of one label. It counts once for each tried drift.
 
     window: the solved graph. now: the newest keyframe. looks: what the landmarks look like, None if this is not known.
     """
     map_T_camera = window.map_T_camera
     density = label_densities(landmarks.position, landmarks.label)
     pivot = map_T_camera[now, :2, 3]
+    due = landmarks.rays[:, None] >= _MORE * landmarks.compared
     born = active & (landmarks.first >= now - _EPOCH)
     best: Closure | None = None
     compared = 0
     marginals: gtsam.Marginals | None = None
     for here, there in ((active, ~active), (born, ~born)):
         possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~landmarks.together
+        if not (possible & due).any():
+            continue
         one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
         if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
             continue
@@ -159,6 +175,7 @@ def find_closure(
             marginals = marginals or gtsam.Marginals(*window.whole())
         except RuntimeError:  # The system is indeterminate, so no loop can be tested.
             return None, compared
+        landmarks.compared = np.where(possible, landmarks.rays[:, None], landmarks.compared)
         before = np.minimum(landmarks.last[two], landmarks.first[one].min())
         epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
         anchors = [int(before[before // _EPOCH == e].max()) for e in epochs]
