@@ -31,19 +31,22 @@ def align(
     map_T_camera: Floats,
     centre: Floats,
     spread: Floats,
+    share: Floats,
     alike: Floats | None = None,
 ) -> Floats:
-    """Return the planar correction (4, 4) in map of the camera poses that best aligns the rays with the landmarks.
+    """Return the planar corrections (K, 4, 4) in map of the camera poses that best align the rays with the landmarks.
 
     The cost of a ray is its squared deviation from the best landmark of its label, at most `STRAY_RAY`. positions, labels:
-    (N, 3) m and (N,) of the landmarks. centre: (3,) m, the point about which the correction turns. spread: (3,) standard
-    deviations of the correction in x, y (m) and yaw (rad). They define its prior and bound the grid. alike: (R, N) the log
-    odds that each ray shows each landmark, from its appearance. None if this is not known.
+    (N, 3) m and (N,) of the landmarks. centre: (3,) m, the point about which a correction turns. spread: (3,) standard
+    deviations of the last correction in x, y (m) and yaw (rad). They define its prior and bound the grid. share: (K,) of its
+    variance that the drift has at each pose. This is also the part of the last correction that is expected there. alike:
+    (R, N) the log odds that each ray shows each landmark, from its appearance. None if this is not known.
     """
     steps = (_steps(spread[0], _FINE_SHIFT, _MOST_SHIFTS), _steps(spread[1], _FINE_SHIFT, _MOST_SHIFTS))
     grid = np.stack(np.meshgrid(*steps, _steps(spread[2], _FINE_TURN, _MOST_TURNS), indexing="ij"), axis=-1).reshape(-1, 3)
     cost = ((grid / np.maximum(spread, 1e-6)) ** 2).sum(axis=1)
-    lines = _Lines.of(rays, map_T_camera, centre)
+    # A random walk between two known ends is most uncertain in the middle.
+    lines = _Lines.of(rays, map_T_camera, centre, share, spread[2] * np.sqrt(share * (1 - share)))
     gain = np.zeros((len(rays), len(positions))) if alike is None else 2 * alike
     ray, landmark = np.nonzero(_reachable(lines, positions - centre, grid, gain) & (rays.label[:, None] == labels))
     few = max(1, _AT_ONCE // len(grid))  # The number of pairs of a ray and a landmark in a block.
@@ -57,30 +60,32 @@ def align(
         best = np.minimum.reduceat(misfit, cuts[:block] - cuts[0], axis=1)
         cost += (np.minimum(best, STRAY_RAY) - STRAY_RAY).sum(axis=1)
         cuts, ends = cuts[block:], ends[block:]
-    correction = lift_se2(grid[np.argmin(cost)])
-    correction[:3, 3] += centre - correction[:3, :3] @ centre
-    return correction
+    corrections = lift_se2(share[:, None] * grid[np.argmin(cost)])
+    corrections[:, :3, 3] += centre - corrections[:, :3, :3] @ centre
+    return corrections
 
 
 @dataclass(frozen=True)
 class _Lines:
-    """Rays in the plane: offset (R, 2) m from the centre of the corrections, heading (R,) rad, its noise sigma (R,) rad, and
-    the horizontal part of the range (R,) m, NaN if unknown, with its noise (R,) m."""
+    """Rays in the plane: offset (R, 2) m from the centre of the corrections, heading (R,) rad, its noise sigma (R,) rad, the
+    horizontal part of the range (R,) m, NaN if unknown, with its noise (R,) m, and the share (R,) of the correction."""
 
     offset: Floats
     heading: Floats
     sigma: Floats
     range: Floats
     range_sigma: Floats
+    share: Floats
 
     @classmethod
-    def of(cls, rays: Rays, map_T_camera: Floats, centre: Floats) -> Self:
-        """Make lines of rays at camera poses (K, 4, 4)."""
+    def of(cls, rays: Rays, map_T_camera: Floats, centre: Floats, share: Floats, blur: Floats) -> Self:
+        """Make lines of rays at camera poses (K, 4, 4) with shares (K,). blur: (K,) rad, the noise of the headings."""
         origin, direction = rays.in_map(map_T_camera)
         level = np.hypot(direction[:, 0], direction[:, 1])
         heading = np.arctan2(direction[:, 1], direction[:, 0])
-        sigma = rays.sigma / np.maximum(level, _MIN_LEVEL)
-        return cls((origin - centre)[:, :2], heading, sigma, rays.range * level, np.hypot(rays.range_sigma, _LANDMARK_SIGMA))
+        sigma = np.hypot(rays.sigma / np.maximum(level, _MIN_LEVEL), blur[rays.keyframe])
+        range_sigma = np.hypot(rays.range_sigma, _LANDMARK_SIGMA)
+        return cls((origin - centre)[:, :2], heading, sigma, rays.range * level, range_sigma, share[rays.keyframe])
 
     def take(self, which: Ints) -> Self:
         """Select lines by their indices."""
@@ -108,11 +113,12 @@ def _misfit(lines: _Lines, target: Floats, grid: Floats, gain: Floats) -> Floats
 
     target: (P, 3) m, the landmark of each pair, relative to the centre. gain: (P,) lowers the cost of each pair.
     """
-    cos, sin = np.cos(grid[:, 2, None]), np.sin(grid[:, 2, None])
+    shift_x, shift_y, turn = (column[:, None] * lines.share for column in grid.T)
+    cos, sin = np.cos(turn), np.sin(turn)
     x, y = lines.offset.T
-    dx, dy = target[:, 0] - (grid[:, :1] + cos * x - sin * y), target[:, 1] - (grid[:, 1:2] + sin * x + cos * y)
+    dx, dy = target[:, 0] - (shift_x + cos * x - sin * y), target[:, 1] - (shift_y + sin * x + cos * y)
     distance = np.maximum(np.hypot(dx, dy), 1e-6)
-    angle = (np.arctan2(dy, dx) - lines.heading - grid[:, 2, None] + np.pi) % (2 * np.pi) - np.pi
+    angle = (np.arctan2(dy, dx) - lines.heading - turn + np.pi) % (2 * np.pi) - np.pi
     deviation = angle**2 / (lines.sigma**2 + (_LANDMARK_SIGMA / distance) ** 2)
     if np.isfinite(lines.range).any():
         miss = (distance - lines.range) ** 2 / lines.range_sigma**2

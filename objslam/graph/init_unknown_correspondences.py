@@ -33,6 +33,9 @@ HORIZON = 0.1
 landmark was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours more often."""
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
+_TURNED = np.radians(3.0)
+"""A step ends when the heading has drifted by this (rad, one standard deviation). All poses of a step are aligned by one
+correction, so the drift within the step blurs its rays. With a larger value, more steps with turns are aligned wrongly."""
 _PLACE = 0.1
 """A measured range may err by this (m) in addition to 4 standard deviations of its noise. A larger value accepts more wrong
 ranges."""
@@ -103,8 +106,9 @@ class _Exploration:
 
     def run(self, progress: Callable[[int, int], None]) -> InitialEstimate:
         """Explore all keyframes."""
-        for begin in range(1, len(self.keyframes), self.settings.joint.explore_step):
-            end = min(begin + self.settings.joint.explore_step, len(self.keyframes))
+        end = 1
+        while end < len(self.keyframes):
+            begin, end = end, self._end(end)
             self._add(begin, end)
             if (held := int((self.owner >= 0).sum())) >= 2 * self.taught:
                 rays = self.rays
@@ -115,6 +119,11 @@ class _Exploration:
                 self._find_loop(end - 1)
             progress(end, len(self.keyframes))
         return InitialEstimate(self.window.map_T_camera, Association(self.owner, self.known.label), self.known.position)
+
+    def _end(self, begin: int) -> int:
+        """Return the end of the step that begins at a keyframe. A step with turns is shorter."""
+        turned = int(np.searchsorted(self.heading, self.heading[begin - 1] + _TURNED**2))
+        return min(begin + self.settings.joint.explore_step, max(turned, begin + 1), len(self.keyframes))
 
     def _add(self, begin: int, end: int) -> None:
         """Add the keyframes from `begin` to `end` - 1 and their rays, find new landmarks, and solve."""
@@ -173,13 +182,17 @@ class _Exploration:
         some, which, looks = self._some(new, begin), np.flatnonzero(active), self._looks()
         poses = self.window.map_T_camera[begin:end]
         drift = _drifted(self.keyframes, begin - 1, end)
-        # The whole step is aligned first, because the heading may err by more than the angle between two landmarks.
+        # The step is aligned first, because the heading may err by more than the angle between two landmarks.
         alike = None
         if looks is not None:
             each = np.repeat(np.arange(len(some)), len(which)), np.tile(which, len(some))
             alike = looks.ray_odds(some, *each, np.zeros(len(each[0]), dtype=bool)).reshape(len(some), len(which))
         spread = _planar_sigmas(drift[-1], poses[-1])
-        poses[:] = align(some, known.position[which], known.label[which], poses, poses[0, :3, 3], spread, alike) @ poses
+        share = (self.heading[begin:end] - self.heading[begin - 1]) / max(
+            self.heading[end - 1] - self.heading[begin - 1], 1e-12
+        )
+        landmarks = known.position[which], known.label[which]
+        poses[:] = align(some, *landmarks, poses, poses[0, :3, 3], spread, share, alike) @ poses
         left = _LEFT * drift + np.diag([_TURN] * 3 + [_SHIFT] * 3) ** 2
         owner = assign(
             some,
