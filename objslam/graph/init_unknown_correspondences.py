@@ -86,14 +86,15 @@ def initialize_unknown(
 class _Exploration:
     """The exploration at the present keyframe.
 
-    owner: (R,) the landmark of each ray, or -1. heading: (K,) the variance of the odometry's heading, rad^2. counted: (N,)
-    the number of rays of each landmark when its covariance was computed. refused: loops that raise the cost too much.
+    way: (K, 4, 4) map_T_camera by odometry. owner: (R,) the landmark of each ray, or -1. heading: (K,) the variance of the
+    odometry's heading, rad^2. counted: (N,) the number of rays of each landmark when its covariance was computed. refused:
+    loops that raise the cost too much.
     """
 
     def __init__(self, keyframes: Keyframes, rays: Rays, cameras: tuple[Camera, ...], settings: Settings) -> None:
         assert keyframes.drift is not None
         self.keyframes, self.rays, self.cameras, self.settings = keyframes, rays, cameras, settings
-        self.measured = Measurements.of(keyframes, rays, settings)
+        self.measured, self.way = Measurements.of(keyframes, rays, settings), keyframes.map_T_camera
         self.heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
         self.first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
         self.owner = np.full(len(rays), -1, dtype=np.int64)
@@ -127,7 +128,7 @@ class _Exploration:
 
     def _add(self, begin: int, end: int) -> None:
         """Add the keyframes from `begin` to `end` - 1 and their rays, find new landmarks, and solve."""
-        map_T_camera, way = self.window.map_T_camera, self.keyframes.map_T_camera
+        map_T_camera, way = self.window.map_T_camera, self.way
         map_T_camera[begin:end] = map_T_camera[begin - 1] @ inverse(way[begin - 1]) @ way[begin:end]
         new = np.arange(self.first_ray[begin] if begin > 1 else 0, self.first_ray[end])
         self._recognise(new, begin, end)
