@@ -1,9 +1,10 @@
 """Initialise poses and landmarks without an association, from odometry alone.
 
-As in `init_known_correspondences`, keyframes are added a few at a time, at poses that continue the solved path by odometry.
-Each ray is assigned to the known landmark whose predicted bearing it fits, within a gate that allows for the odometry's
-drift. Unassigned rays of recent keyframes give new landmarks, because the drift between these keyframes is small. The result
-is the start of a global association.
+As in `init_known_correspondences`, keyframes are added a few at a time, at poses that continue the solved path by odometry,
+and a sliding window is solved. Each ray is assigned to the known landmark whose predicted bearing it fits, within a gate
+that allows for the odometry's drift. Unassigned rays of recent keyframes give new landmarks, because the drift between these
+keyframes is small. Recent landmarks that are the same as old ones close a loop, and only then the whole graph is solved. The
+result is the start of a global association.
 """
 
 from collections.abc import Callable
@@ -30,7 +31,8 @@ from objslam.graph.sliding_window import SlidingWindow
 
 HORIZON = 0.1
 """A landmark is expected at its position if the heading drifted by less than this (rad, one standard deviation) since the
-landmark was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours more often."""
+landmark, or one beside it, was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours
+more often."""
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
 _TURNED = np.radians(3.0)
@@ -172,7 +174,7 @@ class _Exploration:
         return None if self.ratio is None else Looks.of(self.rays, self.owner, len(self.known), self.ratio)
 
     def _active(self, now: int) -> Bools:
-        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since its last observation."""
+        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since it was last known there."""
         return np.sqrt(self.known.turned(self.heading, now)) < HORIZON
 
     def _recognise(self, new: Ints, begin: int, end: int) -> None:

@@ -114,7 +114,7 @@ class Landmarks:
         heading: (K,) the variance of the odometry's heading.
         """
         variance = np.maximum(heading[now] - heading[self.last], 0.0)
-        for _ in range(_STEPS if len(self) > MIN_LANDMARKS else 0):
+        for _ in range(_STEPS if len(self) else 0):
             beside = np.where(self.together, variance, np.inf)
             np.fill_diagonal(beside, np.inf)
             fewer = np.minimum(variance, beside.min(axis=1) + _BESIDE**2)

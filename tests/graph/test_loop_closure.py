@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from objslam.core.geometry import lift_se2
-from objslam.graph.loop_closure import POSE_FLOOR, relative_covariances
+from objslam.graph.loop_closure import _BESIDE, POSE_FLOOR, Landmarks, relative_covariances
 from objslam.graph.variables import X0
 
 
@@ -50,3 +50,36 @@ def test_an_anchor_without_a_covariance_leaves_the_others():
     left = relative_covariances(Unsure(marginals, 5), poses, [0, 5], 9)
     assert len(left) == len(every) / 2
     np.testing.assert_allclose(left, every[: len(left)])
+
+
+def seen(owner: list[int], keyframe: list[int]) -> Landmarks:
+    """Landmarks of rays (R,), which are sorted by keyframe."""
+    rays, count = np.array(owner), max(owner) + 1
+    landmarks = Landmarks.none().and_also(np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count, dtype=np.int64))
+    first_ray = np.searchsorted(keyframe, np.arange(max(keyframe) + 2))
+    landmarks.see(np.array(keyframe), rays, np.arange(len(rays)), first_ray)
+    return landmarks
+
+
+def test_a_landmark_is_expected_from_those_that_a_frame_showed_beside_it():
+    """Landmark 0 was beside 1, and 1 beside 2, which is seen last. Nothing was beside landmark 3."""
+    landmarks = seen([0, 1, 3, 1, 2, 2], [0, 0, 1, 2, 2, 9])
+    turned = landmarks.turned(0.01 * np.arange(10.0), 9)
+    np.testing.assert_allclose(turned, [2 * _BESIDE**2, _BESIDE**2, 0.0, 0.08], atol=1e-12)
+
+
+def test_a_landmark_beside_none_that_was_seen_later_drifts_alone():
+    landmarks = seen([0, 1, 1], [2, 2, 3])
+    heading = np.array([0.0, 0.0, 0.0, 1e-4, 1e-3, 2e-3])  # Less than the way over landmark 1 adds.
+    np.testing.assert_allclose(landmarks.turned(heading, 5), [2e-3, 1.9e-3], atol=1e-12)
+    assert landmarks.turned(100 * heading, 5)[0] == pytest.approx(0.19 + _BESIDE**2)
+
+
+def test_merged_landmarks_have_the_rays_and_frames_of_all():
+    landmarks = seen([0, 1, 2, 3, 0, 3], [0, 0, 4, 4, 6, 7])
+    merged = landmarks.renumbered(np.array([0, 1, 0, -1]), np.ones((2, 3)))
+    assert merged.rays.tolist() == [3, 1]
+    assert merged.first.tolist() == [0, 0]
+    assert merged.last.tolist() == [6, 0]
+    assert merged.together.tolist() == [[True, True], [True, True]]
+    assert not merged.compared.any()  # All pairs are compared again.

@@ -151,3 +151,21 @@ def test_a_point_is_at_a_camera_if_any_camera_is_near_enough():
     found = sliding_window._at_a_point(positions, points)
     assert 20 < found.sum() < 44
     np.testing.assert_array_equal(found, nearest < sliding_window._AT_CAMERA)
+
+
+def test_a_window_with_other_landmarks_is_solved_as_a_whole():
+    """Two landmarks that were one thing become one. The graph is then that of all rays, as if it had grown so."""
+    drive, window = at_truth()
+    one = np.where(drive.rays.keyframe > 0, drive.association.object, -1)
+    owner = one.copy()
+    first = np.flatnonzero(owner == 0)
+    owner[first[len(first) // 2 :]] = drive.association.count
+    points = np.concatenate([drive.points, drive.points[:1]])
+    split = SlidingWindow(window._measured, owner, len(points))
+    end = len(drive.keyframes)
+    split.positions[:] = points
+    split.extend(end, np.flatnonzero(owner >= 0), np.arange(len(points)), np.zeros((len(points), 3, 3)))
+    joined = split.regrown(one, drive.points.copy(), split.map_T_camera)
+    joined.solve(100)
+    assert joined.solved == end
+    assert apart(joined.map_T_camera, whole_solution(drive, end)) < 1e-3
