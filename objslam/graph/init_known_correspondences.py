@@ -49,7 +49,7 @@ def initialize_known(
     The map frame is the odometry's frame, in which the first keyframe is fixed. progress(done, total) counts keyframes.
     """
     keyframes, rays, settings, owner = measured.keyframes, measured.rays, measured.settings, association.object
-    window = SlidingWindow(measured, owner, association.count, _ITERATIONS)
+    window = SlidingWindow(measured, owner, association.count)
     map_T_camera = window.map_T_camera
     first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
     # The rays whose object is not in the graph yet, and the number of these rays at the last triangulation of each object.
@@ -84,7 +84,7 @@ def initialize_known(
         window.positions = expected
         window.extend(end, fresh, born, covariance)
         if np.isfinite(window.positions[:, 0]).any():
-            optimum = window.solve()
+            optimum = window.solve(_ITERATIONS)
             if trace is not None and (end >= _RECORDED * recorded or end == len(keyframes)):
                 recorded = end
                 trace.iteration("grow", optimum.cost_after, map_T_camera[:end], window.positions)

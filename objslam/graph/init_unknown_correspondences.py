@@ -1,15 +1,15 @@
 """Initialise poses and landmarks without an association, from odometry alone.
 
-As in `init_known_correspondences`, keyframes are added a few at a time, at poses that continue the solved path by odometry.
-Each ray is assigned to the known landmark whose predicted bearing it fits, within a gate that allows for the odometry's
-drift. Unassigned rays of recent keyframes give new landmarks, because the drift between these keyframes is small. The result
-is the start of a global association.
+As in `init_known_correspondences`, keyframes are added a few at a time, at poses that continue the solved path by odometry,
+and a sliding window is solved. Each ray is assigned to the known landmark whose predicted bearing it fits, within a gate
+that allows for the odometry's drift. Unassigned rays of recent keyframes give new landmarks, because the drift between these
+keyframes is small. Recent landmarks that are the same as old ones close a loop, and only then the whole graph is solved. The
+result is the start of a global association.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from objslam.association.appearance.cosine_ratio import CosineRatio
@@ -26,15 +26,19 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
 from objslam.graph.loop_closure import Closure, Landmarks, closed_path, covariances_at, find_closure
-from objslam.graph.optimizers import build_graph, levenberg_marquardt
 from objslam.graph.robust_cost import truncated_cost
-from objslam.graph.variables import add_values, make_values, read_points, read_poses
+from objslam.graph.sliding_window import SlidingWindow
 
 HORIZON = 0.1
 """A landmark is expected at its position if the heading drifted by less than this (rad, one standard deviation) since the
-landmark was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours more often."""
+landmark, or one beside it, was observed. A larger value recognises landmarks after a longer absence, and confuses neighbours
+more often."""
 _STRETCH = 150
 """The number of latest keyframes that are searched for new landmarks. A larger number is slower and includes more drift."""
+_TURNED = np.radians(4.0)
+"""A step ends when the heading has drifted by this (rad, one standard deviation). One correction aligns all poses of a step,
+so the drift within the step blurs its rays. With a larger value, more steps with turns are aligned wrongly. Without a limit,
+a simulated robot lost its way within an hour. With 3 and 4 degrees, it did not."""
 _PLACE = 0.1
 """A measured range may err by this (m) in addition to 4 standard deviations of its noise. A larger value accepts more wrong
 ranges."""
@@ -53,6 +57,9 @@ closes more wrong loops. On MRCLAM, correct loops raised it by up to 110 for eac
 _LESSON = 50
 """The likelihood ratio of appearances is learnt first when twice this number of rays have a landmark. It is learnt again
 each time the number of rays has doubled. A larger number learns later."""
+_AGAIN = 1.05
+"""The covariance of a landmark is computed again when its number of rays has grown by this factor. A larger factor is
+faster, and gates stay wider. With a factor of 1, the time grows with the square of the rays."""
 _PAIRS = 150
 """The mean number of pairs of landmarks that the search for loops may compare for each keyframe. After a larger search, the
 next one waits for more keyframes. Without a limit, wrong input takes very long, because it gives new landmarks without end.
@@ -76,141 +83,205 @@ def initialize_unknown(
     keyframes: Keyframes, rays: Rays, cameras: tuple[Camera, ...], settings: Settings, progress: Callable[[int, int], None]
 ) -> InitialEstimate:
     """Return initial poses and landmarks. The function progress(done, total) gets numbers of keyframes."""
-    measured = Measurements.of(keyframes, rays, settings)
-    assert keyframes.drift is not None
-    heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])  # variance, rad^2
-    map_T_camera = keyframes.map_T_camera.copy()
-    first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
-    owner = np.full(len(rays), -1, dtype=np.int64)
-    known = Landmarks.none()
-    refused: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
-    none, pairs_left = np.zeros(0, dtype=np.int64), 0
-    ratio: CosineRatio | None = None
-    taught = _LESSON  # The number of rays with a landmark from which the ratio was learnt last.
-    graph, values, solved = build_graph(measured.factors(owner, none, none, known.position, end=1)), gtsam.Values(), (0, 0)
-    for begin in range(1, len(keyframes), settings.joint.explore_step):
-        end = min(begin + settings.joint.explore_step, len(keyframes))
-        follow = inverse(keyframes.map_T_camera[begin - 1]) @ keyframes.map_T_camera[begin:end]
-        map_T_camera[begin:end] = map_T_camera[begin - 1] @ follow
+    return _Exploration(keyframes, rays, cameras, settings).run(progress)
 
-        new = np.arange(first_ray[begin] if begin > 1 else 0, first_ray[end])
-        looks = None if ratio is None else Looks.of(rays, owner, len(known), ratio)
-        owner[new], map_T_camera = _recognise(
-            rays, new, known, _active(known, heading, begin), keyframes, map_T_camera, begin, end, looks
+
+class _Exploration:
+    """The exploration at the present keyframe.
+
+    way: (K, 4, 4) map_T_camera by odometry. owner: (R,) the landmark of each ray, or -1. heading: (K,) the variance of the
+    odometry's heading, rad^2. counted: (N,) the number of rays of each landmark when its covariance was computed. refused:
+    loops that raise the cost too much.
+    """
+
+    def __init__(self, keyframes: Keyframes, rays: Rays, cameras: tuple[Camera, ...], settings: Settings) -> None:
+        assert keyframes.drift is not None
+        self.keyframes, self.rays, self.cameras, self.settings = keyframes, rays, cameras, settings
+        self.measured, self.way = Measurements.of(keyframes, rays, settings), keyframes.map_T_camera
+        self.heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
+        self.first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
+        self.owner = np.full(len(rays), -1, dtype=np.int64)
+        self.known, self.counted = Landmarks.none(), np.zeros(0, dtype=np.int64)
+        self.window = SlidingWindow(self.measured, self.owner, 0)
+        self.refused: set[tuple[tuple[int, ...], tuple[int, ...]]] = set()
+        self.pairs_left = 0
+        self.ratio: CosineRatio | None = None
+        self.taught = _LESSON  # The number of rays with a landmark from which the ratio was learnt last.
+
+    def run(self, progress: Callable[[int, int], None]) -> InitialEstimate:
+        """Explore all keyframes."""
+        end = 1
+        while end < len(self.keyframes):
+            begin, end = end, self._end(end)
+            self._add(begin, end)
+            if (held := int((self.owner >= 0).sum())) >= 2 * self.taught:
+                rays = self.rays
+                self.ratio = learn_ratio(rays, rays.keyframe, rays.track_id, self.owner, len(rays.label_names))
+                self.taught = held
+            self.pairs_left += _PAIRS * (end - begin)
+            if len(self.known) and self.pairs_left > 0:
+                self._find_loop(end - 1)
+            progress(end, len(self.keyframes))
+        return InitialEstimate(self.window.map_T_camera, Association(self.owner, self.known.label), self.known.position)
+
+    def _end(self, begin: int) -> int:
+        """Return the end of the step that begins at a keyframe. A step with turns is shorter."""
+        turned = int(np.searchsorted(self.heading, self.heading[begin - 1] + _TURNED**2))
+        return min(begin + self.settings.joint.explore_step, max(turned, begin + 1), len(self.keyframes))
+
+    def _add(self, begin: int, end: int) -> None:
+        """Add the keyframes from `begin` to `end` - 1 and their rays, find new landmarks, and solve."""
+        map_T_camera, way = self.window.map_T_camera, self.way
+        map_T_camera[begin:end] = map_T_camera[begin - 1] @ inverse(way[begin - 1]) @ way[begin:end]
+        new = np.arange(self.first_ray[begin] if begin > 1 else 0, self.first_ray[end])
+        self._recognise(new, begin, end)
+        fresh = new[self.owner[new] >= 0]
+        stretch = max(0, end - _STRETCH, int(np.searchsorted(self.heading, self.heading[end - 1] - HORIZON**2)))
+        before = len(self.known)
+        self._discover(stretch, end)
+        born = np.arange(before, len(self.known))
+        self.counted = np.append(self.counted, np.zeros(len(born), dtype=np.int64))
+        if len(born):
+            fresh = np.concatenate([fresh, np.flatnonzero(self.owner >= before)])
+        self.known.see(self.rays.keyframe, self.owner, fresh, self.first_ray)
+        self.window.positions = self.known.position
+        self.window.extend(end, fresh, born, self.known.covariance[born])
+        if len(self.known):
+            self._solve()
+
+    def _solve(self, whole: bool = False) -> None:
+        """Solve the window or the whole graph. Without the landmarks that end at a camera, the graph is made again."""
+        self.window.solve(_ITERATIONS, whole)
+        kept = np.isfinite(self.window.positions[:, 0])
+        if kept.all():
+            self._settle(self.window.solved == self.window.end)
+        else:
+            into = np.where(kept, np.cumsum(kept) - 1, -1)
+            self._renumber(into, self.window.positions[kept], self.window.map_T_camera)
+            self._solve()
+
+    def _settle(self, whole: bool) -> None:
+        """Compute the covariances of the landmarks with clearly more rays than before, or of all after a whole solve."""
+        number = np.bincount(self.owner[self.owner >= 0], minlength=len(self.known))
+        due = (number >= _AGAIN * self.counted) | whole
+        which = np.flatnonzero(due[self.owner] & (self.owner >= 0))
+        index = np.cumsum(due) - 1
+        self.known.covariance[due] = covariances_at(
+            self.rays.take(which), index[self.owner[which]], self.known.position[due], self.window.map_T_camera
         )
-        fresh = new[owner[new] >= 0]
-        stretch = max(0, end - _STRETCH, int(np.searchsorted(heading, heading[end - 1] - HORIZON**2)))
-        born = _discover(rays, owner, known, keyframes, map_T_camera, stretch, end, cameras, settings)
-        fresh = np.concatenate([fresh, np.flatnonzero(owner >= len(known) - len(born))]) if len(born) else fresh
-        known.last[owner[fresh]] = np.maximum(known.last[owner[fresh]], rays.keyframe[fresh])
+        self.counted = np.where(due, number, self.counted)
 
-        graph.push_back(build_graph(measured.factors(owner, fresh, born, known.position, begin=begin, end=end)))
-        if len(known):
-            # Most variables stay as the last solve left them. To make them all again would take a fifth of the solve.
-            fresh_poses, fresh_landmarks = np.arange(solved[0], end), np.arange(solved[1], len(known))
-            add_values(values, map_T_camera, known.position, fresh_poses, fresh_landmarks)
-            values, solved = levenberg_marquardt(graph, values, _ITERATIONS, 1e-4).values, (end, len(known))
-            map_T_camera[:end] = read_poses(values)
-            known.position = read_points(values)
-            known.covariance = covariances_at(rays, owner, known.position, map_T_camera)
-        if (held := int((owner >= 0).sum())) >= 2 * taught:
-            ratio, taught = learn_ratio(rays, rays.keyframe, rays.track_id, owner, len(rays.label_names)), held
-        pairs_left += _PAIRS * (end - begin)
-        if len(known) and pairs_left > 0:
-            active, now = _active(known, heading, end - 1), end - 1
-            of = settings.association
-            looks = None if ratio is None else Looks.of(rays, owner, len(known), ratio)
-            found, compared = find_closure(known, active, rays, owner, graph, values, map_T_camera, now, of, looks)
-            pairs_left -= compared
-            if found is not None and (pairs := (tuple(found.now), tuple(found.before))) not in refused:
-                closed = _close(found, known, measured, owner, map_T_camera[:end], heading)
-                if closed is None:
-                    refused.add(pairs)
-                else:
-                    graph, known, owner, map_T_camera[:end] = closed
-                    refused.clear()  # The numbers of the landmarks have changed.
-                    values, solved = gtsam.Values(), (0, 0)
-        progress(end, len(keyframes))
-    return InitialEstimate(map_T_camera, Association(owner, known.label), known.position)
+    def _looks(self) -> Looks | None:
+        return None if self.ratio is None else Looks.of(self.rays, self.owner, len(self.known), self.ratio)
 
+    def _active(self, now: int) -> Bools:
+        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since it was last known there."""
+        return np.sqrt(self.known.turned(self.heading, now)) < HORIZON
 
-def _close(
-    found: Closure, known: Landmarks, measured: Measurements, owner: Ints, map_T_camera: Floats, heading: Floats
-) -> tuple[gtsam.NonlinearFactorGraph, Landmarks, Ints, Floats] | None:
-    """Return graph, landmarks, landmark of each ray, and poses after a loop closure. None if the cost rises too much."""
-    now, old, rays = found.now, found.before, measured.rays
-    end = len(map_T_camera)
-    poses = closed_path(found, known, map_T_camera, heading[:end])
-    into = np.arange(len(known))
-    into[now] = old
-    kept = np.flatnonzero(into == np.arange(len(known)))
-    number = np.searchsorted(kept, into)
-    first, last = known.first.copy(), known.last.copy()
-    np.minimum.at(first, into, known.first)
-    np.maximum.at(last, into, known.last)
-    # A landmark moves with the pose that observed it last.
-    carried = poses[known.last] @ inverse(map_T_camera[known.last])
-    position = np.einsum("nij,nj->ni", carried[:, :3, :3], known.position) + carried[:, :3, 3]
-    merged = Landmarks(position[kept], known.covariance[kept], known.label[kept], first[kept], last[kept])
-    owned = np.where(owner >= 0, number[owner], -1)
-    held = np.flatnonzero((owned >= 0) & (rays.keyframe < end))
-    graph = build_graph(measured.factors(owned, held, np.arange(len(merged)), merged.position, end=end))
-    start = make_values(poses, merged.position, np.arange(len(merged)))
-    values = levenberg_marquardt(graph, start, _ITERATIONS_OF_A_LOOP, 1e-4).values
-    before = truncated_cost(rays, owner, known.position, map_T_camera, *measured.odometry())
-    poses, merged.position = read_poses(values), read_points(values)
-    if truncated_cost(rays, owned, merged.position, poses, *measured.odometry()) > before + _STRAIN * len(now):
-        return None
-    merged.covariance = covariances_at(rays, owned, merged.position, poses)
-    return graph, merged, owned, poses
+    def _recognise(self, new: Ints, begin: int, end: int) -> None:
+        """Find the landmark of each new ray (n,), and align the poses from `begin` to `end` - 1 with the landmarks."""
+        active, known = self._active(begin), self.known
+        if len(new) == 0 or not active.any():
+            return
+        some, which, looks = self._some(new, begin), np.flatnonzero(active), self._looks()
+        poses = self.window.map_T_camera[begin:end]
+        drift = _drifted(self.keyframes, begin - 1, end)
+        # The step is aligned first, because the heading may err by more than the angle between two landmarks.
+        alike = None
+        if looks is not None:
+            each = np.repeat(np.arange(len(some)), len(which)), np.tile(which, len(some))
+            alike = looks.ray_odds(some, *each, np.zeros(len(each[0]), dtype=bool)).reshape(len(some), len(which))
+        spread = _planar_sigmas(drift[-1], poses[-1])
+        share = (self.heading[begin:end] - self.heading[begin - 1]) / max(
+            self.heading[end - 1] - self.heading[begin - 1], 1e-12
+        )
+        landmarks = known.position[which], known.label[which]
+        poses[:] = align(some, *landmarks, poses, poses[0, :3, 3], spread, share, alike) @ poses
+        left = _LEFT * drift + np.diag([_TURN] * 3 + [_SHIFT] * 3) ** 2
+        owner = assign(
+            some,
+            np.where(active[:, None], known.position, np.nan),
+            known.covariance,
+            known.label[:, None] == np.arange(len(self.rays.label_names)),
+            poses,
+            some.sigma,
+            pose_covariance=left,
+            looks=looks,
+        )
+        origins, _ = some.in_map(poses)
+        distance = np.linalg.norm(known.position[owner] - origins, axis=1)
+        wrong = np.abs(some.range - distance) > 4 * some.range_sigma + _PLACE
+        self.owner[new] = np.where(wrong, -1, owner)
 
+    def _discover(self, begin: int, end: int) -> None:
+        """Make landmarks of unassigned rays of the keyframes from `begin` to `end` - 1."""
+        part = np.arange(self.first_ray[begin], self.first_ray[end])
+        free, fewest = part[self.owner[part] < 0], self.settings.association.min_rays + _MORE_RAYS
+        if len(free) < fewest:
+            return
+        some, frames = self._some(free, begin), self.keyframes.take(np.arange(begin, end))
+        poses = self.window.map_T_camera[begin:end]
+        found = associate_globally(PosedRays(some, frames, self.cameras, poses, some.sigma), self.settings)
+        if found.count == 0:
+            return
+        placed, ready = triangulate_landmarks(poses, some, found, fewest, self.settings)
+        number = np.full(found.count + 1, -1, dtype=np.int64)
+        number[:-1][ready] = len(self.known) + np.arange(int(ready.sum()))
+        self.owner[free] = np.where(placed.weight > 0, number[found.object], -1)
+        self.known = self.known.and_also(placed.positions[ready], placed.covariance[ready], found.label[ready])
 
-def _active(known: Landmarks, heading: Floats, now: int) -> Bools:
-    """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since its last observation."""
-    return np.sqrt(np.maximum(heading[now] - heading[known.last], 0.0)) < HORIZON
+    def _some(self, rays: Ints, begin: int) -> Rays:
+        """Return rays (n,) whose keyframes count from `begin`."""
+        some = self.rays.take(rays)
+        return replace(some, keyframe=some.keyframe - begin)
 
+    def _find_loop(self, now: int) -> None:
+        """Close a loop that ends at keyframe `now`, if one is certain."""
+        active, of = self._active(now), self.settings.association
+        found, compared = find_closure(self.known, active, self.window, now, of, self._looks())
+        self.pairs_left -= compared
+        if found is None or (pairs := (tuple(found.now), tuple(found.before))) in self.refused:
+            return
+        if self._close(found):
+            self.refused.clear()  # The numbers of the landmarks have changed.
+        else:
+            self.refused.add(pairs)
 
-def _recognise(
-    rays: Rays,
-    new: Ints,
-    known: Landmarks,
-    active: Bools,
-    keyframes: Keyframes,
-    map_T_camera: Floats,
-    begin: int,
-    end: int,
-    looks: Looks | None,
-) -> tuple[Ints, Floats]:
-    """Return the active landmark of each new ray (n,), or -1, and all poses (K, 4, 4). The poses from `begin` to `end` - 1
-    are now aligned with the landmarks."""
-    if len(new) == 0 or not active.any():
-        return np.full(len(new), -1, dtype=np.int64), map_T_camera
-    some, which = rays.take(new), np.flatnonzero(active)
-    drift = _drifted(keyframes, begin - 1)
-    centre, spread = map_T_camera[begin, :3, 3], _planar_sigmas(drift[end - 1], map_T_camera[end - 1])
-    # The whole step is aligned first, because the heading may err by more than the angle between two landmarks.
-    alike = None
-    if looks is not None:
-        each = np.repeat(np.arange(len(some)), len(which)), np.tile(which, len(some))
-        alike = looks.ray_odds(some, *each, np.zeros(len(each[0]), dtype=bool)).reshape(len(some), len(which))
-    correction = align(some, known.position[which], known.label[which], map_T_camera, centre, spread, alike)
-    poses = map_T_camera.copy()
-    poses[begin:end] = correction @ poses[begin:end]
-    left = _LEFT * drift + np.diag([_TURN] * 3 + [_SHIFT] * 3) ** 2
-    owner = assign(
-        some,
-        np.where(active[:, None], known.position, np.nan),
-        known.covariance,
-        known.label[:, None] == np.arange(len(rays.label_names)),
-        poses,
-        some.sigma,
-        pose_covariance=left,
-        looks=looks,
-    )
-    origins, _ = some.in_map(poses)
-    distance = np.linalg.norm(known.position[owner] - origins, axis=1)
-    wrong = np.abs(some.range - distance) > 4 * some.range_sigma + _PLACE
-    return np.where(wrong, -1, owner), poses
+    def _close(self, found: Closure) -> bool:
+        """Close a loop, unless the cost rises too much. Return whether it is closed."""
+        known, owner, window, counted = self.known, self.owner, self.window, self.counted
+        now, old, end, poses = found.now, found.before, window.end, window.map_T_camera.copy()
+        before = self._cost()
+        poses[:end] = closed_path(found, known, poses[:end], self.heading[:end])
+        into = np.arange(len(known))
+        into[now] = old
+        kept = np.flatnonzero(into == np.arange(len(known)))
+        # A landmark moves with the pose that observed it last.
+        last = self.known.renumbered(np.searchsorted(kept, into), known.position[kept]).last
+        carried = poses[last] @ inverse(window.map_T_camera[last])
+        position = np.einsum("nij,nj->ni", carried[:, :3, :3], known.position[kept]) + carried[:, :3, 3]
+        self._renumber(np.searchsorted(kept, into), position, poses)
+        self.window.solve(_ITERATIONS_OF_A_LOOP)
+        if self._cost() <= before + _STRAIN * len(now):
+            self._settle(True)
+            return True
+        self.known, self.owner, self.window, self.counted = known, owner, window, counted
+        return False
+
+    def _cost(self) -> float:
+        """Return the cost of the present map, NaN if a landmark has left the graph."""
+        poses = self.window.map_T_camera[: self.window.end]
+        return truncated_cost(self.rays, self.owner, self.known.position, poses, *self.measured.odometry())
+
+    def _renumber(self, into: Ints, positions: Floats, map_T_camera: Floats) -> None:
+        """Give the rays of each landmark to landmark into[j] (N,), -1 for none, in a graph that is made again.
+
+        positions: (M, 3) m, of the new landmarks. map_T_camera: (K, 4, 4).
+        """
+        self.known = self.known.renumbered(into, positions)
+        self.owner = np.append(into, -1)[self.owner]
+        self.window = self.window.regrown(self.owner, positions, map_T_camera)
+        self.counted = np.zeros(len(positions), dtype=np.int64)
 
 
 def _planar_sigmas(covariance: Floats, map_T_camera: Floats) -> Floats:
@@ -220,48 +291,11 @@ def _planar_sigmas(covariance: Floats, map_T_camera: Floats) -> Floats:
     return np.sqrt(np.maximum([place[0], place[1], rotation[2]], 0.0))
 
 
-def _discover(
-    rays: Rays,
-    owner: Ints,
-    known: Landmarks,
-    keyframes: Keyframes,
-    map_T_camera: Floats,
-    begin: int,
-    end: int,
-    cameras: tuple[Camera, ...],
-    settings: Settings,
-) -> Ints:
-    """Add landmarks from unassigned rays of keyframes `begin` to `end` - 1 to `known` and `owner`. Return their numbers."""
-    free = np.flatnonzero((owner < 0) & (rays.keyframe >= begin) & (rays.keyframe < end))
-    none, fewest = np.zeros(0, dtype=np.int64), settings.association.min_rays + _MORE_RAYS
-    if len(free) < fewest:
-        return none
-    some = rays.take(free)
-    frames, poses = keyframes.take(np.arange(end)), map_T_camera[:end]
-    found = associate_globally(PosedRays(some, frames, cameras, poses, some.sigma), settings)
-    if found.count == 0:
-        return none
-    placed, ready = triangulate_landmarks(map_T_camera, some, found, fewest, settings)
-    born = len(known.label) + np.arange(int(ready.sum()))
-    number = np.full(found.count + 1, -1, dtype=np.int64)
-    number[:-1][ready] = born
-    owner[free] = np.where(placed.weight > 0, number[found.object], -1)
-    known.position = np.concatenate([known.position, placed.positions[ready]])
-    known.covariance = np.concatenate([known.covariance, placed.covariance[ready]])
-    known.label = np.concatenate([known.label, found.label[ready]])
-    mine = free[owner[free] >= 0]
-    seen_first = np.full(len(known.label), len(keyframes), dtype=np.int64)
-    np.minimum.at(seen_first, owner[mine], rays.keyframe[mine])
-    known.first = np.concatenate([known.first, seen_first[born]])
-    known.last = np.concatenate([known.last, np.zeros(len(born), dtype=np.int64)])
-    return born
-
-
-def _drifted(keyframes: Keyframes, since: int) -> Floats:
-    """Return the covariances (K, 6, 6) that the odometry accumulated after keyframe `since`, each in its camera's frame."""
+def _drifted(keyframes: Keyframes, since: int, end: int) -> Floats:
+    """Return the covariances (n, 6, 6) that the odometry accumulated after keyframe `since` until each later keyframe before
+    `end`, in its camera's frame."""
     odom_T_base, drift = keyframes.odom_T_base, keyframes.drift
     assert odom_T_base is not None
     assert drift is not None
-    to_camera = adjoint(inverse(odom_T_base @ keyframes.base_T_camera))
-    gathered = np.where((np.arange(len(drift)) >= since)[:, None, None], drift - drift[since], 0.0)
-    return to_camera @ gathered @ np.swapaxes(to_camera, 1, 2)
+    to_camera = adjoint(inverse(odom_T_base[since + 1 : end] @ keyframes.base_T_camera[since + 1 : end]))
+    return to_camera @ (drift[since + 1 : end] - drift[since]) @ np.swapaxes(to_camera, 1, 2)

@@ -13,6 +13,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, exp_se3, inverse, log_se3
 from objslam.core.types import Rays
 from objslam.graph.robust_cost import FLOOR, ray_information
+from objslam.graph.sliding_window import SlidingWindow
 from objslam.graph.variables import X0
 
 _EPOCHS = 8
@@ -20,6 +21,15 @@ _EPOCHS = 8
 _SLIPS = (1.0, 3.0, 10.0)
 """The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
 more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
+_BESIDE = 0.03
+"""The standard deviation (rad) of the heading around a landmark, if it is known around another one that some frame showed
+beside it. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after longer ways
+through the map, of which parts may be bent."""
+_STEPS = 10
+"""The most landmarks on such a way. More than ten add a larger variance than an exploration accepts."""
+_MORE = 1.5
+"""Landmarks are compared again when the recent landmark of a pair has this multiple of the rays that it had before. A larger
+number is faster, and finds loops later. With 1, two landmarks that never match would be compared at each step."""
 _EPOCH = 40
 """An epoch is this number of consecutive keyframes. The drift since an epoch is computed from only one of its keyframes, so
 a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
@@ -35,23 +45,93 @@ keyframes near it, so few are enough. A larger number takes longer."""
 
 @dataclass
 class Landmarks:
-    """N landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), and first and last keyframe (N,) that saw
-    each."""
+    """N landmarks: position (N, 3) m, covariance (N, 3, 3) m^2, label (N,), and first and last keyframe (N,) that saw each.
+
+    rays: (N,) the number of rays of each landmark. together: (N, N) whether some frame shows both landmarks. compared:
+    (N, N) the number of rays of the first landmark when it was last compared with the second one.
+    """
 
     position: Floats
     covariance: Floats
     label: Ints
     first: Ints
     last: Ints
+    rays: Ints
+    together: Bools
+    compared: Ints
 
     @classmethod
     def none(cls) -> Self:
         """Return an empty table."""
         nobody = np.zeros(0, dtype=np.int64)
-        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody)
+        pairs = np.zeros((0, 0), dtype=bool), np.zeros((0, 0), dtype=np.int64)
+        return cls(np.zeros((0, 3)), np.zeros((0, 3, 3)), nobody, nobody, nobody, nobody, *pairs)
 
     def __len__(self) -> int:
         return len(self.label)
+
+    def and_also(self, position: Floats, covariance: Floats, label: Ints) -> Self:
+        """Return the landmarks and n further ones that no frame has seen yet. position: (n, 3) m. label: (n,)."""
+        return type(self)(
+            np.concatenate([self.position, position]),
+            np.concatenate([self.covariance, covariance]),
+            np.concatenate([self.label, label]),
+            np.append(self.first, np.full(len(label), np.iinfo(np.int64).max)),
+            np.append(self.last, np.full(len(label), -1)),
+            np.append(self.rays, np.zeros(len(label), dtype=np.int64)),
+            np.pad(self.together, (0, len(label))),
+            np.pad(self.compared, (0, len(label))),
+        )
+
+    def renumbered(self, into: Ints, position: Floats) -> Self:
+        """Return M landmarks of which each takes the place of all landmarks j with its number in into[j] (N,). -1 drops j.
+
+        position: (M, 3) m. The covariances are NaN.
+        """
+        count, kept = len(position), np.flatnonzero(into >= 0)
+        to = into[kept]
+        label, last, rays = np.zeros((3, count), dtype=np.int64)
+        label[to] = self.label[kept]
+        np.add.at(rays, to, self.rays[kept])
+        first = np.full(count, np.iinfo(np.int64).max)
+        np.minimum.at(first, to, self.first[kept])
+        np.maximum.at(last, to, self.last[kept])
+        together = np.zeros((count, count), dtype=bool)
+        np.logical_or.at(together, (to[:, None], to), self.together[np.ix_(kept, kept)])
+        compared = np.zeros((count, count), dtype=np.int64)
+        return type(self)(position, np.full((count, 3, 3), np.nan), label, first, last, rays, together, compared)
+
+    def see(self, keyframe: Ints, owner: Ints, which: Ints, first_ray: Ints) -> None:
+        """Note that the landmarks own new rays `which` (n,). Rays are sorted by keyframe.
+
+        keyframe, owner: (R,) the keyframe of each ray, and its landmark, or -1. first_ray: (K+1,) of each keyframe.
+        """
+        if not len(which):
+            return
+        np.add.at(self.rays, owner[which], 1)
+        np.minimum.at(self.first, owner[which], keyframe[which])
+        np.maximum.at(self.last, owner[which], keyframe[which])
+        seen = np.unique(keyframe[which]).tolist()
+        beside = np.concatenate([np.arange(first_ray[k], first_ray[k + 1]) for k in seen])
+        self.together |= seen_together(keyframe[beside] - seen[0], owner[beside], len(self))
+
+    def turned(self, heading: Floats, now: int) -> Floats:
+        """Return the variance (N,), rad^2, of the heading at keyframe `now` in the part of the map around each landmark.
+
+        The heading drifts since the last observation of a landmark. If a frame showed another landmark beside it, the other
+        one tells where it is. So if the other one was observed later, the heading drifts only since then.
+
+        heading: (K,) the variance of the odometry's heading.
+        """
+        variance = np.maximum(heading[now] - heading[self.last], 0.0)
+        for _ in range(_STEPS if len(self) else 0):
+            beside = np.where(self.together, variance, np.inf)
+            np.fill_diagonal(beside, np.inf)
+            fewer = np.minimum(variance, beside.min(axis=1) + _BESIDE**2)
+            if (fewer == variance).all():
+                break
+            variance = fewer
+        return variance
 
 
 @dataclass(frozen=True)
@@ -71,11 +151,7 @@ class Closure:
 def find_closure(
     landmarks: Landmarks,
     active: Bools,
-    rays: Rays,
-    owner: Ints,
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    map_T_camera: Floats,
+    window: SlidingWindow,
     now: int,
     settings: AssociationSettings,
     looks: Looks | None = None,
@@ -85,27 +161,31 @@ def find_closure(
     There are two searches. For a long drift, the recently seen landmarks (`active`, (N,)) are matched with all others. For a
     slip or a push, only the new landmarks (first seen in the last `_EPOCH` keyframes) are matched with all others.
 
-    A pair is a recent and an old landmark of one label. It counts once for each tried drift.
+    A search is made only if it has a new pair, or more rays of the recent landmark of a pair (`_MORE`). A pair is a recent
+    and an old landmark of one label. It counts once for each tried drift.
 
-    owner: (R,) the landmark of each ray, or -1. graph, values: solved. map_T_camera: (K, 4, 4) the solved poses. now: the
-    newest keyframe. looks: what the landmarks look like, None if this is not known.
+    window: the solved graph. now: the newest keyframe. looks: what the landmarks look like, None if this is not known.
     """
-    together = seen_together(rays.keyframe, owner, len(landmarks))
+    map_T_camera = window.map_T_camera
     density = label_densities(landmarks.position, landmarks.label)
     pivot = map_T_camera[now, :2, 3]
+    due = landmarks.rays[:, None] >= _MORE * landmarks.compared
     born = active & (landmarks.first >= now - _EPOCH)
     best: Closure | None = None
     compared = 0
     marginals: gtsam.Marginals | None = None
     for here, there in ((active, ~active), (born, ~born)):
-        possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~together
+        possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~landmarks.together
+        if not (possible & due).any():
+            continue
         one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
         if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
             continue
         try:
-            marginals = marginals or gtsam.Marginals(graph, values)
+            marginals = marginals or gtsam.Marginals(*window.whole())
         except RuntimeError:  # The system is indeterminate, so no loop can be tested.
             return None, compared
+        landmarks.compared = np.where(possible, landmarks.rays[:, None], landmarks.compared)
         before = np.minimum(landmarks.last[two], landmarks.first[one].min())
         epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
         anchors = [int(before[before // _EPOCH == e].max()) for e in epochs]
@@ -125,9 +205,7 @@ def find_closure(
     return best, compared
 
 
-def find_missed_closures(
-    landmarks: Landmarks, middle: Floats, rays: Rays, owner: Ints, map_T_camera: Floats
-) -> list[Closure]:
+def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Floats) -> list[Closure]:
     """Return loops that a whole solved path may have missed, those with the most evidence first.
 
     A search during initialisation allows for the drift that the odometry says. Landmarks may be confused after an unlikely
@@ -135,14 +213,13 @@ def find_missed_closures(
     landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with those seen mostly before
     it. The loops are proposals, and a solve must judge them.
 
-    middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. owner: (R,) the
-    landmark of each ray, or -1. map_T_camera: (K, 4, 4) the solved poses.
+    middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera:
+    (K, 4, 4) the solved poses.
     """
     counts = np.flatnonzero(np.isfinite(middle))
     if len(counts) < 2 * MIN_LANDMARKS:
         return []
-    together = seen_together(rays.keyframe, owner, len(landmarks))
-    possible = (landmarks.label[:, None] == landmarks.label) & ~together
+    possible = (landmarks.label[:, None] == landmarks.label) & ~landmarks.together
     density = np.zeros(len(landmarks))
     density[counts] = label_densities(landmarks.position[counts], landmarks.label[counts])
     found: dict[tuple[tuple[int, ...], tuple[int, ...]], Closure] = {}

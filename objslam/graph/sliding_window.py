@@ -4,6 +4,8 @@ If each step solved the whole graph, the time would grow with the square of the 
 whole graph is solved each time its size has doubled. All whole solves together take twice the time of the last one.
 """
 
+from typing import Self
+
 import gtsam
 import numpy as np
 
@@ -27,19 +29,20 @@ were 0.2 s apart. A larger distance also removes real landmarks."""
 class SlidingWindow:
     """Camera poses map_T_camera (K, 4, 4) and landmark positions (N, 3), in map, of a graph that grows along the path.
 
-    A landmark that is not in the graph yet has the position NaN. The graph has the keyframes before `end`.
+    A landmark that is not in the graph yet has the position NaN. The graph has the keyframes before `end`. The last whole
+    solve had the keyframes before `solved`.
     """
 
-    def __init__(self, measured: Measurements, owner: Ints, landmarks: int, iterations: int) -> None:
-        """Start with the first keyframe. owner: (R,) the landmark of each ray. iterations: the most in a solve."""
+    def __init__(self, measured: Measurements, owner: Ints, landmarks: int) -> None:
+        """Start with the first keyframe. owner: (R,) the landmark of each ray. The caller may change it for later rays."""
         self.map_T_camera = measured.keyframes.map_T_camera.copy()
         self.positions = np.full((landmarks, 3), np.nan)
-        self._measured, self._owner, self._iterations = measured, owner, iterations
+        self._measured, self._owner = measured, owner
         self._factors: list[list[gtsam.NonlinearFactor]] = [[] for _ in self.map_T_camera]  # By their last keyframe.
         self._weak: dict[int, gtsam.NonlinearFactor] = {}  # The weak prior of each landmark, by its key.
         self._held: dict[int, gtsam.NonlinearFactor] = {}  # By key: the prior in place of factors outside the window.
         self._values = gtsam.Values()
-        self._begin, self.end, self._solved = 0, 0, 0  # The window's ends, and `end` at the last whole solve.
+        self._begin, self.end, self.solved = 0, 0, 0  # The window's ends, and `end` at the last whole solve.
         nothing = np.zeros(0, dtype=np.int64)
         self.extend(1, nothing, nothing, np.zeros((0, 3, 3)))
 
@@ -64,16 +67,34 @@ class SlidingWindow:
                 self._held[L0 + j] = _prior(L0 + j, self._values, spread)
         self.end = end
 
-    def solve(self) -> Optimum:
-        """Solve the window, or the whole graph if it has grown enough or is complete. Then move the window on.
+    def regrown(self, owner: Ints, positions: Floats, map_T_camera: Floats) -> Self:
+        """Return a window at the same keyframes with other landmarks and poses (K, 4, 4). Its next solve is whole.
+
+        owner: (R,) the landmark of each ray. positions: (N, 3) m, all finite.
+        """
+        other = type(self)(self._measured, owner, len(positions))
+        other.map_T_camera[:], other.positions = map_T_camera, positions
+        held = np.flatnonzero((owner >= 0) & (self._measured.rays.keyframe < self.end))
+        other.extend(self.end, held, np.arange(len(positions)), np.zeros((len(positions), 3, 3)))
+        return other
+
+    def whole(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """Return the whole graph and its values."""
+        graph = build_graph(*self._factors[: self.end], list(self._weak.values()))
+        return graph, self._values
+
+    def solve(self, iterations: int, whole: bool = False) -> Optimum:
+        """Solve the window by at most some iterations. Then move the window on.
+
+        The whole graph is solved if the caller asks for it, or if the graph has grown enough or is complete.
 
         A landmark that ends at a camera (`_AT_CAMERA`) leaves the graph, its position becomes NaN, and new rays may find it
         again. SolveError if the linear system is indeterminate, or if the cost is not finite.
         """
-        if self.end >= _GROWTH * self._solved or self.end == len(self.map_T_camera):
-            self._begin, self._solved, self._held = 0, self.end, {}
+        if whole or self.end >= _GROWTH * self.solved or self.end == len(self.map_T_camera):
+            self._begin, self.solved, self._held = 0, self.end, {}
         graph = self._graph(self._begin, self.end)
-        optimum = levenberg_marquardt(graph, self._values.extract(graph.keyVector()), self._iterations, 1e-4)
+        optimum = levenberg_marquardt(graph, self._values.extract(graph.keyVector()), iterations, 1e-4)
         self._values.update(optimum.values)
         keyframes, poses = keyframes_in(optimum.values)
         landmarks, points = landmarks_in(optimum.values)

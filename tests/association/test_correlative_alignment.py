@@ -62,32 +62,46 @@ def test_the_correction_of_a_stretch_comes_back(seed, ranges):
     off = lift_se2(np.array([0.05, -0.06, 0.09]))
     wrong = off @ poses
     labels = np.zeros(len(LANDMARKS), dtype=np.int64)
-    correction = align(rays, LANDMARKS, labels, wrong, wrong[0, :3, 3], np.array([0.1, 0.1, 0.07]))
+    correction = align(rays, LANDMARKS, labels, wrong, wrong[0, :3, 3], np.array([0.1, 0.1, 0.07]), np.ones(len(poses)))
     assert nearest(rays, correction @ wrong)[:-3].mean() > 0.97
     assert nearest(rays, wrong)[:-3].mean() < 0.8
     left = inverse(poses) @ correction @ wrong
     assert np.abs(np.arctan2(left[:, 0, 2], left[:, 2, 2])).max() < 0.03
 
 
+def test_a_heading_that_drifts_along_the_poses_is_corrected_at_each_pose():
+    """One correction for all poses fits only some of their rays."""
+    poses, rays, _ = drive(np.random.default_rng(0), rays_each=2)
+    share = np.linspace(0, 1, len(poses))
+    wrong = lift_se2(share[:, None] * np.array([0.0, 0.0, 0.2])) @ poses
+    spread = np.array([0.0, 0.0, 0.1])
+    labels, off = np.zeros(len(LANDMARKS), dtype=np.int64), []
+    for part in (share, np.ones(len(poses))):
+        left = inverse(poses) @ align(rays, LANDMARKS, labels, wrong, np.zeros(3), spread, part) @ wrong
+        off.append(np.abs(np.arctan2(left[:, 0, 2], left[:, 2, 2])).max())
+    assert off[0] < 0.02
+    assert off[1] > 0.05
+
+
 def test_without_drift_nothing_moves():
     poses, rays, _ = drive(np.random.default_rng(0))
-    still = align(
-        rays, LANDMARKS + np.array([0.1, 0.1, 0.0]), np.zeros(5, dtype=np.int64), poses, poses[3, :3, 3], np.zeros(3)
-    )
-    np.testing.assert_allclose(still, np.eye(4), atol=1e-12)
+    labels, whole = np.zeros(5, dtype=np.int64), np.ones(len(poses))
+    still = align(rays, LANDMARKS + np.array([0.1, 0.1, 0.0]), labels, poses, poses[3, :3, 3], np.zeros(3), whole)
+    np.testing.assert_allclose(still, np.broadcast_to(np.eye(4), still.shape), atol=1e-12)
 
 
 def test_landmarks_of_other_labels_say_nothing():
     poses, rays, _ = drive(np.random.default_rng(0))
-    still = align(rays, LANDMARKS, np.ones(5, dtype=np.int64), poses, poses[0, :3, 3], np.full(3, 0.1))
-    np.testing.assert_allclose(still, np.eye(4), atol=1e-12)
+    still = align(rays, LANDMARKS, np.ones(5, dtype=np.int64), poses, poses[0, :3, 3], np.full(3, 0.1), np.ones(len(poses)))
+    np.testing.assert_allclose(still, np.broadcast_to(np.eye(4), still.shape), atol=1e-12)
 
 
 @pytest.mark.parametrize("at_once", [300, 30])  # fewer hypotheses, and fewer rays too
 def test_what_does_not_fit_into_memory_at_once_is_taken_in_parts(monkeypatch, at_once):
     poses, rays, _ = drive(np.random.default_rng(1), rays_each=2)
     wrong = lift_se2(np.array([0.03, 0.02, 0.05])) @ poses
-    ask = (rays, LANDMARKS, np.zeros(5, dtype=np.int64), wrong, wrong[0, :3, 3], np.array([0.1, 0.1, 0.07]))
+    spread, whole = np.array([0.1, 0.1, 0.07]), np.ones(len(poses))
+    ask = (rays, LANDMARKS, np.zeros(5, dtype=np.int64), wrong, wrong[0, :3, 3], spread, whole)
     whole = align(*ask)
     monkeypatch.setattr("objslam.association.correlative_alignment._AT_ONCE", at_once)
     np.testing.assert_array_equal(align(*ask), whole)

@@ -12,6 +12,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.graph import init_unknown_correspondences
 from objslam.graph.init_unknown_correspondences import _planar_sigmas, initialize_unknown
 from objslam.graph.loop_closure import distribute_correction
+from objslam.graph.sliding_window import SlidingWindow
 from objslam.mapping import pipeline
 from objslam.mapping.solution import rays_moved, seen_something
 from objslam.simulation import preset, simulate
@@ -51,6 +52,28 @@ def test_a_large_search_for_loops_waits_for_keyframes(monkeypatch):
     monkeypatch.setattr(init_unknown_correspondences, "_PAIRS", 40)
     initialize_unknown(keyframes, rays, (log.cameras[0].camera,), settings, lambda done, total: None)
     assert 40 * len(keyframes) - 1000 <= sum(searches) <= 40 * len(keyframes) + 1000
+
+
+def test_an_exploration_solves_the_whole_graph_only_at_doublings_and_loops(monkeypatch):
+    """With a whole solve in each step, the time would grow with the square of the drive."""
+    log = simulate(preset("drift"), 0)
+    settings = Settings.model_validate({"mode": "joint", "odometry": STEP})
+    frames = build_keyframes(log, settings, Ledger())
+    keyframes, rays = seen_something(frames, build_rays(log, frames, settings, Ledger()))
+    solve, close, whole, loops = SlidingWindow.solve, init_unknown_correspondences._Exploration._close, [], []
+
+    def counted(window, *given):
+        optimum = solve(window, *given)
+        whole.append(window.solved == window.end)
+        return optimum
+
+    monkeypatch.setattr(SlidingWindow, "solve", counted)
+    monkeypatch.setattr(
+        init_unknown_correspondences._Exploration, "_close", lambda *of: loops.append(close(*of)) or loops[-1]
+    )
+    initialize_unknown(keyframes, rays, (log.cameras[0].camera,), settings, lambda done, total: None)
+    assert len(whole) >= len(keyframes) / settings.joint.explore_step - 1
+    assert sum(whole) <= np.log2(len(keyframes)) + 2 * len(loops) + 1  # The step after a loop is whole too.
 
 
 def test_a_bent_path_begins_where_it_was_and_ends_where_it_should():

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import gtsam
 import numpy as np
 import pytest
 
 from objslam.core.geometry import lift_se2
-from objslam.graph.loop_closure import POSE_FLOOR, Landmarks, closed_path, find_missed_closures, relative_covariances
+from objslam.graph.loop_closure import (
+    _BESIDE,
+    POSE_FLOOR,
+    Landmarks,
+    closed_path,
+    find_missed_closures,
+    relative_covariances,
+)
 from objslam.graph.variables import X0
 
 
@@ -60,15 +65,15 @@ def two_visits(seed, turn, shift):
     places = np.column_stack([rng.uniform(0, 8, (8, 2)), rng.uniform(0, 1.5, 8)])
     moved = places @ gtsam.Rot3.Rz(turn).matrix().T + [*shift, 0.0]
     position = np.concatenate([places, moved]) + rng.normal(0, 0.03, (16, 3))
-    number = np.arange(16)
-    landmarks = Landmarks(position, np.tile(0.05**2 * np.eye(3), (16, 1, 1)), 0 * number, 10 * number, 10 * number + 9)
-    rays = SimpleNamespace(keyframe=np.repeat(10 * number, 5))
-    return landmarks, rays, np.repeat(number, 5), np.tile(np.eye(4), (160, 1, 1))
+    owner = np.repeat(np.arange(16), 10)
+    landmarks = Landmarks.none().and_also(position, np.tile(0.05**2 * np.eye(3), (16, 1, 1)), np.zeros(16, dtype=np.int64))
+    landmarks.see(np.arange(160), owner, np.arange(160), np.arange(161))
+    return landmarks, np.tile(np.eye(4), (160, 1, 1))
 
 
 def test_the_second_visit_is_found_through_a_bend_of_the_path():
-    landmarks, rays, owner, path = two_visits(1, np.radians(25), (1.5, -1.0))
-    found = find_missed_closures(landmarks, landmarks.first + 4.5, rays, owner, path)
+    landmarks, path = two_visits(1, np.radians(25), (1.5, -1.0))
+    found = find_missed_closures(landmarks, landmarks.first + 4.5, path)
     best = found[0]
     assert dict(zip(best.now.tolist(), best.before.tolist(), strict=True)) == {8 + i: i for i in range(8)}
     moved = landmarks.position[8:] @ best.correction[:3, :3].T + best.correction[:3, 3]
@@ -80,12 +85,45 @@ def test_the_second_visit_is_found_through_a_bend_of_the_path():
 
 
 def test_landmarks_that_one_frame_shows_are_no_copies():
-    landmarks, rays, owner, path = two_visits(1, np.radians(25), (1.5, -1.0))
-    rays.keyframe = np.zeros(len(owner), dtype=np.int64)
-    assert find_missed_closures(landmarks, landmarks.first + 4.5, rays, owner, path) == []
+    landmarks, path = two_visits(1, np.radians(25), (1.5, -1.0))
+    landmarks.together[:] = True
+    assert find_missed_closures(landmarks, landmarks.first + 4.5, path) == []
 
 
 def test_few_landmarks_are_no_loop():
-    landmarks, rays, owner, path = two_visits(1, 0.0, (0.0, 0.0))
+    landmarks, path = two_visits(1, 0.0, (0.0, 0.0))
     middle = np.where(np.arange(16) < 3, landmarks.first, np.nan)
-    assert find_missed_closures(landmarks, middle, rays, owner, path) == []
+    assert find_missed_closures(landmarks, middle, path) == []
+
+
+def seen(owner: list[int], keyframe: list[int]) -> Landmarks:
+    """Landmarks of rays (R,), which are sorted by keyframe."""
+    rays, count = np.array(owner), max(owner) + 1
+    landmarks = Landmarks.none().and_also(np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count, dtype=np.int64))
+    first_ray = np.searchsorted(keyframe, np.arange(max(keyframe) + 2))
+    landmarks.see(np.array(keyframe), rays, np.arange(len(rays)), first_ray)
+    return landmarks
+
+
+def test_a_landmark_is_expected_from_those_that_a_frame_showed_beside_it():
+    """Landmark 0 was beside 1, and 1 beside 2, which is seen last. Nothing was beside landmark 3."""
+    landmarks = seen([0, 1, 3, 1, 2, 2], [0, 0, 1, 2, 2, 9])
+    turned = landmarks.turned(0.01 * np.arange(10.0), 9)
+    np.testing.assert_allclose(turned, [2 * _BESIDE**2, _BESIDE**2, 0.0, 0.08], atol=1e-12)
+
+
+def test_a_landmark_beside_none_that_was_seen_later_drifts_alone():
+    landmarks = seen([0, 1, 1], [2, 2, 3])
+    heading = np.array([0.0, 0.0, 0.0, 1e-4, 1e-3, 2e-3])  # Less than the way over landmark 1 adds.
+    np.testing.assert_allclose(landmarks.turned(heading, 5), [2e-3, 1.9e-3], atol=1e-12)
+    assert landmarks.turned(100 * heading, 5)[0] == pytest.approx(0.19 + _BESIDE**2)
+
+
+def test_merged_landmarks_have_the_rays_and_frames_of_all():
+    landmarks = seen([0, 1, 2, 3, 0, 3], [0, 0, 4, 4, 6, 7])
+    merged = landmarks.renumbered(np.array([0, 1, 0, -1]), np.ones((2, 3)))
+    assert merged.rays.tolist() == [3, 1]
+    assert merged.first.tolist() == [0, 0]
+    assert merged.last.tolist() == [6, 0]
+    assert merged.together.tolist() == [[True, True], [True, True]]
+    assert not merged.compared.any()  # All pairs are compared again.

@@ -22,7 +22,7 @@ def at_truth(seed: int = 0, **changes) -> tuple[Drive, SlidingWindow]:
     keyframes = replace(drive.keyframes, map_T_base=drive.map_T_base)
     drive = replace(drive, keyframes=keyframes)
     measured = Measurements.of(keyframes, drive.rays, drive.settings)
-    return drive, SlidingWindow(measured, drive.association.object, drive.association.count, 20)
+    return drive, SlidingWindow(measured, drive.association.object, drive.association.count)
 
 
 def extended(drive: Drive, window: SlidingWindow, end: int) -> None:
@@ -50,7 +50,7 @@ def grow(drive: Drive, window: SlidingWindow) -> list[np.ndarray]:
     paths = []
     for end in [*range(1 + STEP, len(drive.keyframes), STEP), len(drive.keyframes)]:
         extended(drive, window, end)
-        window.solve()
+        window.solve(20)
         paths.append(window.map_T_camera[:end].copy())
     return paths
 
@@ -113,7 +113,7 @@ def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
     drive, window = at_truth()
     end = 1 + 4 * STEP
     extended(drive, window, end)
-    window.solve()
+    window.solve(20)
     bad = int(np.flatnonzero(np.isfinite(window.positions[:, 0]))[0])
     taken = []
 
@@ -126,7 +126,7 @@ def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
 
     monkeypatch.setattr(sliding_window, "levenberg_marquardt", collapsing)
     extended(drive, window, end + STEP)
-    window.solve()
+    window.solve(20)
     assert np.isnan(window.positions[bad]).all()
     rays = np.flatnonzero((drive.association.object != bad) & (drive.rays.keyframe > 0))
     for last in [*range(end + 2 * STEP, len(drive.keyframes), STEP), len(drive.keyframes)]:
@@ -134,7 +134,7 @@ def test_a_landmark_that_ends_at_a_camera_leaves_the_graph(monkeypatch):
         born = np.setdiff1d(np.unique(drive.association.object[some]), np.flatnonzero(np.isfinite(window.positions[:, 0])))
         window.positions[born] = drive.points[born]
         window.extend(last, some, born, np.tile(np.eye(3), (len(born), 1, 1)))
-        window.solve()
+        window.solve(20)
     measured = Measurements.of(drive.keyframes, drive.rays, drive.settings)
     landmarks = np.unique(drive.association.object[rays])
     graph = build_graph(measured.factors(drive.association.object, rays, landmarks, drive.points))
@@ -151,3 +151,21 @@ def test_a_point_is_at_a_camera_if_any_camera_is_near_enough():
     found = sliding_window._at_a_point(positions, points)
     assert 20 < found.sum() < 44
     np.testing.assert_array_equal(found, nearest < sliding_window._AT_CAMERA)
+
+
+def test_a_window_with_other_landmarks_is_solved_as_a_whole():
+    """Two landmarks that were one thing become one. The graph is then that of all rays, as if it had grown so."""
+    drive, window = at_truth()
+    one = np.where(drive.rays.keyframe > 0, drive.association.object, -1)
+    owner = one.copy()
+    first = np.flatnonzero(owner == 0)
+    owner[first[len(first) // 2 :]] = drive.association.count
+    points = np.concatenate([drive.points, drive.points[:1]])
+    split = SlidingWindow(window._measured, owner, len(points))
+    end = len(drive.keyframes)
+    split.positions[:] = points
+    split.extend(end, np.flatnonzero(owner >= 0), np.arange(len(points)), np.zeros((len(points), 3, 3)))
+    joined = split.regrown(one, drive.points.copy(), split.map_T_camera)
+    joined.solve(100)
+    assert joined.solved == end
+    assert apart(joined.map_T_camera, whole_solution(drive, end)) < 1e-3

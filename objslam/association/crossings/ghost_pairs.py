@@ -28,7 +28,8 @@ slower."""
 _POINTS = 120
 """The most proposed points that are tried in pairs. A larger number is slower: all pairs of points are scored."""
 _RAYS = 300
-"""The most rays that score pairs of points. The refinement uses all rays. A larger number is slower."""
+"""The most rays that score pairs of points, and that first compare the best pair with the two landmarks. All rays compare
+them only if the pair is then better. A larger number is slower."""
 _LEAST_GAIN = 30.0
 """The least decrease of -2 ln likelihood by which two new points must explain the rays of two landmarks better. Rays share
 errors, so that a small decrease is chance. With a larger value, fewer ghosts are replaced."""
@@ -61,6 +62,9 @@ def replace_ghosts(state: State, gate: float, seed: int = 0) -> State:
         obs, noise = state.obs.take(held), float(state.class_noise[state.label[pair[0]]])
         found = _best_points(obs, noise, gate, np.random.default_rng([seed, *pair]))
         if found is None:
+            continue
+        few = _some(obs)
+        if _settled(few, found, noise, gate)[2] >= _settled(few, position[pair], noise, gate)[2]:
             continue
         _, _, now = _settled(obs, position[pair], noise, gate)
         points, owner, cost = _settled(obs, found, noise, gate)
@@ -98,10 +102,14 @@ def _best_points(obs: Observations, noise: float, gate: float, rng: np.random.Ge
     points = middle[(depth1 > MIN_DEPTH) & (depth2 > MIN_DEPTH) & (sin2 > _LEAST_SIN2)][:_POINTS]
     if len(points) < 2:
         return None
-    some = obs.take(np.unique(np.linspace(0, len(obs) - 1, _RAYS).astype(np.int64)))
-    costs = _costs(some, points, noise, gate)
+    costs = _costs(_some(obs), points, noise, gate)
     together = np.stack([np.minimum(one, costs).sum(axis=1) for one in costs])
     return np.asarray(points[list(np.unravel_index(together.argmin(), together.shape))])
+
+
+def _some(obs: Observations) -> Observations:
+    """Return every n-th ray, about `_RAYS` of them."""
+    return obs.take(np.unique(np.linspace(0, len(obs) - 1, _RAYS).astype(np.int64)))
 
 
 def _settled(obs: Observations, points: Floats, noise: float, gate: float) -> tuple[Floats, Ints, float]:

@@ -12,7 +12,7 @@ from objslam.errors import SolveError
 from objslam.mapping.merge_and_split import joined
 
 if TYPE_CHECKING:
-    from objslam.core.arrays import Floats, Ints
+    from objslam.core.arrays import Floats
     from objslam.graph.loop_closure import Closure, Landmarks
     from objslam.mapping.joint_alternation import JointState
 
@@ -53,32 +53,28 @@ def _with_a_loop(state: JointState) -> JointState | None:
     """Return the state after the closure of one loop that explains the log better. None without one."""
     from objslam.graph.loop_closure import find_missed_closures
 
-    landmarks, middle, owner = _landmarks(state)
-    for closure in find_missed_closures(landmarks, middle, state.rays, owner, state.solved_poses)[:_TRIED]:
+    landmarks, middle = _landmarks(state)
+    for closure in find_missed_closures(landmarks, middle, state.solved_poses)[:_TRIED]:
         closed = _closed(state, closure, landmarks)
         if closed is not None and closed.explained > state.explained:
             return closed
     return None
 
 
-def _landmarks(state: JointState) -> tuple[Landmarks, Floats, Ints]:
-    """Return the landmarks of the state, the median keyframe of the rays of each (N,), NaN without enough rays, and the
-    landmark of each ray (R,), or -1."""
+def _landmarks(state: JointState) -> tuple[Landmarks, Floats]:
+    """Return the landmarks of the state, and the median keyframe of the rays of each (N,), NaN without enough rays."""
     from objslam.graph.loop_closure import Landmarks, covariances_at
 
     assert state.association is not None
     assert state.estimate is not None
-    owner, count = np.where(state.agree, state.association.object, -1), state.association.count
+    rays, label, position = state.rays, state.association.label, np.nan_to_num(state.estimate.positions)
+    owner = np.where(state.agree, state.association.object, -1)
     held = np.flatnonzero(owner >= 0)
-    mine, keyframe = owner[held], state.rays.keyframe[held]
-    first, last = np.full(count, len(state.keyframes)), np.full(count, -1)
-    np.minimum.at(first, mine, keyframe)
-    np.maximum.at(last, mine, keyframe)
-    position = np.nan_to_num(state.estimate.positions)
-    enough = (np.bincount(mine, minlength=count) >= state.settings.association.min_rays) & state.estimate.solved
-    middle = np.where(enough, grouped_median(keyframe.astype(float), mine, count), np.nan)
-    covariance = covariances_at(state.rays, owner, position, state.solved_poses)
-    return Landmarks(position, covariance, state.association.label, first, last), middle, owner
+    landmarks = Landmarks.none().and_also(position, covariances_at(rays, owner, position, state.solved_poses), label)
+    landmarks.see(rays.keyframe, owner, held, np.searchsorted(rays.keyframe, np.arange(len(state.keyframes) + 1)))
+    middle = grouped_median(rays.keyframe[held].astype(float), owner[held], len(label))
+    enough = (landmarks.rays >= state.settings.association.min_rays) & state.estimate.solved
+    return landmarks, np.where(enough, middle, np.nan)
 
 
 def _closed(state: JointState, closure: Closure, landmarks: Landmarks) -> JointState | None:
