@@ -1,4 +1,5 @@
 """Changes to a solved map that rounds of association and solve do not find, and the reasons to look for them.
 
-Objects where rays of several things meet, because the poses err, are dropped. The odometry tells whether the poses err.
+Visits whose landmarks are copies of older ones are moved onto them. Objects where rays of several things meet, because the
+poses err, are dropped. The odometry tells whether the poses err.
 """
