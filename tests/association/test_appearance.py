@@ -208,5 +208,6 @@ def test_an_alignment_prefers_the_landmark_that_looks_alike(clusters: Scene) -> 
     places, where = np.array([[2.0, 0.2, 0.0], [2.0, -0.2, 0.0]]), np.zeros(3)
     for best in (0, 1):
         alike = np.where(np.arange(2) == best, 3.0, -3.0)[None]
-        correction = align(ray, places, np.zeros(2, dtype=np.int64), origin, where, np.array([0.01, 0.01, 0.1]), alike)
-        assert np.sign(correction[1, 0]) == (1 if best == 0 else -1)
+        spread, share = np.array([0.01, 0.01, 0.1]), np.ones(1)
+        correction = align(ray, places, np.zeros(2, dtype=np.int64), origin, where, spread, share, alike)
+        assert np.sign(correction[0, 1, 0]) == (1 if best == 0 else -1)

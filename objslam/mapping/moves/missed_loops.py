@@ -39,14 +39,20 @@ def with_missed_loops(state: JointState) -> JointState:
         return state
     try:
         best = state.better(best.released(state.hold))
-        if best is state:
-            return state
-        assert best.association is not None
-        assert best.estimate is not None
-        turns = best.attempt().alternated(best.estimate.map_T_base, (best.association, best.estimate.positions))
-    except SolveError:  # The map before is there.
-        return best
-    return best.better(turns)
+    except SolveError:  # The map without the closures is there.
+        return state
+    return state if best is state else _with_rounds(best)
+
+
+def _with_rounds(state: JointState) -> JointState:
+    """Return the state after rounds of association, if they explain the log better."""
+    assert state.association is not None
+    assert state.estimate is not None
+    try:
+        found = state.attempt().alternated(state.estimate.map_T_base, (state.association, state.estimate.positions))
+    except SolveError:  # The map before the rounds is there.
+        return state
+    return state.better(found)
 
 
 def _with_a_loop(state: JointState) -> JointState | None:
