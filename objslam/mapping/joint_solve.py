@@ -109,11 +109,13 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
             if not finds_same_objects(state, other.association):
                 attempt = _from_start(*solved_if_sure(noisier, other, sure))
                 state = state.better(_searched(attempt))
-        starts = (
-            lambda: _from_tracks(begin),
-            lambda: _from_start(begin.attempt(), None),
-            lambda: _from_start(begin.attempt(), explored(along(begin, path))[0]),
-        )
+
+        def along_tracks() -> JointState:
+            return _from_start(begin.attempt(), explored(along(begin, path))[0])
+
+        starts = [lambda: _from_tracks(begin), lambda: _from_start(begin.attempt(), None), along_tracks]
+        if np.isfinite(state.rays.range).any():
+            starts = [] if sure else [along_tracks]
         for other_start in starts:  # The first ones take less time.
             if not _unclear(state):
                 break
