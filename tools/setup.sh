@@ -136,13 +136,13 @@ needs_cuda() {
 # installed, Python imports large ones for the first time, which compiles them. That takes seconds.
 install_all() {
     small_torch &
-    pinned run | awk '/^[^ ]/{here = !/^torch==/} here' | install_pinned || return
+    pinned run | awk '/^[^ ]/{here = !/^torch==/} here' | install_pinned || { wait; return 1; }
     wait
     pinned run | install_pinned || return # torch, if there was no CPU build of it
     if needs_cuda; then pinned cuda | install_pinned || return; fi
     if [ "$want" = dev ]; then
         "$venv/bin/python" -c 'import open3d, rerun, scipy.stats, torch' >/dev/null 2>&1 &
-        { pinned dev; pinned docs; } | install_pinned || return
+        { pinned dev; pinned docs; } | install_pinned || { wait; return 1; }
         wait
     fi
     pip_install --no-index --no-deps --no-build-isolation --editable "$root" &&

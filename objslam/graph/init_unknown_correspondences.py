@@ -25,7 +25,7 @@ from objslam.core.geometry import adjoint, inverse
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_landmarks
-from objslam.graph.loop_closure import Closure, Landmarks, closed_path, covariances_at, find_closure
+from objslam.graph.loop_closure import Closure, Landmarks, closed_path, covariances_at, find_closure, heading_variance
 from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.sliding_window import SlidingWindow
 
@@ -98,7 +98,7 @@ class _Exploration:
         assert keyframes.drift is not None
         self.keyframes, self.rays, self.cameras, self.settings = keyframes, rays, cameras, settings
         self.measured, self.way = Measurements.of(keyframes, rays, settings), keyframes.map_T_camera
-        self.heading = np.maximum.accumulate(np.linalg.eigvalsh(keyframes.drift[:, :3, :3])[:, -1])
+        self.heading = heading_variance(keyframes.drift)
         self.first_ray = np.searchsorted(rays.keyframe, np.arange(len(keyframes) + 1))
         self.owner = np.full(len(rays), -1, dtype=np.int64)
         self.known, self.counted = Landmarks.none(), np.zeros(0, dtype=np.int64)

@@ -255,6 +255,13 @@ def closed_path(closure: Closure, landmarks: Landmarks, map_T_camera: Floats, dr
     return distribute_correction(map_T_camera, closure.correction, min(left, max(back - 1, 0)), back, drift)
 
 
+def heading_variance(drift: Floats) -> Floats:
+    """Return the variance (K,), rad^2, of the heading at each keyframe, by the drift (K, 6, 6) of the odometry.
+
+    It never falls, so that it can tell how far the heading drifted between two keyframes."""
+    return np.maximum.accumulate(np.linalg.eigvalsh(drift[:, :3, :3])[:, -1])
+
+
 def covariances_at(rays: Rays, owner: Ints, position: Floats, map_T_camera: Floats) -> Floats:
     """Return the covariances (N, 3, 3), m^2, of landmarks from their rays, at fixed poses (K, 4, 4).
 

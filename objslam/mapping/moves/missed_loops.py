@@ -85,15 +85,14 @@ def _landmarks(state: JointState) -> tuple[Landmarks, Floats]:
 
 def _closed(state: JointState, closure: Closure, landmarks: Landmarks) -> JointState | None:
     """Return an attempt after the solve of a closure. None if it has no solution."""
-    from objslam.graph.loop_closure import closed_path
+    from objslam.graph.loop_closure import closed_path, heading_variance
 
     assert state.association is not None
     assert state.keyframes.drift is not None
     into = np.arange(state.association.count)
     into[closure.now] = closure.before
     found = joined(state.association, into)
-    heading = np.maximum.accumulate(np.linalg.eigvalsh(state.keyframes.drift[:, :3, :3])[:, -1])
-    poses = closed_path(closure, landmarks, state.solved_poses, heading)
+    poses = closed_path(closure, landmarks, state.solved_poses, heading_variance(state.keyframes.drift))
     attempt = state.attempt().counted(found)
     try:
         return attempt.solve("merge", found, poses)
