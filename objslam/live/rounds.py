@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from objslam.live.mapper.maintenance import is_quiet
 from objslam.live.worker import Request, Worker, solved
 from objslam.sources.journal.records import Correction
 
@@ -24,6 +25,7 @@ class Rounds(ABC, Generic[Answer, Told]):
 
     A round begins when the number of keyframes has grown by `growth` since the last one began. So the time of all rounds is
     proportional to the number of keyframes. The map is corrected when the number has grown by `delay` since the round began.
+    Both wait for a keyframe without other tasks (`is_quiet`).
     If the process is done by then, the map does not depend on the machine's speed. If it is late, a `patient` session waits
     for it, and any other session goes on. The journal receives each correction with its keyframe, so that a resumed session
     makes it there.
@@ -66,6 +68,8 @@ class Rounds(ABC, Generic[Answer, Told]):
         while self._known and self._known[0].keyframe <= number:
             self._correct(self._known.popleft())
             self._asked, changed = None, True
+        if not is_quiet(number):
+            return changed
         if self._asked is not None and not self._replaying:
             changed |= self._finish(number)
         if number >= self._next:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Self
@@ -33,6 +34,9 @@ larger residuals."""
 _STILL = 0.01
 """The rounds along the most likely path stop when at most this share of the rays changes its object. A larger share stops
 them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
+_RUINED = 10.0
+"""The log odds of the best round against the last above which the best one counts. Right rounds differ by less than 5, and
+ruined maps by 100 to 5000. With a larger value, a worse map may stay."""
 _WORSE = 2
 """The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
 takes longer, but gets over more rounds in which close objects merge."""
@@ -128,7 +132,7 @@ class JointState:
         returned. A few changed rays hardly change the shared errors, but their estimation takes most of the time of a solve.
         So the shared errors keep the values of the first round. After the last round, they are estimated again.
         """
-        state, before, earlier = self, self, dict[bytes, Self]()
+        state, before, earlier, states = self, self, dict[bytes, Self](), [] if self.estimate is None else [self]
         held = False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"association, round {number + 1}", 0, 0)
@@ -140,7 +144,7 @@ class JointState:
                     returned = list(earlier).index(key)
                     state = state.continued_from(max(list(earlier.values())[returned:], key=lambda one: one.explained))
                 if not held:
-                    return replace(state, hold=self.hold, unsettled=0)
+                    return replace(state, hold=self.hold, unsettled=0)._or_if_ruined(states)
                 before = state = state.released(self.hold)
                 held = False
             else:
@@ -148,13 +152,25 @@ class JointState:
                 solved = state.solve("association", found, map_T_base @ state.keyframes.base_T_camera)
                 solved = replace(solved, hold=state.errors is not None)
                 state = solved.merged()
+                states += [solved, state]
                 held = solved.hold != self.hold and (holds or state is not solved)
                 earlier[key] = state
             assert state.association is not None
             assert state.estimate is not None
             map_T_base, guess = state.estimate.map_T_base, (state.association, state.estimate.positions)
         unsettled = state.changed_since(before)
-        return replace(state.released(self.hold) if held else state, hold=self.hold, unsettled=unsettled)
+        state = state.released(self.hold) if held else state
+        return replace(state, hold=self.hold, unsettled=unsettled)._or_if_ruined(states)
+
+    def _or_if_ruined(self, states: Sequence[Self]) -> Self:
+        """Return the state after rounds, or the best of the states before if it explains the log far better.
+
+        A wrong merge can ruin a map in the last round, and so can noise that is estimated from half of the rays."""
+        best = max(states, key=lambda one: one.explained, default=self)
+        if best.association is None or best.explained - self.explained < _RUINED:
+            return self
+        again = replace(best, hold=self.hold).solve("association", best.association, best.solved_poses)
+        return replace(again, rounds=self.rounds, unsettled=0) if again.explained > self.explained else self
 
     def changed_since(self, before: Self) -> int:
         """Return the number of objects that differ from those of an earlier state (`objects_changed`)."""

@@ -9,14 +9,15 @@ from bench_robots import robot
 from log_parts import without_names
 from turning_drive import drive, errors_of
 
-from objslam.config import load_settings
+from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
-from objslam.mapping import pipeline
+from objslam.mapping import joint_solve, pipeline
 from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
 from objslam.mapping.joint_alternation import JointState
 from objslam.mapping.joint_solve import _or_from
+from objslam.simulation import preset, simulate
 
 TURN_SCALE, TURN_BIAS, CLOCK = "odometry.turn_scale", "odometry.turn_bias", "front.clock"
 
@@ -97,3 +98,18 @@ def test_a_start_from_which_nothing_is_solved_loses_no_map():
 
     state = begin(drive(1))
     assert _or_from(nowhere, state) is state
+
+
+def test_false_boxes_call_for_no_other_start(monkeypatch):
+    """They agree with no object, but they are not in tracks. A quarter of these boxes is false."""
+
+    def another(*_: object) -> None:
+        raise AssertionError("a right map was sought again")
+
+    monkeypatch.setattr(joint_solve, "_or_from", another)
+    log = simulate(preset("demo", frames=200, localization=None, odometry=Odometry(), classes=3, false=0.25), 1)
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
+    result = pipeline.run(log, settings, Ledger())
+    compared = evaluate(result.map, log.truth, align="se2", radius=0.5).to_dict()
+    assert tuple(compared[name] for name in ("matched", "false", "missed")) == (12, 0, 0)
+    assert (result.association.object < 0).mean() > 0.2

@@ -25,11 +25,12 @@ from objslam.mapping.labels import MANY, SECOND
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
 _GROWING = 3  # The keyframe of each period after which tracks and keyframes are dropped and all rays are tested.
 _CLOSING = 6  # The keyframe of each period for merging and removing landmarks. It differs from _GROWING to spread delay.
+_QUIET = 9  # The keyframe of each period without a task. It is odd, so that no relinearisation of `_BREATH` is due either.
 _BREATH = 2  # The period of relinearisations after a large change, in keyframes. A larger period settles the map later.
 _FIRST = 20  # The number of keyframes at the first full solve. Fewer keyframes have too few rays of any landmark.
 _GROWTH = 1.5  # A full solve follows when keyframes have grown by this factor. A larger one keeps early errors longer.
 _ITERATIONS = 8  # The most iterations of a full solve. More iterations delay the next frame.
-_LARGE = 400  # With more keyframes, a rebuild in slices replaces the full solve. A larger number delays the next frame more.
+_LARGE = 200  # With more keyframes, a rebuild in slices replaces the full solve. A larger number delays the next frame more.
 _ODDS = 2.5  # The least log odds that two landmarks are one object, not two neighbours. Larger odds leave more duplicates.
 _HALF = 0.5  # The share of inliers below which a landmark is triangulated again. A larger share redoes more landmarks.
 _VISITS = 6
@@ -58,12 +59,18 @@ class _SecondObject:
     far: bool
 
 
+def is_quiet(number: int) -> bool:
+    """Return whether no task is due at a keyframe. Then the next frame waits less for work that may be done at any time."""
+    return number % _EVERY == _QUIET
+
+
 def maintain(m: MapState) -> None:
     """Run the tasks that are due after a keyframe."""
+    rebuilding = m.graph.is_rebuilding
     m.graph.continue_rebuild()
     number, schedule = m.next_id.keyframe, m.schedule
     due = number % _EVERY == 0 or (schedule.relinearisations > 0 and number % _BREATH == 0)
-    relinearise = due and not m.graph.is_rebuilding  # A rebuild relinearises anyway.
+    relinearise = due and not rebuilding  # A rebuild relinearises anyway.
     if relinearise:
         schedule.relinearisations = max(0, schedule.relinearisations - 1)
     m.graph.prepare(_coming(m), relinearise)
