@@ -18,7 +18,7 @@ MANY, SECOND = 5, 0.25
 """A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
 find fewer second objects."""
 _DOUBLE = 0.1
-"""One object for each label is tried if a label with boxes in a keyframe has several there in at most this share of cases. A
+"""One object for each label is tried if at most this share of the pairs of a label and a keyframe has several boxes. A
 detector draws some boxes twice, and some false ones. With a larger share, more logs are tried without success. Each try
 takes a solve."""
 _AGREES = 3.0

@@ -48,9 +48,10 @@ def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = 
     may be small. An exploration has the shared errors fixed, and shared errors from a wrong map are wrong by more than their
     sigma. With too little noise, known objects would be outside their gates, and the exploration would map them twice.
 
-    Even if nearly all rays agree, the shared error `surface` may have misled the exploration. It is the error of how far
-    centres are behind surfaces. With a wrong value, an object that is seen from another side seems to be another object. If
-    the solve changes the value by more than single objects differ, the log is explored with the new value.
+    Even if nearly all rays agree, the shared error `surface` may have misled the exploration. It is the error of the
+    distance from surfaces to the centres behind them. With a wrong value, an object that is seen from another side seems to
+    be another object. If the solve changes the value by more than single objects differ, the log is explored with the new
+    value.
 
     assumed: (P,) the shared errors in the first exploration. Its noise was nominal. sure: whether the filter for logs with
     ranges was sure of the first exploration. Another exploration by this filter takes little time. So noisy odometry is
