@@ -58,7 +58,7 @@ def vars_of(given: camera.Camera) -> dict[str, Any]:
 
 
 def checked_arrays(given: camera.Camera) -> dict[str, Any]:
-    """Return the matrix, the distortion and base_T_camera as arrays. The ValueError names an array of another shape."""
+    """Return the matrix, the distortion and base_T_camera as arrays. ValueError names an array of a wrong shape."""
     found = {name: np.asarray(getattr(given, name), dtype=np.float64) for name in ("matrix", "distortion", "base_T_camera")}
     for name, shape in (("matrix", (3, 3)), ("base_T_camera", (4, 4))):
         if found[name].shape != shape:

@@ -26,7 +26,8 @@ _MARGIN = 2.0
 sparser, so a match is more evidence."""
 _REFINEMENTS = 3  # The Gauss-Newton steps of a hypothesis and of its assignment. Few are enough from a close start.
 _CANDIDATES = 3000
-"""The most pairs of a landmark here and one there. Two pairs form a hypothesis. A larger number costs time."""
+"""The most pairs of a landmark `here` and a landmark `there` that are tried. Two pairs form a hypothesis. A larger number
+costs time."""
 _HYPOTHESES = 2000  # The most hypotheses of two pairs, those with the longest bases. A larger number costs time.
 _VERIFIED = 20  # The number of hypotheses with the best quick scores that get an assignment. A larger number costs time.
 _GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
@@ -162,8 +163,10 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
-    """Return the pairs (C,), (C,) of landmarks here and there that may be one landmark within the drift. At most
-    `_CANDIDATES` pairs remain: those of the landmarks here that have the fewest partners."""
+    """Return the pairs (C,), (C,) of landmarks `here` and `there` that may be one landmark within the drift.
+
+    At most `_CANDIDATES` pairs remain: those of the landmarks `here` that have the fewest partners.
+    """
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)
     shifted = float(np.sqrt(np.linalg.eigvalsh(problem.prior[:2, :2])[-1]))
@@ -175,8 +178,7 @@ def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
 
 
 def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
-    """Return hypotheses (H, 2, 2) of two pairs each: any two pairs with fitting distances, and each single pair, listed
-    twice."""
+    """Return hypotheses (H, 2, 2) of two pairs each. The two have distances that fit, or are one pair listed twice."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
     i, j = np.triu_indices(len(a), 1)
     differ = (a[i] != a[j]) & (b[i] != b[j])
@@ -239,7 +241,7 @@ def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
 def _gains(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
     """Return the gains (H, C) of pairs a, b (C,) under corrections (H, 3). A gain is -inf outside the gate.
 
-    A gain is the log likelihood ratio of two explanations: the two are one landmark, or the landmark here is new.
+    A gain is the log likelihood ratio of two explanations of a pair: both are one landmark, or the landmark `here` is new.
     """
     return _gain(problem, a, b, problem.target[b] - _moved(problem.offset, x)[0][:, a])
 

@@ -18,9 +18,9 @@ from objslam.core.statistics import distinct, grouped_median, grouped_quantile, 
 from objslam.core.types import Keyframes
 
 _WHOLE = 0.25
-"""The share of the boxes at the image's edge that reach beyond it, above which the boxes of a camera go around whole
-objects. It was 0.5 in three recordings of such boxes. With a larger share, the misses of such detectors count less often.
-With a smaller one, a few wrong boxes change what counts as a miss."""
+"""The boxes of a camera go around whole objects if more than this share of its boxes at the image's edge reach beyond it.
+The share was 0.5 in three recordings of such boxes. With a larger value, the misses of such detectors count less often. With
+a smaller one, a few wrong boxes change what counts as a miss."""
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of an object and a frame processed together, which fit into the processor's cache.
 _USUAL_DISTANCES = (0.02, 0.98)
 """The quantiles of a class's detection distances. Outside them, a miss tells nothing. A wider range counts more misses."""
@@ -32,8 +32,8 @@ _FRONT_SHARE = 0.95
 front."""
 _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
-counts. Things that are not that thick need only half of the sum of their sizes instead of the first: on a table, a thing may
-hide its neighbour. Larger values hide fewer objects."""
+counts. Half the sum of the two sizes replaces the first if it is smaller, because on a table a thing may hide its neighbour.
+Larger values hide fewer objects."""
 _SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. A larger number is finer.
 _SAME_SIDE = np.cos(np.radians(45.0))
 """The cosine of the largest angle between two views of one side of an object. A smaller cosine counts more frames."""
@@ -191,9 +191,12 @@ def count_looks(
 ) -> Ints:
     """Return in how many frames (N,) each object of a map should be detected if it is at its position (N, 3) m.
 
-    This takes four conditions: its box lies in the image, distance and side are as in earlier detections, and no closer box
-    covers it. extent: (N, 2) m, NaN where unknown. known: from where each object was detected, with the sides in the frame
-    of the positions. obs: the boxes of the frames. distance: (R,) m to the object of each box, NaN where unknown.
+    An object should be detected under four conditions. Its box lies in the image. Its distance is one at which it was
+    detected before. The camera sees a side that was detected before. No closer box covers it.
+
+    extent: (N, 2) m, the width and height of each object, NaN where unknown. known: from where each object was detected. Its
+    sides are in the frame of the positions. obs: the boxes in the frames of `view`. distance: (R,) m, from the camera to the
+    object of each of these boxes, NaN where unknown.
     """
     near, far = (np.array([getattr(one, name) for one in known]) for name in ("near", "far"))
     found = np.zeros(len(position), dtype=np.int64)
@@ -284,10 +287,10 @@ def _in_image(
 
 
 def _whole_boxes(obs: Observations, view: CameraFrames) -> Bools:
-    """Return of which cameras (C,) the boxes go around whole objects, also where the image's edge cuts an object off.
+    """Return which cameras (C,) have boxes that go around whole objects, even if the image's edge cuts an object off.
 
-    Such boxes reach beyond the image. A detector that draws them, such as one of the poses of
-    objects, should find an object wherever its centre is in the image. A few boxes beyond the edge are no such detector.
+    Such boxes reach beyond the image. A detector of the poses of objects draws them, for example. It should find an object
+    wherever its centre is in the image. A few boxes beyond the edge are not enough: any detector may draw them.
     """
     sizes = np.array([camera.size for camera in view.cameras]).reshape(-1, 2)
     camera, low, high = view.camera[obs.frame], obs.box[:, :2], obs.box[:, 2:]

@@ -76,9 +76,9 @@ def prior_sigma(name: str, settings: Settings, place: float) -> float:
 def estimates(settings: Settings, odometry: bool, localized: bool) -> bool:
     """Return whether the shared errors of a log are estimated.
 
-    odometry: whether it is used. localized: whether there is a localisation. calibration.use decides. With "auto", fixed
-    mode needs a localisation that is not coarse. In joint mode, each pose counts by its noise, so a coarse localisation
-    tells little, but nothing wrong.
+    calibration.use decides. With "auto", fixed mode needs a localisation that is not coarse. In joint mode, each pose counts
+    by its noise, so a coarse localisation helps little, and does no harm. odometry: whether the odometry is used. localized:
+    whether there is a localisation.
     """
     use = settings.calibration.use
     if settings.mode == "fixed":

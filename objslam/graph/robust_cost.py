@@ -1,4 +1,7 @@
-"""The cost of a solution, for a comparison of solutions with different inliers, and the information of rays."""
+"""The cost of a solution, and the information that rays give about landmarks.
+
+The cost of a ray has an upper bound. So the costs of solutions with different inliers can be compared.
+"""
 
 import numpy as np
 

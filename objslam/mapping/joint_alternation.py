@@ -198,12 +198,11 @@ class JointState:
         return replace(chosen, rounds=self.rounds, unsettled=0)
 
     def relocalized(self) -> Self:
-        """Return the state after rounds along the most likely path through its map, if they make the rays better
-        `explained`.
+        """Do rounds along the most likely path through the map. Return the new state if it is `better`, else this one.
 
         The rounds of `alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each round
-        here begins with the path that is most likely if any ray may belong to any landmark. Every second round holds the
-        shared errors and the noise, as they change little in one round.
+        here begins with another path. It is the most likely one if any ray may belong to any landmark. Every second round
+        holds the shared errors and the noise, because one round changes them little.
         """
         if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
             return self
@@ -240,7 +239,7 @@ class JointState:
         return self.better(turns)
 
     def split(self) -> Self:
-        """Return the state after a split of objects that may be two, if the rays then have a better value of `explained`.
+        """Split the objects that may be two. Return the new state if it is `better`, else this one.
 
         The rounds of `alternated` do not separate two things that share one object, because the path is bent until all rays
         agree. They also keep a phantom where the rays of two things cross. Here all objects whose rays come in two bundles

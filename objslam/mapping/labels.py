@@ -18,7 +18,7 @@ MANY, SECOND = 5, 0.25
 """A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
 find fewer second objects."""
 _DOUBLE = 0.1
-"""One object for each label is tried if at most this share of labels has several boxes in a keyframe, over all keyframes. A
+"""One object for each label is tried if at most this share of the pairs of a label and a keyframe has several boxes. A
 detector draws some boxes twice, and some false ones. With a larger share, more logs are tried without success. Each try
 takes a solve."""
 _AGREES = 3.0
@@ -65,10 +65,10 @@ def angles_to_objects(rays: Rays, estimate: Estimate, map_T_camera: Floats) -> F
 def shows_second_object(
     rays: Rays, association: Association, estimate: Estimate, keyframes: Keyframes, map_T_camera: Floats, settings: Settings
 ) -> bool:
-    """Return whether boxes of a label that have no object meet in a point of their own, more closely than by chance.
+    """Return whether a label has a second object: rays without an object meet in one point, more closely than by chance.
 
-    A box that agrees with the object of its label, or that is drawn around the same thing in the same keyframe, shows no
-    second object. keyframes: the keyframes of the rays. map_T_camera: (K, 4, 4) the solved poses.
+    Two kinds of rays do not count. The first agree with the object of their label. The second have a box around that object,
+    which has another box in the same keyframe. keyframes: of the rays. map_T_camera: (K, 4, 4) the solved poses.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
@@ -80,8 +80,8 @@ def shows_second_object(
 
 
 def _drawn_twice(rays: Rays, association: Association) -> Bools:
-    """Return which rays (R,) have a box that is drawn around the object of their label. In the same keyframe, the object has
-    a box of its own, and the centre of one of the two boxes is inside the other box."""
+    """Return which rays (R,) have a second box around the object of their label. Its first box is in the same keyframe, and
+    the centre of one of the two boxes is inside the other box."""
     held = np.flatnonzero(association.object >= 0)
     key = rays.keyframe * len(rays.label_names) + rays.label
     order = held[np.argsort(key[held], kind="stable")]

@@ -129,8 +129,8 @@ def with_noise_of(errors: SharedErrors, estimate: Estimate) -> SharedErrors:
 
 
 def with_jumps(solution: Solution, jumps: Jumps) -> Solution:
-    """Return the solution with the error that a map has because `jumps` were removed from its poses. All objects share
-    it."""
+    """Return the solution with the error that is left in a map after `jumps` were removed from its poses. All objects share
+    this error."""
     estimate, association, rays = solution.estimate, solution.association, solution.rays
     used = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))
     keyframe = rays.keyframe[used]
@@ -158,8 +158,8 @@ def rays_moved(before: Ints, after: Ints) -> int:
 def objects_changed(before: tuple[Association, Estimate], after: tuple[Association, Estimate]) -> int:
     """Return how many objects are new, are gone, or moved by more than their sigma, between two solved associations.
 
-    A sigma takes the association for granted. So a place that changes by more, because rays change their objects, is less
-    certain than its sigma says. A few rays that go back and forth between neighbours hardly move anything.
+    A sigma takes the association for granted. Rays that change their objects can move an object by more than its sigma. Then
+    its place is less certain than its sigma says. A few rays that go back and forth between neighbours hardly move anything.
     """
     (first, was), (second, now) = before, after
     i, j, _ = _same_objects(first.object, second.object)

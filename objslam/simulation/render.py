@@ -55,7 +55,7 @@ class RenderSettings(CourseSettings):
     camera: InstanceOf[Camera] = make_camera(focal=400.0, position=(0.1, 0.0, 1.0), pitch=-0.25)
     labels: tuple[str, ...] = LABELS  # The labels of the objects in the room. A label may be repeated.
     min_views: Annotated[int, Field(ge=0)] = 18
-    """The least number of images with a good box of each object. A good box is within the limits, and not cut off by the
+    """The least number of images with a good box of each object. A good box is within `limits`, and not cut off by the
     edge."""
     min_parallax_deg: NotNegative = 33.0  # The least parallax of each object over these images, degrees.
     limits: BoxLimits = BoxLimits()
@@ -81,7 +81,7 @@ class TrueBoxes:
     """The boxes around the visible pixels of the M objects in an image.
 
     object: (M,) the ids. box: (M, 4) x1, y1, x2, y2, px. A box around the one pixel (0, 0) is (0, 0, 1, 1), as in detectors.
-    depth: (M,) the median z of the visible pixels, m. counts: (M,) whether the box is within the limits.
+    depth: (M,) the median z of the visible pixels, m. counts: (M,) whether the box is within `BoxLimits`.
     cut: (M,) whether the box touches the image's edge.
     """
 

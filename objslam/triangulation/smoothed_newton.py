@@ -14,9 +14,9 @@ _MAX_ITERATIONS = 80  # The most Newton steps. A solved object leaves the block 
 _LATE_SMOOTHING = 1e-9  # The smoothing (in mean distances) below which an object gets only a few more Newton steps.
 _LEAST_SMOOTHING = 1e-11  # The least smoothing (in mean distances). It is above the rounding errors.
 _ROUNDING = 1e-14
-"""The residual of the duals is zero up to rounding if it is below this (in mean distances) divided by the smoothing: an
-offset is exact to about 1e-15, and a dual is an offset divided by the smoothing. With a smaller value, rounding keeps some
-objects from less smoothing until the last step."""
+"""The residual of the duals counts as zero if its product with the smoothing is below this (in mean distances). An offset is
+exact to about 1e-15, and a dual is an offset divided by the smoothing. With a smaller value, rounding errors keep the
+smoothing of some objects large until the last step."""
 _ON_LINE = (1e-7, 1e-5)  # The values of `on_line` (in mean distances) that are tried where 0 does not give the optimum.
 _TINY = 1e-300  # The least divisor, so that 0 / 0 gives 0.
 
@@ -45,8 +45,8 @@ def _smoothed_optimum(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
 
     The method is Andersen, Christiansen, Conn & Overton, SIAM J. Sci. Comput. 22 (2000), with Chan, Golub & Mulet's
     linearisation. The result is the points (3, B), the dual (3, n, B) of each line, and the number of iterations. The dual
-    is the unit vector of the offset. If the solution lies on the line, the dual is a vector across the line that is at most
-    1 long.
+    is the unit vector along the offset of a point from its line. If the point lies on the line, the dual is a vector across
+    the line that is at most 1 long.
     """
     xp = lines.xp
     point, dual = xp.zeros_like(lines.foot[:, 0]), xp.zeros_like(lines.foot)

@@ -30,7 +30,8 @@ from behind, and some boxes show two objects."""
 
 @dataclass(frozen=True)
 class Density:
-    """The density of cosines of each label. mean: (L,). between, within: (L,) the parts of the variance."""
+    """The Gaussian density of the cosines of each label. mean: (L,) of the cosines. between, within: (L,) the two parts of
+    their variance, as in the formula of this module."""
 
     mean: Floats
     between: Floats
@@ -56,8 +57,8 @@ class Pairs:
 
 @dataclass(frozen=True)
 class CosineRatio:
-    """The densities of two kinds of cosines. same: between boxes of one object. different: between two objects of one
-    label."""
+    """The densities of two kinds of cosines. same: between boxes of one object. different: between boxes of two objects of
+    one label."""
 
     same: Density
     different: Density

@@ -48,9 +48,9 @@ _USUAL_GAIN = 2.366
 """The usual gain: the median decrease of the cost of the rays of one thing if two points explain them in place of one. It is
 the median of chi-squared with `_FREE` degrees of freedom."""
 _USUAL_GAINS = ((0.5, _USUAL_GAIN), (0.8, 4.642))
-"""Two pairs of a probability and the quantile of this chi-squared distribution. Errors that last for a while, such as those
-of a wheel that slips, concern only some landmarks, and show in the second quantile. If one landmark in five is two things,
-this does not change the second quantile."""
+"""Two probabilities, each with its quantile of chi-squared with `_FREE` degrees of freedom. Errors that last for a while,
+such as those of a wheel that slips, concern only some landmarks. They show in the second quantile. If one landmark in five
+is two things, this does not change the second quantile."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Crossings:
     """S landmarks whose rays come in two bundles.
 
     landmark: (S,). second: (R,) whether a ray is in the second bundle of its landmark. odds: (S,) log odds that the landmark
-    is one thing. A positive value can be too small. position: (S, 2, 3) m, where the two things are if it is two.
+    is one thing. A positive value can be too small. position: (S, 2, 3) m, where its two things would be.
     """
 
     landmark: Ints
@@ -120,7 +120,7 @@ def _as_two(alone: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple
 
 
 def _most(bundles: Bundles, free: FreeFit) -> Floats:
-    """Return the greatest log likelihood (G,) that a bundle as a thing of its own can have beside its bearings."""
+    """Return the greatest log likelihood (G,), without the bearings, that a bundle can have as a thing of its own."""
     usual, landmark = bundles.usual, bundles.landmark
     variance_ = usual.class_spread[landmark] ** 2 + usual.view**2
     size = np.maximum(_size_odds(usual.class_mean[landmark], usual.class_mean[landmark], variance_), 0.0)
@@ -130,8 +130,8 @@ def _most(bundles: Bundles, free: FreeFit) -> Floats:
 def _overlap(bundles: Bundles, position: Floats) -> Bools:
     """Return for each pair (S,) of bundles whether things of their size at points (G, 3) m would overlap.
 
-    Two things do not. The rays to the middles of the boxes of a large thing, from two sides, do not meet in one point, and
-    two points inside it explain them better.
+    Two things do not overlap. But two points inside one large thing may explain its rays better than one point, because the
+    rays from two sides to the middles of its boxes do not meet in one point.
     """
     apart = np.linalg.norm(position[::2] - position[1::2], axis=1)
     return np.asarray(apart < np.exp(bundles.size(position)[0]).reshape(-1, 2).mean(axis=1))
@@ -195,8 +195,10 @@ def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
 
 
 def _as_one(bundles: Bundles) -> tuple[Floats, Floats]:
-    """Return the log likelihood (S,) of each pair of bundles as one thing without that of its bearings, and their cost
-    (S,)."""
+    """Judge the explanation that the two bundles of each landmark show one thing.
+
+    Return its log likelihood (S,) without the bearings, and the cost (S,) of the bearings.
+    """
     usual, landmark = bundles.usual, bundles.landmark[::2]
     start = bundles.state.landmarks.position[landmark]
     position, log_volume, _ = fit_points(bundles, bundles.group // 2, landmark, bundles.noise[::2], start)

@@ -53,10 +53,11 @@ class Motions:
         )
 
     def costs(self, k: int, grid: Grid) -> tuple[Cells, Cells, Cells]:
-        """Return the costs of motion `k`, as three arrays: by x (2 X - 1, Y), by y (2 X - 1, Y) and by yaw (2 Y - 1,).
+        """Return the costs of motion `k` in x (2 X - 1, Y), in y (2 X - 1, Y) and in yaw (2 Y - 1,).
 
-        The first axis is the step from the previous state to the next one, in increasing order. The second axis is the yaw
-        of the states, because a step in x or y depends on it. The drift in x, y and yaw counts as independent.
+        The grid has X shifts along each axis, and Y turns. The first axis of an array is the step from the previous state to
+        the next one, in increasing order. The second axis is the yaw of the states, because a step in x or y depends on it.
+        The drift in x, y and yaw counts as independent.
         """
         shifts, turns = (np.arange(1 - len(axis), len(axis)) for axis in (grid.shifts, grid.turns))
         cos, sin, way = np.cos(grid.turns) - 1, np.sin(grid.turns), self.way[k]
@@ -105,10 +106,10 @@ def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
     """Return for each state the least sum (Y, X, X) of two costs: of a state before, and of the motion from there.
 
     A sum is at most `_SLIP`. Only states below `_SLIP` can lead to a smaller sum, so only the part of the grid that contains
-    them is searched. It is small where the rays tell well where the robot is.
+    them is searched. This part is small where the rays tell well where the robot is.
 
     Args:
-        total: (Y, X, X) of the states before.
+        total: (Y, X, X) the costs of the states before.
         x, y, yaw: as in `Motions.costs`.
     """
     below = total < _SLIP
@@ -130,22 +131,23 @@ def _extent(there: Bools) -> slice:
 def _least(total: Cells, cost: Cells, states: slice, count: int) -> tuple[Cells, slice]:
     """Take a step along the second axis of a grid of states.
 
-    Return the least sum (m, W, n) for each reached state: the cost of a state before, plus the cost of the step from there.
-    Also return the slice of the W states along this axis that are reached.
+    A sum is the cost of a state before, plus the cost of the step from there. Return the least sum (m, W, n) for each state
+    that is reached, and where the W reached states are on the second axis.
 
     A sum is at most `_SLIP`, so only the steps that cost less are tried. They are few, because the odometry drifts little
-    between two stretches of the path. All sums at once take three times as long.
+    between two stretches of the path. To compute the sums of all steps at once takes three times as long.
 
     Args:
-        total: (m, V, n) of the states before.
-        cost: (2 count - 1, m) of the steps. The second axis may have length 1.
-        states: the V states along the second axis, out of `count` states.
+        total: (m, V, n) the costs of the states before.
+        cost: (2 count - 1, m) the costs of the steps. The second axis may have length 1.
+        states: where the V states are on the second axis.
+        count: the number of all states on the second axis.
     """
     total = np.ascontiguousarray(total)
     cheap = np.flatnonzero(cost.min(axis=1) < _SLIP)
     steps = (cheap - (count - 1)).tolist() or [0]
     after = slice(max(states.start + steps[0], 0), min(states.stop + steps[-1], count))
-    if not len(cheap) or after.start >= after.stop:  # No state is reached but by a slip.
+    if not len(cheap) or after.start >= after.stop:  # Only a slip reaches a state.
         return np.full_like(total, _SLIP), states
     least = np.full((len(total), after.stop - after.start, total.shape[2]), _SLIP, dtype=total.dtype)
     for step, of_step in zip(steps, cost[cheap], strict=True):

@@ -55,7 +55,7 @@ class InnerSolve(Linearised):
     def ordered(self, near: Near | None) -> Self:
         """Return the state with the order of elimination, which all later states share.
 
-        near: of a solve that may have had the same variables. Then its order is taken.
+        near: an earlier solve. If it had the same variables, its order is taken.
         """
         known = order_near(near, self.landmarks)
         order = elimination_order(self.rows.jacobian, self.graph.blocks) if known is None else known

@@ -30,7 +30,7 @@ class Motions:
     to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. to_rows: (s, 6, 6) back. weight: (s,) robust.
     covariance: (s, 6, 6) of the twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their
     standard deviations. The rest comes from the interpolated path. seconds: (s,) durations. rows: of the motions in the
-    linear system. tied: the share of the motions between keyframes that are below ties.
+    linear system. tied: as in `OdometryMotions`.
     """
 
     to_twist: Floats
@@ -81,14 +81,15 @@ class Motions:
 
 
 def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Floats) -> Floats:
-    """Return instruments (M, p): the `LinearSystem.sides` without the noise of motions in the scales of the odometry and in
-    the weights.
+    """Return instruments (M, p). They are the `LinearSystem.sides` without the noise of single motions.
 
-    The noise of a motion is both in its derivative by the scale and in its residual. Their product would bias the scale: up
-    if the odometry measures the motion, down if it commands it. The neighbours move alike, and their noise is independent
-    (instrumental variables; Fuller 1987, 1.4). The noise is also in the weight, because longer motions have more noise. So
-    motions that were measured too short would weigh more, and bias the errors of the odometry. Hence the neighbours also
-    predict the covariance there, within limits (`_ALIKE`), because a motion between two stands has no like neighbours. The
+    The noise of a motion is both in its derivative by a scale of the odometry and in its residual. Their product would bias
+    the scale: upwards if the odometry is measured, downwards if it is a command to the robot. The neighbours move alike, and
+    their noise is independent. So they predict the derivative (instrumental variables; Fuller 1987, 1.4).
+
+    The noise is also in the weight of a motion, because longer motions have more noise. So motions that were measured too
+    short would weigh more, and bias the errors of the odometry. Hence the neighbours also predict the covariance for these
+    errors. The prediction has limits (`_ALIKE`), because a motion between two stops differs from its neighbours. The
     derivatives by other errors do not point along the noise that changes the weight.
     """
     instruments = sides.copy()
@@ -111,9 +112,10 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
 
 
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
-    """Predict motions (n, D) at the rate of four motions near each: two before, two after. seconds: (n,) the durations.
+    """Predict each of the motions (n, D) from its own duration and the rate of four motions near it: two before, two after.
 
-    The motions directly beside a motion do not count: they may share a step of the odometry with it, and so its noise.
+    The motions directly beside it do not count: they may share a step of the odometry with it, and so its noise. seconds:
+    (n,) the durations.
     """
 
     def near(values: Floats) -> Floats:

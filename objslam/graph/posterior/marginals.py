@@ -59,8 +59,8 @@ class SolvedMeasurements:
     come from arrays.
 
     measured, association: the measurements, and the landmark of each ray. used: (R,) the rays in the graph. map_T_camera:
-    (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. near: of a solve that may have had the same
-    variables. Then its order of elimination is taken.
+    (P, 4, 4). positions: (N, 3) m, NaN for a landmark that is not in the graph. near: an earlier solve. If it had the same
+    variables, its order of elimination is taken.
     """
 
     measured: Measurements

@@ -71,8 +71,8 @@ class BoxViews:
         return found
 
     def edges(self, touched: Floats | None = None) -> BoxEdges:
-        """Return the planes of the boxes. touched: (B, 4, P, 3) m, the points at which the bodies may touch them, if
-        known."""
+        """Return the planes through the edges of the boxes. touched: (B, 4, P, 3) m, the points where the bodies may touch
+        the planes. Without them, each plane is the one at the middle of its edge."""
         return self._at_middles if touched is None else self._edges(touched)
 
     @cached_property

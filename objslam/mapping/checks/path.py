@@ -33,8 +33,8 @@ _ACCELERATION = 5.0
 """The acceleration (m/s^2) that a slow robot does not exceed from one step to the next and back. Wheels on a floor slip at
 4 to 8. A larger value warns less often."""
 _TIMES = 5.0
-"""The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. The same
-is done with turn rates. A larger number warns less often."""
+"""The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. It is also
+the multiple for the turn rate of a jump. A larger number warns less often."""
 _TIMES_ODD = 3.5
 """The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
@@ -45,8 +45,8 @@ _STILL = 1e-4
 """The robot stands still if two poses differ by less than this distance (m) and turn (rad). A larger value takes slow motion
 for a stop."""
 _FROZEN_SECONDS = 8.0
-"""The shortest time (s) without motion that may be a frozen path. If a robot really stands
-still, its boxes do not move in the image either. A larger value finds fewer frozen paths."""
+"""The shortest time (s) without motion that may be a frozen path. If a robot really stands still, its boxes do not move in
+the image either. A larger value finds fewer frozen paths."""
 _MOVING_PX = 12.0
 """A camera moves if the boxes of one label spread by more than this (px) about their median, within seconds. A larger spread
 finds fewer frozen paths."""
@@ -56,8 +56,8 @@ larger value suits noisy poses."""
 _PIECE = 1.0
 """The time (s) over which distances are compared. A longer time suits noisy poses."""
 _LEAST_PIECE = 0.3
-"""The least distance in a time of `_PIECE` that is compared, as a share of the longest distance. Shorter distances are
-noise."""
+"""Two distances are compared if both are at least this share of the longest distance in a time of `_PIECE`. Shorter ones are
+noise. A larger share compares fewer distances."""
 _OTHER_SCALE = 0.1
 """A run warns if the logarithm of the ratio between the distances by localisation and odometry exceeds this. Real odometry
 errs by up to 8 %. A larger value warns less often."""
@@ -68,7 +68,7 @@ _BEFORE = 0.3
 def check_path(log: Log, settings: Settings) -> list[Finding]:
     """Return the findings about the poses of a log, from the poses and from the motion of the boxes.
 
-    In fixed mode with a localisation, the odometry is not used. Its speed and jumps then spoil nothing.
+    In fixed mode with a localisation, the odometry is not used. So its speed and its jumps do not spoil the map.
     """
     max_gap, joint = settings.poses.max_gap, settings.mode == "joint"
     found: list[Finding] = []

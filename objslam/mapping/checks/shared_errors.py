@@ -1,4 +1,4 @@
-"""Checks of the shared errors and of the noise, because an error far beyond its prior has a cause."""
+"""Check the shared errors and the noise. A value far beyond its prior has a cause, which a warning names."""
 
 import numpy as np
 
@@ -50,8 +50,8 @@ _DEPTHS, _ODOMETRY, _POSES = ("ranges", "range_bias"), ("along", "across", "turn
 def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
     """Warn of each shared error that is far from the mean of its prior, and name the probable cause.
 
-    The value of an error that the log does not show follows the noise, so it causes no warning.
-    The prior is from the settings or from a calibration file. A large error causes no warning if the file already has it.
+    If the log does not show an error, its value follows the noise. Such an error causes no warning. The prior is from
+    the settings or from a calibration file. A large error causes no warning if the file already has it.
     """
     for name, of in calibration.to_dict()["parameters"].items():
         expected = of["prior_mean"]

@@ -19,8 +19,8 @@ _SPEED = np.radians(25.0)
 """The highest angular speed (rad/s), seen from the camera, of a thing whose boxes follow one another. A larger value follows
 faster things, and joins more boxes by chance."""
 _LAGS = (1, 2, 3)
-"""The numbers of frames from one box of a thing that moves to its next box. Larger numbers bridge more missed detections,
-and join more boxes by chance."""
+"""The next box of a thing that moves comes one of these numbers of frames later. Larger numbers bridge more missed
+detections, and join more boxes by chance."""
 _FAR_LAGS = (50, 51, 52)
 """After these numbers of frames, two boxes no longer show the same motion. Such pairs show how often boxes follow one
 another by chance."""
@@ -30,8 +30,8 @@ _SMOOTH = 0.25
 """The largest `_jitter` of a thing that moves. Noise has 1, and a smooth motion nearly 0. A larger value finds more things
 that move, and also boxes that jump about one place."""
 _SIGMAS = 3.0
-"""The noise that two boxes may have beside the motion, in standard deviations. A larger number joins more boxes by
-chance."""
+"""Two boxes that follow one another may differ from the motion by this many standard deviations of their noise. A larger
+number joins more boxes by chance."""
 
 
 def moving_things(evidence: Evidence, left: Ints) -> Iterator[Ints]:

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from objslam.mapping.joint_alternation import JointState
 
 _NOISIER = 1.5
-"""The factor on the noise of rays or odometry, found by a solve, above which a looser odometry is tried as well.
-A larger factor explores fewer logs twice."""
+"""A looser odometry is tried as well if a solve finds more than this factor on the noise of rays or odometry. A larger
+factor explores fewer logs twice."""
 _CLEAR = 0.95
-"""The share of agreeing rays above which a log is not explored again without the filter for ranges, whatever its noise. A
-larger share explores more logs twice. In simulation, maps that show objects twice explained at most 0.93 of the rays, but up
-to 0.96 with ranges. A good map can explain as few."""
+"""If at least this share of the rays agrees, a log is not explored again because of its noise. The exception is a log that
+the filter for ranges is sure of. A larger share explores more logs twice. In simulation, maps that show objects twice
+explained at most 0.93 of the rays, but up to 0.96 with ranges. A good map can explain as few."""
 _SAME = 0.01
 """If a second exploration gives at most this share of the rays to other objects than the map does, it is not continued. Two
 explorations of one drive always assign a few rays between neighbours in different ways. With a larger share, more second
@@ -38,20 +38,24 @@ factor suits worse odometry, and loses more objects of good odometry."""
 def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = False) -> JointState | None:
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
-    None in three cases: noise and shared errors are about those that the first exploration assumed (`assumed` (P,), and the
-    nominal noise), the settings fix the noise, or nearly all rays agree. Noise and shared errors are known only after a
-    solve, but an exploration needs them before. A wrong map can hide the noise of the odometry in the noise of the rays.
+    There is no attempt, but None, in three cases. The noise and the shared errors are about as the first exploration assumed
+    them. The settings fix the noise. Nearly all rays agree.
+
+    Noise and shared errors are known only after a solve, but an exploration needs them before. A wrong map can hide the
+    noise of the odometry in the noise of the rays.
 
     The noise of the attempt is at least nominal. A solve estimates shared errors and noise together, so the remaining noise
     may be small. An exploration has the shared errors fixed, and shared errors from a wrong map are wrong by more than their
     sigma. With too little noise, known objects would be outside their gates, and the exploration would map them twice.
 
-    If nearly all rays agree, wrong distances of centres behind surfaces may still have misled the exploration: an object
-    that is seen from another side then seems to be another object. If the distances differ by more than those of single
-    objects do, the log is explored with them.
+    Even if nearly all rays agree, the shared error `surface` may have misled the exploration. It is the error of the
+    distance from surfaces to the centres behind them. With a wrong value, an object that is seen from another side seems to
+    be another object. If the solve changes the value by more than single objects differ, the log is explored with the new
+    value.
 
-    sure: whether the filter for logs with ranges was sure of the first exploration. Another exploration by it takes little
-    time, so noise of the odometry is reason enough, even if nearly all rays agree with a map that shows objects twice.
+    assumed: (P,) the shared errors in the first exploration. Its noise was nominal. sure: whether the filter for logs with
+    ranges was sure of the first exploration. Another exploration by this filter takes little time. So noisy odometry is
+    reason enough, even if nearly all rays agree: they can also agree with a map that shows objects twice.
     """
     if state.errors is None or "odometry" not in state.errors.unknown_noise:
         return None

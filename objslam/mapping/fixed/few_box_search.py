@@ -1,4 +1,4 @@
-"""Search the objects of a log that sees each thing from few places, with a given noise."""
+"""Find the objects of a log that sees each thing from few places, under an assumed noise."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class SparseNoise:
 
 @dataclass(frozen=True)
 class Searched:
-    """The objects that a search finds with a noise.
+    """The objects that a search finds under an assumed noise.
 
-    For the P rays with an object, direction: (P, 3) of the ray, apart: (P, 3) m, from the ray's corrected origin to the
-    object, and shift: (P, 3) m, from the given to the corrected origin, in a frame whose z is up. sigma: (P,) rad,
-    range_sigma: (P,) m, place: m, the noise in the settings. range: (P,) m, NaN if unknown.
+    The arrays describe the P rays that have an object. Their frame has z up. direction: (P, 3) of each ray. shift: (P, 3) m,
+    from the given to the corrected origin of the ray. apart: (P, 3) m, from the corrected origin to the object. range: (P,)
+    m, NaN if unknown. sigma: (P,) rad, range_sigma: (P,) m, and place: m, the noise in the settings.
     """
 
     noise: SparseNoise
@@ -78,7 +78,7 @@ class Searched:
 
     @property
     def value(self) -> float:
-        """The evidence of the noise. It is minus infinity if the noise explains too few boxes."""
+        """The evidence for the noise. It is minus infinity if the noise explains too few boxes."""
         return self.found.chance + self.found.detections if self.found.explained >= _EXPLAINED else -np.inf
 
     @property
@@ -88,7 +88,7 @@ class Searched:
 
 
 def search_objects(log: Log, settings: Settings, noise: SparseNoise, *, correct_places: bool = False) -> Searched:
-    """Search the objects of a log with a noise. correct_places: as in `few_ray_evidence`."""
+    """Find the objects of a log under an assumed noise. correct_places: as in `few_ray_evidence`."""
     from objslam.association.few_rays.additional_objects import few_ray_evidence
     from objslam.association.observations import PosedRays
     from objslam.graph.fixed_pose_triangulation import pose_noise

@@ -27,9 +27,9 @@ _DOT, _START = 11.0, 15.0  # The dot of an object, and the circle at the start o
 _ELLIPSE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _LONG_SIDE, _SHORT_SIDE = 1350.0, 600.0  # The longer side of the map, and its least width, px. Its least height is 300 px.
 _GROWTH = 0.4
-"""Ellipses widen the shown area by at most this share of its longer side, on each side. They end at the edge then. A larger
-share shows more of large ellipses, and shrinks the rest of the map. At 0.4 the cup of a drive of 1 m past it is shown whole,
-and no ellipse shrinks the rest to less than half."""
+"""Ellipses widen the shown area by at most this share of its longer side, on each side. The edge of the picture cuts off
+larger ellipses. A larger share shows more of them, and shrinks the rest of the map. At 0.4, the ellipse of a cup is shown
+whole after a drive of 1 m past it, and no ellipse shrinks the rest to less than half."""
 _EDGE = 0.985  # The triangle of a far object is at this share of the way from the centre of the picture to the edge.
 _TRIANGLE = 18.0  # The triangle of a far object has this length, px.
 _PATH, _BAND = 2.0, 1.0  # The widths, px, of a path, and of the outlines of a body that is 2 sigma smaller or larger.

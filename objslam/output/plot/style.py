@@ -23,17 +23,18 @@ DrawnShape = Literal["ellipsoid", "cuboid", "cylinder"]
 REJECTED_BELOW = 0.5  # A ray is rejected if its robust weight, in [0, 1], is below this value. A larger value rejects more.
 _USUAL_REACH = 2.0  # Rays are drawn with this length, m, if no ray has an object.
 _HUES = 12
-"""Labels get this many hues before the first one lies between two others. With more, hues are harder to tell apart. With
-fewer, a label more often has another colour in a map with other labels. It is even, so that the luminances alternate."""
+"""The number of hues on the circle. If a map has more labels, the others get hues in between. With a larger number, hues are
+harder to tell apart. With a smaller one, a label more often has another colour in a map with other labels. The number is
+even, so that the luminances alternate."""
 _NEXT = 5  # A label whose hue is taken tries the hue this many further on. It has no divisor in common with `_HUES`.
 _SATURATION = 0.85  # The colours of labels have this saturation, in [0, 1].
 _LUMINANCES = (0.09, 0.17)
 """Neighbouring hues alternate between these relative luminances, in [0, 1], so that many colours stay distinct. Text in
 either luminance has a contrast of at least 4.5 on white (WCAG 2.1)."""
 _CORE, _AROUND = 0.1, 1.5
-"""They limit the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects on
-each side. A picture shows objects up to `_AROUND` times the box's diagonal away from the box. A larger share hides more far
-objects. A larger multiple hides fewer."""
+"""The limits of the shown area of a map without a path. The box of the objects leaves out the share `_CORE` of the objects
+on each side. A picture shows objects up to `_AROUND` times the box's diagonal away from the box. A larger `_CORE` hides more
+far objects. A larger `_AROUND` hides fewer."""
 _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
 """A picture shows the corners of a cuboid under two conditions. The standard deviation of its yaw is below `_KNOWN_HEADING`
 (rad). Its length exceeds its width by more than `_LONGER` standard deviations of their difference. With 15 degrees, three
@@ -88,8 +89,8 @@ def colours_of(labels: Sequence[str]) -> dict[str, tuple[float, float, float]]:
 def _slots(labels: Sequence[str]) -> dict[str, float]:
     """Return the place of each label on the circle of hues, from 0 to `_HUES`.
 
-    It depends on the name, so that a label has one colour in all maps. Only if names of a map have the same place, the later
-    in the alphabet takes another one.
+    The place depends on the name, so that a label has one colour in all maps. If two names of a map have the same place, the
+    later one in the alphabet takes another place.
     """
     slots: dict[str, float] = {}
     taken: set[int] = set()
@@ -156,11 +157,12 @@ def drawn_shape(body: Body) -> DrawnShape:
 
 
 def body_outline(o: MapObject, sigmas: float = 0.0) -> Floats | None:
-    """Return the closed outline (n, 2), m, of an object's body seen from above, along z. None for a point.
+    """Return the closed outline (n, 2), m, of an object's body seen from above, along z.
 
-    It is a rectangle if the body is drawn as a cuboid (`drawn_shape`), and an ellipse otherwise.
+    It is a rectangle if the body is drawn as a cuboid (`drawn_shape`), and an ellipse otherwise. A point has no outline, and
+    neither has a body without length or width.
 
-    sigmas: the standard deviations that are added to its length and width. None if no length or width is left.
+    sigmas: how many standard deviations are added to the length and the width of the body.
     """
     body = o.body
     if body is None or o.status != "ok":

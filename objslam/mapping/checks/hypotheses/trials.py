@@ -88,8 +88,8 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
 
 
 def _unchanged(before: Agreement | None, log: Log) -> Trial:
-    """Return the trial of the unchanged log. Boxes that are seen from one direction count as fitting. So a hypothesis that
-    makes their rays cross gains no boxes."""
+    """Return the trial of the unchanged log. Boxes whose rays come from one direction count as fitting. So a hypothesis that
+    makes these rays cross gains no boxes."""
     if before is None:
         return Trial(None, 0.0, 0.0, _straight(log))
     narrow = float(before.narrow.sum() / before.boxes)
@@ -143,12 +143,13 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
         fit += ", and the robot drives where it heads"
     message = f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}"
     if taken:
-        message += f". The run takes it for {unusual}, and corrects that"
+        message += f". The run takes this error for {unusual}, and corrects that"
     return Finding(best.hypothesis.name, message, spoils=not taken, basis="log" if _is_crooked(first) else "boxes")
 
 
 def _both_ways(good: Sequence[Trial]) -> list[Trial]:
-    """Return the trials with another clock if earlier and later frames fit about equally, the best first. Else none."""
+    """Return the trials with another clock, the best first, if earlier and later clocks fit about equally. Else return
+    none."""
     clocks = [trial for trial in good if _shift(trial)]
     earlier, later = (max((t.score for t in clocks if sign * _shift(t) > 0), default=0.0) for sign in (-1, 1))
     return clocks if clocks and min(earlier, later) >= _BOTH_WAYS * max(earlier, later) else []
