@@ -54,6 +54,8 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     shift = with_bodies(Solution(keyframes, rays, association, estimate, ()), state.cameras, state.settings).to_centre
     if shift is None:
         return estimate, None
+    # Of a rejected ray, the box shows another thing. The shift would turn its ray to this body, and it would agree.
+    shift = shift.only(estimate.weight > 0)
     worth = worth_turning(shift, rays.sigma, association) | worth_lengthening(shift, rays, association)
     if not worth.any():
         return estimate, None
