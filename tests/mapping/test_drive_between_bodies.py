@@ -35,6 +35,21 @@ def test_large_objects_bend_neither_map_nor_path(seed):
         assert (o.body.size_sigma > 0).all()
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_wrong_names_spoil_no_body(seed):
+    """Six of a hundred boxes show another thing. A shape is found from a few boxes of each side, which must not be these."""
+    log, rng = drive(seed), np.random.default_rng(seed)
+    _, right = scores(log)
+    found = log.cameras[0].detections
+    label = np.where(rng.random(len(found)) < 0.06, rng.integers(0, 8, len(found)), found.label)
+    renamed = replace(log.cameras[0], detections=replace(found, label=label))
+    _, bodies = scores(replace(log, cameras=(renamed,)))
+    assert tuple(bodies[name] for name in ("matched", "false", "missed")) == (8, 0, 0)
+    assert bodies["position_rmse"] < 1.2 * right["position_rmse"]
+    assert bodies["ate"] < 1.2 * right["ate"]
+    assert bodies["iou_median"] > 0.9 * right["iou_median"]
+
+
 def test_a_box_with_a_wrong_name_is_not_turned_to_the_body_of_that_name():
     """thing_0 has nine boxes, one of which shows another thing 45 degrees aside. If it is turned too, it seems to agree."""
     log, _ = robot(7000, "vio")

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.association.observations import MIN_DEPTH, extents
+from objslam.association.observations import MIN_DEPTH, extents, size_per_metre
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES, UNKNOWN_YAW, Body, PlacedBody
 from objslam.core.camera import Camera
+from objslam.core.geometry import angles_off
 from objslam.core.statistics import grouped_median
 from objslam.frontend.surface_ranges import centre_factors, half_widths_of_rays
 from objslam.frontend.up import up_axis
@@ -117,9 +118,15 @@ def _views(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) 
     box = (rays.box[:, 2:] > rays.box[:, :2]).all(axis=1)
     ray = np.flatnonzero((association.object >= 0) & sees_size & box)
     ray = ray[fit[association.object[ray]]]
-    origin = map_T_camera[rays.keyframe[ray], :3, 3]
+    origin, direction = rays.take(ray).in_map(map_T_camera)
+    points = estimate.positions[association.object[ray]]
     # A point that its rays do not determine may lie at the camera. Such a point has no direction.
-    ray = ray[np.linalg.norm(estimate.positions[association.object[ray]] - origin, axis=1) > MIN_DEPTH]
+    apart = np.linalg.norm(points - origin, axis=1) > MIN_DEPTH
+    # The rejected box of a large thing may still show it, because its ray points beside the point where the others meet. If
+    # that point is not even near the box, the box shows another thing.
+    reach = np.linalg.norm(size_per_metre(rays.take(ray), keyframes, cameras), axis=1) / 2
+    near = np.tan(np.minimum(angles_off(origin, direction, points), np.pi / 4)) < np.minimum(reach, 1.0)
+    ray = ray[apart & ((estimate.weight[ray] > 0) | near)]
     behind = np.zeros((len(rays), 4), dtype=bool)
     behind[ray] = edges_behind_boxes(solution, cameras, settings, map_T_camera, sizes.max(axis=1) / 2, ray)
     number = np.bincount(association.object[ray], minlength=association.count)
