@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -61,6 +61,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     nothing to do."""
     first = ("forks", "long")
     items.sort(key=lambda item: next((i for i, name in enumerate(first) if item.get_closest_marker(name)), len(first)))
+
+
+@pytest.fixture(scope="module")
+def one_start() -> Iterator[None]:
+    """No map of a joint solve is tried from other starts, as unclear maps are. Other starts take most of the time of a test
+    that asks what the first start finds, and can hide that it finds nothing."""
+    from objslam.mapping import joint_solve
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_solve, "_unclear", lambda state: False)
+        yield
 
 
 @pytest.fixture
