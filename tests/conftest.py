@@ -44,6 +44,12 @@ def no_progress() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def no_boxes_of_earlier_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The user's cache has the boxes that a detector found when the tests ran before, perhaps with other code."""
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="session", autouse=True)
 def no_waiting_for_the_disk() -> None:
     """No test cuts the power: they kill processes, and a killed process leaves what it wrote to the kernel. So nothing waits
     until it is on the disk, which takes some milliseconds each time. A descriptor that is no file is still an error. Tests
