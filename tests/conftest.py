@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -44,6 +44,12 @@ def no_progress() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def no_boxes_of_earlier_runs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The user's cache has the boxes that a detector found when the tests ran before, perhaps with other code."""
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(scope="session", autouse=True)
 def no_waiting_for_the_disk() -> None:
     """No test cuts the power: they kill processes, and a killed process leaves what it wrote to the kernel. So nothing waits
     until it is on the disk, which takes some milliseconds each time. A descriptor that is no file is still an error. Tests
@@ -61,6 +67,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     nothing to do."""
     first = ("forks", "long")
     items.sort(key=lambda item: next((i for i, name in enumerate(first) if item.get_closest_marker(name)), len(first)))
+
+
+@pytest.fixture(scope="module")
+def one_start() -> Iterator[None]:
+    """No map of a joint solve is tried from other starts, as unclear maps are. Other starts take most of the time of a test
+    that asks what the first start finds, and can hide that it finds nothing."""
+    from objslam.mapping import joint_solve
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_solve, "_unclear", lambda state: False)
+        yield
 
 
 @pytest.fixture

@@ -25,6 +25,7 @@ from objslam.mapping.pipeline import run
 from objslam.simulation import preset, simulate
 from objslam.simulation.settings import DepthNoise
 
+pytestmark = pytest.mark.usefixtures("one_start")
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 NAMES = sorted(file.name for file in CONFIGS.glob("*.yaml"))
 

@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.geometry import make_pose, motion_between
+from objslam.core.geometry import lengths, make_pose, motion_between
 from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.frontend.odometry_bridge import OdometryBridge
@@ -280,8 +280,8 @@ def refocused(directions: Floats, errors: Floats | tuple[float, float, float]) -
     """
     (focal, cx, cy), (x, y, z) = np.moveaxis(np.asarray(errors), -1, 0), directions.T
     longer = np.stack([x - cx * z, y - cy * z, (1 + focal) * z], axis=-1)
-    length = np.linalg.norm(longer, axis=-1)
-    return longer / length[..., None], np.sqrt((1 + focal) / length**3)
+    length = lengths(longer)
+    return longer / length[..., None], np.sqrt((1 + focal) / length) / length
 
 
 def later(stamps: Floats, clock: float, path: Trajectory | None) -> Floats:

@@ -76,11 +76,11 @@ def test_a_demo_replaces_no_log_of_others(objslam: Objslam, tmp_path: Path) -> N
 def test_demo_from_images(objslam: Objslam, attempts: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole way: rendered images, the shipped detector, both modes. The bars are those that the README promises.
 
-    A third of the images have to meet them too, because rendering takes most of the time. An object then needs to be in a
-    third as many, so that the room is that of the whole demo. The objects do not depend on the surface, so it is made of
+    A quarter of the images have to meet them too, because rendering takes most of the time. An object then needs to be in a
+    quarter as many, so that the room is that of the whole demo. The objects do not depend on the surface, so it is made of
     fewer depth images.
     """
-    monkeypatch.setattr(render, "RenderSettings", partial(RenderSettings, frames=80, min_views=7))
+    monkeypatch.setattr(render, "RenderSettings", partial(RenderSettings, frames=60, min_views=5))
     monkeypatch.setattr(demo, "settings_of", lambda mode, file, told: settings_of(mode, file, [*told, FEW_DEPTHS]))
     done = objslam("demo", "-o", tmp_path / "demo")
     assert done.code == 0, done.err

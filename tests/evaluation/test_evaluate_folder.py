@@ -26,6 +26,8 @@ from objslam.mapping import pipeline
 from objslam.output.result_folder import write_result
 from objslam.simulation import preset, simulate
 
+pytestmark = pytest.mark.usefixtures("one_start")
+
 
 def test_what_was_compared_with_is_named(tmp_path: Path) -> None:
     result, truth = synthetic_result(

@@ -17,6 +17,7 @@ from objslam.mapping import pipeline
 from objslam.mapping.solution import rays_moved, seen_something
 from objslam.simulation import preset, simulate
 
+pytestmark = pytest.mark.usefixtures("one_start")
 STEP = {"x_per_m": 0.0, "y_per_m": 0.0, "xy_per_rad": 0.0, "yaw_per_m": 0.0, "yaw_per_rad": 0.0}
 STEP |= {"floor_xy": 0.01, "floor_yaw": float(np.radians(0.3))}
 LESS = {stage: {"use": False} for stage in ("checks", "bodies", "calibration")}

@@ -10,6 +10,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.mapping import pipeline
 from objslam.simulation import DepthNoise, preset, simulate
 
+pytestmark = pytest.mark.usefixtures("one_start")
+
 
 def driven(seed=0, **changes):
     return simulate(preset("demo", frames=200, objects=12, classes=12, depth=DepthNoise(), **changes), seed)

@@ -14,6 +14,7 @@ from objslam.mapping import pipeline
 from objslam.mapping.labels import labels_tell
 from objslam.simulation import preset, simulate
 
+pytestmark = pytest.mark.usefixtures("one_start")
 QUIET = ("mode=joint", "output.recording=false", "checks.use=false", "bodies.use=false")
 """Without what does not decide whether labels tell objects apart."""
 HELD = "calibration.use=false"

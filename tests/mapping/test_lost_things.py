@@ -13,6 +13,7 @@ from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.simulation import preset, simulate
 
+pytestmark = pytest.mark.usefixtures("one_start")
 HELD = LEAN.model_copy(update={"calibration": LEAN.calibration.model_copy(update={"use": False})})
 BY_LABEL = HELD.model_copy(update={"association": HELD.association.model_copy(update={"method": "by_label"})})
 

@@ -15,6 +15,8 @@ from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.simulation import PoseNoise, preset, simulate
 
+pytestmark = pytest.mark.usefixtures("one_start")
+
 
 @cache
 def drive() -> Log:

@@ -25,6 +25,7 @@ from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
 from objslam.mapping.refuted import without_refuted
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
 
+pytestmark = pytest.mark.usefixtures("one_start")
 SETTINGS = load_settings(None, ("mode=joint", "output.recording=false", "calibration.use=false", "bodies.use=false"))
 
 

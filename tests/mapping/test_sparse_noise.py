@@ -41,6 +41,7 @@ def few_tried(monkeypatch):
     """Fewer noises than usual are tried, the true ones among them."""
     monkeypatch.setattr(tested, "_PLACES", (1.0, 30.0))
     monkeypatch.setattr(tested, "_RAYS", (1.0,))
+    monkeypatch.setattr(tested, "_TURN", 30)
 
 
 @pytest.mark.usefixtures("few_tried")

@@ -13,6 +13,7 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
+from objslam.core.geometry import lengths
 from objslam.core.rotation import cross
 from objslam.core.types import Association
 from objslam.errors import SolveError
@@ -272,10 +273,10 @@ class _Misses:
     def of(cls, origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float) -> Self:
         """Measure rays (M, n, 3) against points `target` (n, 3). place: m, the noise of origins."""
         to = target - origins
-        distance = np.maximum(np.linalg.norm(to, axis=-1), 1e-3)
+        distance = np.maximum(lengths(to), 1e-3)
         to = to / distance[..., None]
         level = np.stack([-directions[..., 1], directions[..., 0], np.zeros(distance.shape)], axis=-1)
-        level /= np.maximum(np.linalg.norm(level, axis=-1, keepdims=True), 1e-6)
+        level /= np.maximum(lengths(level), 1e-6)[..., None]
         basis = np.stack([level, cross(directions, level)], axis=-2)
         sigma = np.hypot(angle, place / distance)
         return cls(np.einsum("mnki,mni->mnk", basis, to) / sigma[..., None], basis, to, distance, angle, sigma)

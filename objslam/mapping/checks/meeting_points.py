@@ -208,7 +208,8 @@ def _nearly_parallel(rows: _Rows) -> Bools:
 def _tried_points(rows: _Rows, size: Ints, dice: Floats) -> tuple[Floats, Bools]:
     """Return the points (L, P, 3) where pairs of rays come closest, and which of them (L, P) are ahead of both cameras.
 
-    All pairs of a label are tried if there are few enough, else random pairs.
+    All pairs of a label are tried if there are few enough, else random pairs. Points that are ahead come first. The others
+    are there only to fill the rows, because the table takes its time for each of them too.
     """
     tried = int(_tried(size).max())
     order = np.arange(tried)
@@ -228,7 +229,9 @@ def _tried_points(rows: _Rows, size: Ints, dice: Floats) -> tuple[Floats, Bools]
     sin2 = np.where(wide, sin2, 1.0)
     s, t = (along_a - cos * along_b) / sin2, (cos * along_a - along_b) / sin2
     points = (o_a + s[:, :, None] * d_a + o_b + t[:, :, None] * d_b) / 2
-    return points, wide & (s > _NEAREST) & (t > _NEAREST)
+    ahead = wide & (s > _NEAREST) & (t > _NEAREST)
+    some = np.argsort(~ahead, axis=1, kind="stable")[:, : max(1, int(ahead.sum(axis=1).max()))]
+    return np.take_along_axis(points, some[:, :, None], axis=1), np.take_along_axis(ahead, some, axis=1)
 
 
 def _seen_from_around(rows: _Rows, points: Floats, inside: Bools) -> Bools:

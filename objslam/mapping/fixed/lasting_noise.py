@@ -109,15 +109,13 @@ def lasting_variances(cells: Cells) -> Floats:
     cells = cells.take(_counted(cells.times))
     same = cells.owner[:, None] == cells.owner
     known = np.diag(cells.white**2) + _LOOSE**2 * np.where(same, cells.shift @ cells.shift.T, 0.0)
-    root = np.linalg.cholesky(known)
-    mean = np.linalg.solve(root, cells.mean)
-    squared = _FACTORS**2
+    whiten = np.linalg.inv(np.linalg.cholesky(known))
+    mean, squared = whiten @ cells.mean, _FACTORS**2
     likelihood = np.tile(-0.5 * squared, (len(_KINDS), len(TIMES), 1))
-    for rows, kind in zip(likelihood, _KINDS, strict=True):
-        errors = cells._errors(kind)
-        for row, time in zip(rows, TIMES, strict=True):
-            left = np.linalg.solve(root, errors * cells.alike(time))
-            size, vectors = np.linalg.eigh(np.linalg.solve(root, left.T))
+    for column, time in enumerate(TIMES):
+        errors = whiten @ (np.stack([cells._errors(one) for one in np.eye(2)]) * cells.alike(time)) @ whiten.T
+        for row, kind in zip(likelihood[:, column], _KINDS, strict=True):
+            size, vectors = np.linalg.eigh(np.tensordot(kind, errors, 1))
             variance = 1 + squared[:, None] * np.maximum(size, 0.0)
             row -= 0.5 * ((vectors.T @ mean) ** 2 / variance + np.log(variance)).sum(axis=1)
     weight = np.exp(likelihood - likelihood.max()) * np.gradient(_FACTORS)

@@ -99,17 +99,16 @@ class _Poses:
             told = np.einsum("kl,kip->lip", root, told).reshape(1, -1, told.shape[2])
             inner = np.einsum("kl,kij,km->limj", root, inner, root, optimize=True).reshape(1, told.shape[1], -1)
         inner = inner + np.eye(inner.shape[1])
-        half = np.linalg.solve(np.linalg.cholesky(inner), told)
-        flat = half.reshape(-1, half.shape[2])
-        gram = flat.T @ flat
+        best = np.linalg.solve(inner, told)
+        gram = told.reshape(-1, told.shape[2]).T @ best.reshape(-1, told.shape[2])
         total = self.information - gram[1:, 1:] + np.eye(len(self.vector)) * factor**2
         vector = self.vector - gram[1:, 0]
         found = np.linalg.solve(total, vector)
         squares = (self.squares - gram[0, 0] - vector @ found) / factor**2
-        cost = squares + np.linalg.slogdet(inner)[1].sum() + np.linalg.slogdet(total)[1]
+        pivots = np.diagonal(np.linalg.cholesky(inner), axis1=1, axis2=2)
+        cost = squares + 2 * np.log(pivots).sum() + np.linalg.slogdet(total)[1]
         cost += 2 * (self.rays - len(found)) * logarithms[0] + self.prior * (2 * logarithms[0] + factor**-2.0)
-        left = told[:, :, 0] - told[:, :, 1:] @ found
-        errors = np.linalg.solve(inner, left[:, :, None])[:, :, 0]
+        errors = best[:, :, 0] - best[:, :, 1:] @ found
         if alike is not None:
             errors = np.einsum("kl,li->ki", root, errors.reshape(len(root), -1))
         return float(cost), found, errors * sigma
