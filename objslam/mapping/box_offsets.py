@@ -17,6 +17,7 @@ from objslam.core.geometry import evenly_spread, is_planar
 from objslam.core.ground.flattening import noise_of_ground
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
+from objslam.mapping.bodies.centre_bearings import as_centres
 from objslam.mapping.solution import Solution
 from objslam.triangulation.bodies.shared import ALIKE, SIDES, WITHIN
 
@@ -99,7 +100,12 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     # elevation.
     if learnt and joint:
         learnt = is_planar(solution.keyframes.map_T_base) and not any(noise_of_ground(settings))
-    shown = [one.in_elevation() if joint else one for j, one in seen.items() if sized[j]]
+    told_by = seen
+    if not joint:  # The centre of the box of a large thing lies beside its centre. That is no error of the detector.
+        centres = as_centres(solution)
+        plain = settings.fixed.loss == "l1"
+        told_by = sides_of(_sized_rays(centres, cameras, settings), centres.estimate.positions, plain=plain)
+    shown = [one.in_elevation() if joint else one for j, one in told_by.items() if sized[j]]
     share = _share(shown, prior) if learnt else prior
     covariance, bodies = estimate.covariance.copy(), list(solution.bodies or ())
     for j, sides in seen.items():

@@ -144,11 +144,13 @@ def _run(
             say(diagnosis, ledger)
     lasting, late = None, None
     if settings.mode == "fixed":
-        solution, lasting = with_lasting_errors(solution, settings)
-        solution = with_far_sides(solution)
+        solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
     if diagnosis.jumps is not None:
         solution = with_jumps(solution, diagnosis.jumps)
-    solution = with_hidden_parts(with_bodies(solution, cameras, settings), cameras)
+    solution = with_bodies(solution, cameras, settings)
+    if settings.mode == "fixed":  # After the bodies: their edges tell depths that the rays of a point do not tell.
+        solution = with_far_sides(solution)
+    solution = with_hidden_parts(solution, cameras)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     trusted = not diagnosis.spoilt

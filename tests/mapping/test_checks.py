@@ -464,7 +464,7 @@ def test_small_errors_widen_the_covariances_to_the_true_errors(name, monkeypatch
     # The offsets of boxes, and lasting errors of poses, would take in a part of these errors, because the rays of different
     # sides and visits disagree.
     with monkeypatch.context() as alone:
-        alone.setattr(pipeline, "with_lasting_errors", lambda solution, settings: (solution, None))
+        alone.setattr(pipeline, "with_lasting_errors", lambda solution, *_: (solution, None))
         plain = sigmas_off(known, "checks.use=false", "rays.box_sigma=0")
     assert np.median(plain) > 5
     assert np.median(widened) < 1.5

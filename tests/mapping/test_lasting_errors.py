@@ -48,7 +48,7 @@ def test_errors_of_poses_that_last_are_in_the_covariances(monkeypatch):
         log = simulate(preset("demo", odometry=None, objects=12, classes=12, frames=300, false=0.0, **noise), seed)
         logs.append(with_lasting(log, 2.5, 16.0, seed))
     found = np.concatenate([squares(log) for log in logs])
-    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda solution, settings: (solution, None))
+    monkeypatch.setattr(pipeline, "with_lasting_errors", lambda solution, *_: (solution, None))
     without = np.concatenate([squares(log) for log in logs])
     # An honest median is 2.4. A drive of one minute has few independent errors of 16 s, and its objects share them.
     assert np.median(without) > 30
@@ -117,7 +117,7 @@ def test_lasting_errors_are_the_same_with_any_axis_up_and_reach_heights_in_3d(mo
     pitch = 0.005 * np.sin(log.localization.stamps / 3)[:, None] * [0.0, 1.0, 0.0]
     tilted = log.localization.poses @ make_pose(rotation_from_vector(pitch), np.zeros(3))
     squares(replace(log, localization=replace(log.localization, poses=tilted)))
-    (flat, settings), (solid, _) = made
+    (flat, settings, *_), (solid, *_) = made
 
     def added(solution):
         return wider(solution, settings)[0].estimate.covariance - solution.estimate.covariance

@@ -16,6 +16,7 @@ from objslam.core.statistics import grouped_median
 from objslam.frontend.surface_ranges import centre_factors, half_widths_of_rays
 from objslam.frontend.up import up_axis
 from objslam.graph.fixed_pose_triangulation import pose_noise
+from objslam.graph.outlier_rejection import widening
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.bodies.box_views import BoxViews
 from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes
@@ -180,7 +181,10 @@ def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
 
 
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
-    """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2."""
+    """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2.
+
+    The rays of a large thing miss the point, which makes its covariance wider. This is no error of the body.
+    """
     estimate, rays, keyframes = solution.estimate, solution.rays, solution.keyframes
     if settings.mode != "joint" and estimate.calibration is None and not keyframes.localized_every:
         return np.zeros((len(views.objects), 3, 3))
@@ -190,9 +194,11 @@ def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Float
     distance = np.maximum(np.linalg.norm(estimate.positions[owner] - origin, axis=1), MIN_DEPTH)
     noise, place = (rays.sigma, 0.0) if settings.mode == "joint" else pose_noise(rays, keyframes, settings)
     across = 1 / np.hypot(noise[use] * distance, place) ** 2
+    residual = angles_off(origin, direction, estimate.positions[owner]) * distance * np.sqrt(across)
+    wider = widening(residual, owner, solution.association.count)[views.objects]
     along = np.where(np.isfinite(rays.range[use]), 1 / rays.range_sigma[use], 0.0) ** 2
     information = ray_information(direction, across, along, owner, solution.association.count)[views.objects]
-    more = estimate.covariance[views.objects] - np.linalg.pinv(information, hermitian=True)
+    more = estimate.covariance[views.objects] - wider[:, None, None] * np.linalg.pinv(information, hermitian=True)
     size, vectors = np.linalg.eigh((more + np.swapaxes(more, 1, 2)) / 2)
     return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, np.maximum(size, 0.0), vectors))
 

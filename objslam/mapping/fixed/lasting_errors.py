@@ -4,6 +4,7 @@ Poses in a plane turn and shift rays to the left or to the right. Poses in 3D tu
 rays from one visit do not average such an error out, so they count as few. The rays of several visits show its size.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from objslam.core.types import Log
 from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, noise_up
 from objslam.graph.robust_cost import ray_information
+from objslam.mapping.bodies.centre_bearings import as_centres
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.fixed.lasting_noise import TIMES, Cells, LastingNoise, lasting_variances
 from objslam.mapping.moves.odometry_witness import odometry_contradicts
@@ -40,6 +42,9 @@ take up a part of the errors, so the boxes show too small errors. A larger value
 _FEWEST = 3
 """A run warns of such errors only if at least this number of objects show them. Boxes of one object lie beside it in the
 same way for seconds, so one object tells little of the poses. A larger number warns less often."""
+_SMALL = 0.2
+"""The errors are estimated again with the boxes around the centres of bodies, if they are above this multiple of the noise
+`localization`. A larger value takes less time, and blames the poses for boxes of large things."""
 LASTING = "lasting localisation errors"
 """The name of the finding that given poses err for seconds."""
 _POOLED = 20.0
@@ -47,7 +52,9 @@ _POOLED = 20.0
 settings more."""
 
 
-def with_lasting_errors(solution: Solution, settings: Settings) -> tuple[Solution, LastingNoise | None]:
+def with_lasting_errors(
+    solution: Solution, settings: Settings, with_bodies: Callable[[Solution], Solution] | None = None
+) -> tuple[Solution, LastingNoise | None]:
     """Return the solution of a run at given poses with their lasting errors added to its covariances, and these errors. They
     are None if the log does not show them, or if the poses are not planar.
 
@@ -57,6 +64,9 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> tuple[Solutio
     The size of the errors is `localization` times a factor with a half-normal prior of 1. Their correlation falls
     exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood (Patterson
     and Thompson 1971), and averaged over their posterior.
+
+    The centre of the box of a large thing nearby lies beside the image of its centre, for as long as the robot drives by.
+    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres.
     """
     if not solution.keyframes.localized_every:
         return solution, None
@@ -67,6 +77,9 @@ def with_lasting_errors(solution: Solution, settings: Settings) -> tuple[Solutio
 
     covariance = solution.estimate.covariance.copy()
     found = [lasting_variances(cells) for cells in seen]
+    if with_bodies is not None and max(one.sum() for one in found) > _SMALL**2:
+        seen = _cells_of(as_centres(with_bodies(solution)), settings)
+        found = [lasting_variances(cells) for cells in seen]
     for cells, variances in zip(seen, found, strict=True):
         objects, more = cells.covariances(variances)
         covariance[objects] += more
