@@ -52,6 +52,9 @@ object."""
 MOST_NOISE_FACTOR = 5.0
 """The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the
 box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
+NOISE_MEASURED_BY = 6
+"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise is
+that of the settings. A larger number rejects more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
 """The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. At the
 same number of rays of a class, the noise of the class and the nominal noise have equal weight. A larger number keeps objects
@@ -96,6 +99,16 @@ def noise_factors(deviations: Floats, index: Ints, count: int, fewest: int = 1) 
     number = np.bincount(index, minlength=count)
     median = np.where(number >= fewest, grouped_median(deviations, index, count), 0.0)
     return np.maximum(1.0, median / RAYLEIGH_MEDIAN)
+
+
+def widening(residual: Floats, index: Ints, count: int) -> Floats:
+    """Return the factor (N,) >= 1 on the covariance of each object. It is above 1 if rays miss the object by more than their
+    noise.
+
+    The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) in units of the noise
+    of the settings. index, count: as in `noise_factors`.
+    """
+    return noise_factors(residual, index, count, NOISE_MEASURED_BY) ** 2
 
 
 def grouped_median(values: Floats, index: Ints, count: int) -> Floats:

@@ -14,7 +14,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off
 from objslam.core.ground.flattening import flattened_lines, flattened_points, raised_covariances, raised_points
-from objslam.core.statistics import CAUCHY_K, HUBER_K
+from objslam.core.statistics import CAUCHY_K, HUBER_K, widening
 from objslam.core.trace import Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
@@ -25,7 +25,7 @@ from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.multi_start import MultiStart
 from objslam.graph.multiframes import Multiframes
 from objslam.graph.optimizers import Optimum, build_graph, optimize, trace_solve
-from objslam.graph.outlier_rejection import ROUNDS, JointSolution, misfit, reject_outliers, rejected_stretches, widening
+from objslam.graph.outlier_rejection import ROUNDS, JointSolution, misfit, reject_outliers, rejected_stretches
 from objslam.graph.posterior.evidence import log_evidence
 from objslam.graph.posterior.marginals import (
     Solved,

@@ -8,7 +8,7 @@ import numpy as np
 from objslam.association.observations import MIN_DEPTH
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import angles_off
-from objslam.core.statistics import MOST_NOISE_FACTOR, OUTLIER_RAY, STRAY_RAY, noise_factors
+from objslam.core.statistics import MOST_NOISE_FACTOR, NOISE_MEASURED_BY, OUTLIER_RAY, STRAY_RAY, noise_factors
 from objslam.core.trace import Trace
 from objslam.core.types import Association, Rays
 from objslam.graph.assembly import Measurements
@@ -32,9 +32,6 @@ a more exact solution hardly changes an inlier. A larger value is faster."""
 _SURE = 0.95
 """An object is triangulated again if less than this share of its rays are inliers. A larger share is slower, and corrects
 more objects at wrong positions."""
-_FEWEST = 6
-"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise is
-that of the settings. A larger number rejects more rays of noisy objects."""
 
 
 Near = tuple[Ints, NormalEquations]
@@ -240,18 +237,10 @@ def supported(rays: Rays, association: Association, map_T_camera: Floats, positi
     origins, directions = (a[placed] for a in rays.in_map(map_T_camera))
     miss = angles_off(origins, directions, positions[landmark]) / rays.sigma[placed]
     before = used[placed] if used.any() else np.ones(len(miss), dtype=bool)
-    noise = np.minimum(noise_factors(miss[before], landmark[before], association.count, _FEWEST), MOST_NOISE_FACTOR)
+    noise = np.minimum(
+        noise_factors(miss[before], landmark[before], association.count, NOISE_MEASURED_BY), MOST_NOISE_FACTOR
+    )
     agreeing = np.zeros(len(rays), dtype=bool)
     apart = np.linalg.norm(positions[landmark] - origins, axis=1) > MIN_DEPTH
     agreeing[placed] = apart & (miss <= OUTLIER_RAY * noise[landmark])
     return agreeing
-
-
-def widening(residual: Floats, landmark: Ints, count: int) -> Floats:
-    """Return the factor (N,) >= 1 on the covariance of each landmark. It is above 1 if rays miss the landmark by more than
-    their noise.
-
-    The factor is the squared ratio of the measured noise to the noise of the settings. residual: (R,) in units of the noise
-    of the settings.
-    """
-    return noise_factors(residual, landmark, count, _FEWEST) ** 2

@@ -124,11 +124,11 @@ def test_the_last_solve_estimates_the_shared_errors(monkeypatch, two, turns, exp
     assert held == expected
 
 
-@pytest.mark.parametrize(("last", "expected"), [(11.0, 0), (9.0, 1)])
+@pytest.mark.parametrize(("last", "expected"), [(201.0, 0), (199.0, 1)])
 def test_a_last_round_that_ruins_a_map_does_not_count(monkeypatch, two, last, expected):
     """last: what the first of two rounds explains more than the second, and more than the last solve."""
     begin, held = taking_turns(monkeypatch, [two[0], two[1], two[1], two[1]], errors=SimpleNamespace())
-    value = {one.count: evidence for one, evidence in zip(two, (100.0, 100.0 - last), strict=True)}
+    value = {one.count: evidence for one, evidence in zip(two, (1000.0, 1000.0 - last), strict=True)}
     monkeypatch.setattr(JointState, "explained", property(lambda state: value[state.association.count]))
     chosen = begin.alternated(np.eye(4)[None], None)
     assert chosen.association is two[expected]

@@ -12,11 +12,10 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import SHAPES, UNKNOWN_YAW, Body, PlacedBody
 from objslam.core.camera import Camera
 from objslam.core.geometry import angles_off
-from objslam.core.statistics import grouped_median
+from objslam.core.statistics import grouped_median, widening
 from objslam.frontend.surface_ranges import centre_factors, half_widths_of_rays
 from objslam.frontend.up import up_axis
 from objslam.graph.fixed_pose_triangulation import pose_noise
-from objslam.graph.outlier_rejection import widening
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.bodies.box_views import BoxViews
 from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes
