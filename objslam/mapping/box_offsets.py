@@ -101,8 +101,8 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
     if learnt and joint:
         learnt = is_planar(solution.keyframes.map_T_base) and not any(noise_of_ground(settings))
     told_by = seen
-    if not joint:  # The centre of the box of a large thing lies beside its centre. That is no error of the detector.
-        centres = as_centres(solution)
+    # The centre of the box of a large thing lies beside its centre. That is no error of the detector.
+    if learnt and not joint and (centres := as_centres(solution)) is not solution:
         plain = settings.fixed.loss == "l1"
         told_by = sides_of(_sized_rays(centres, cameras, settings), centres.estimate.positions, plain=plain)
     shown = [one.in_elevation() if joint else one for j, one in told_by.items() if sized[j]]

@@ -169,8 +169,8 @@ class JointState:
         best = max(states, key=lambda one: one.explained, default=self)
         if best.association is None or best.explained - self.explained < _RUINED:
             return self
-        again = replace(best, hold=self.hold).solve("association", best.association, best.solved_poses)
-        return replace(again, rounds=self.rounds, unsettled=0) if again.explained > self.explained else self
+        again = replace(best.attempt(), hold=self.hold).solve("association", best.association, best.solved_poses)
+        return replace(self.replaced(again), rounds=self.rounds, unsettled=0) if again.explained > self.explained else self
 
     def changed_since(self, before: Self) -> int:
         """Return the number of objects that differ from those of an earlier state (`objects_changed`)."""
