@@ -17,15 +17,14 @@ from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.noise import NOMINAL
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
+from objslam.graph.calibration.information import covariance_of, likelihood, without_shrinking
 from objslam.graph.calibration.inner_solve import InnerSolve
 from objslam.graph.calibration.localization_noise import noise_of_localization
 from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
-from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.calibration.variance_components import estimate_noise
 from objslam.graph.outlier_rejection import JointSolution, known_landmarks, misfit, reject_outliers
 
@@ -41,10 +40,6 @@ shared errors."""
 _HALVINGS = 3
 """The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
-_RIDGE = 1e-9
-"""The share of the variance of a gradient that is added to its diagonal. It prevents a division by zero if a log cannot tell
-two parameters apart. A larger share mixes such parameters more."""
-
 _NOISE_ROUNDS = 3
 """The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
 _SAME_NOISE = 0.1
@@ -53,13 +48,6 @@ _SAME_NOISE = 0.1
 _SAME_SHARES = 0.5
 """The shares of noise in the information are computed again if the noise changes by more than this share. They change slowly
 with the noise. A larger value computes them less often."""
-
-_LEAST_GROWTH = 0.5
-"""The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
-1. An exact map would grow by 1. With a larger value, the projection is used more rarely."""
-_FAR = 3.0
-"""Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
-determined landmarks count too."""
 
 Measure = Callable[[Keyframes, Rays, Settings], Measurements]
 """A function that collects the measurements of keyframes and rays with the noise of the settings."""
@@ -133,8 +121,8 @@ def calibrate(
             inliers = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used)
             state = inliers.ordered(final.near)
             system = linearise(state, fit.errors, theta, at.noise)
-            reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
-        covariance = _covariance(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
+            reduced = without_shrinking(state, system.reduce(), fit.errors, theta)
+        covariance = covariance_of(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
         by_landmark = (len(state.landmarks), 3, len(theta))
         sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
@@ -249,8 +237,8 @@ class _Fit:
 
         def outer(state: InnerSolve, theta: Floats, linear: LinearSystem) -> _Outer:
             linear = linear.with_noise(shares)
-            system = _without_shrinking(state, linear.reduce(), errors, theta)
-            weights, information = _likelihood(system.with_wider(self.wider))
+            system = without_shrinking(state, linear.reduce(), errors, theta)
+            weights, information = likelihood(system.with_wider(self.wider))
             gradient = weights @ system.gradient
             step = np.linalg.solve(information + prior, gradient - prior @ (theta - errors.mean))
             return _Outer(state, theta, linear, system, gradient, information, information + prior, np.asarray(step))
@@ -284,67 +272,3 @@ class _Fit:
     def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
         """Return the same poses and landmarks with the measurements at the present noise."""
         return state.measuring(self.measure(*self.errors.at(theta)))
-
-
-def _likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:
-    """Return the weights (P, P) of the system's gradient, and the information (P, P) that it has about the parameters.
-
-    The gradient g is Gaussian: its mean is the slope C times the error of the parameters, and V is its variance. So the
-    weights are C' V^-1 and the information is C' V^-1 C (limited information likelihood; Kim 2002). If the derivatives by
-    the parameters have no noise, the weights are 1 and the information is C. If they are only noise, V is large, C is small,
-    and the parameters stay at their prior. SolveError if the system is not finite.
-    """
-    variance, slope = system.variance, system.slope
-    if not (np.isfinite(variance).all() and np.isfinite(slope).all()):
-        raise SolveError("the information about the shared errors is not finite")
-    size = np.sqrt(np.maximum(np.diagonal(variance), 1e-300))
-    scaled = variance / np.outer(size, size) + _RIDGE * np.eye(len(size))
-    weights = np.linalg.solve(scaled, slope / size[:, None]).T / size
-    information = weights @ slope
-    return np.asarray(weights), np.asarray((information + information.T) / 2)
-
-
-def _covariance(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats:
-    """Return the covariance (P, P) of the parameters, at most the covariance of their prior in every direction.
-
-    prior: (P, P) information. wider: (P,) factors on the standard deviations of the gradient, for noise that is not white.
-    With them, the covariance is a sandwich (Huber 1967). Its weights are those of white noise, because the factors are known
-    only roughly, and with too large a factor, other weights would promise too much.
-    """
-    weights, information = _likelihood(system)
-    inverse = np.linalg.inv(information + prior)
-    varies = weights @ system.with_wider(wider).variance @ weights.T + prior
-    root = np.linalg.cholesky(prior)
-    size, axes = np.linalg.eigh(root.T @ inverse @ varies @ inverse @ root)
-    axes = np.linalg.solve(root.T, axes)
-    return np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
-
-
-def _without_shrinking(
-    state: InnerSolve, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats
-) -> ReducedSystem:
-    """Return the system without the force that makes a solution too small, because this force would move the parameters.
-
-    The more the size of the map depends on a parameter, the more the force acts on the parameter. If all lengths have an
-    unknown scale, everything can grow in proportion at no cost. Then nothing but the force determines the common scale. So
-    the common scale is projected out (the gauge of a free network; Meissl 1969). If some length is known, the force is
-    computed and subtracted.
-    """
-    landmarks = state.positions[state.landmarks]
-    if not len(landmarks):
-        return system
-    away = np.linalg.norm(landmarks - np.median(landmarks, axis=0), axis=1)
-    near = away <= _FAR * np.median(away)  # A far landmark is poorly determined, and does not grow with the map.
-    around = landmarks[near] - landmarks[near].mean(axis=0)  # Without the mean, a shift of the map would count as growth.
-    moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
-    size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
-    growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
-    if not growing @ size > _LEAST_GROWTH:
-        return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
-    project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
-    return replace(
-        system,
-        gradient=project @ system.gradient,
-        slope=project @ system.slope @ project.T,
-        variance=project @ system.variance @ project.T,
-    )
