@@ -8,9 +8,9 @@ settings, and the table has these columns:
 
 said: the names of the findings (with * if no object is called ok because of it), and the first words of warnings that the
 unchanged log does not give. ok: the objects that are called ok. over: how many of them are more than 3 sigmas from the true
-object of their label (squared Mahalanobis distance above 13.9, by the covariance that the alignment leaves). squared: the median of the squared distances; 2.4 is honest.
-off: the median error, m. A map in the frame of the odometry is laid on the truth first. Without true objects, the map of the
-unchanged log is the truth.
+object of their label (squared Mahalanobis distance above 13.9). squared: the median of the squared distances; 2.4 is honest.
+off: the median error, m. A map in the frame of the odometry is laid on the truth first, and its objects are judged by the
+covariances that this alignment leaves. Without true objects, the map of the unchanged log is the truth.
 verdict: right (no more objects over 3 sigmas than in the unchanged log, or a median that is at most 1.5 times larger), named
 (no object is called ok), or WRONG, with or without a word.
 """

@@ -59,7 +59,7 @@ def solve(
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:  # The fixed mode does without these modules, and the many below them.
         from objslam.mapping.bodies.centre_bearings import solve_to_centres
-        from objslam.mapping.joint_alternation import JointState
+        from objslam.mapping.joint.joint_alternation import JointState
         from objslam.mapping.joint_solve import solve_joint
 
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)

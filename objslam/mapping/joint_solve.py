@@ -14,7 +14,12 @@ from objslam.core.geometry import inverse
 from objslam.errors import SolveError
 from objslam.frontend.tracks import associate_tracks
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.mapping.doubted_labels import (
+from objslam.mapping.exploration.errors_of_tracks import along, with_errors_of_tracks
+from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
+from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
+from objslam.mapping.fixed.camera_calibration import associate_at_poses
+from objslam.mapping.fixed.fixed_poses import FixedPoses
+from objslam.mapping.joint.doubted_labels import (
     CLEAR_ODDS,
     doubted_names,
     evidence_against,
@@ -22,13 +27,8 @@ from objslam.mapping.doubted_labels import (
     has_several,
     needs_noisy_boxes,
 )
-from objslam.mapping.exploration.errors_of_tracks import along, with_errors_of_tracks
-from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
-from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
-from objslam.mapping.fixed.camera_calibration import associate_at_poses
-from objslam.mapping.fixed.fixed_poses import FixedPoses
-from objslam.mapping.joint_alternation import JointState
-from objslam.mapping.labels import (
+from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.joint.labels import (
     angles_to_objects,
     clock_explains,
     labels_tell,

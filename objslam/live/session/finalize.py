@@ -25,8 +25,8 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.doubted_labels import doubted_names
-from objslam.mapping.labels import labels_tell
+from objslam.mapping.joint.doubted_labels import doubted_names
+from objslam.mapping.joint.labels import labels_tell
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
 
