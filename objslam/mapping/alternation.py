@@ -48,6 +48,7 @@ def solve(
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     doubted: tuple[str, ...] = ()
     unsettled = 0
+    estimated = errors
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
         if errors is None:
@@ -64,6 +65,9 @@ def solve(
 
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
         state = solve_joint(begin, start)
+        if errors is not None and state.errors is not None and state.errors.names != errors.names:
+            estimated = errors = state.errors.with_noise(errors.noise)
+            begin = replace(begin, errors=errors, settings=errors.settings)
         assert state.association is not None
         assert state.estimate is not None
         association, estimate, rounds = state.association, state.estimate, state.rounds
@@ -79,4 +83,4 @@ def solve(
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     solved = Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)
-    return replace(solved, doubted=doubted, unsettled=unsettled)
+    return replace(solved, doubted=doubted, unsettled=unsettled, errors=estimated)

@@ -24,6 +24,7 @@ from objslam.graph.calibration.information import covariance_of, likelihood, wit
 from objslam.graph.calibration.inner_solve import InnerSolve
 from objslam.graph.calibration.localization_noise import noise_of_localization
 from objslam.graph.calibration.noise_in_instruments import noise_shares
+from objslam.graph.calibration.prior_conflict import with_wider_priors
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise
 from objslam.graph.outlier_rejection import JointSolution, known_landmarks, misfit, reject_outliers
@@ -127,6 +128,7 @@ def calibrate(
         sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
     calibration = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
+    calibration = with_wider_priors(calibration, errors.mean, errors.prior)
     return CalibratedSolution(calibration, fit.errors, state.measured, final, sensitivity)
 
 

@@ -55,7 +55,8 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         warn_of_others(m.calibration, log, settings, ledger)
     cameras = tuple(one.camera for one in log.cameras)
     solution = _solved(found, m.by_label, cameras, settings, ledger)
-    if errors is not None:
+    if solution.errors is not None:
+        errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
     solution = with_bodies(solution, cameras, settings)
