@@ -114,12 +114,14 @@ class Calibration:
         A later run with this file in `calibration.file` takes the values and the covariance as its prior.
         """
         sigma, expected = self.sigma, self.expected
+        wider = np.ones(len(self.names)) if self.prior_factor is None else self.prior_factor
         parameters = {
             name: {
                 "value": float(self.values[i]),
                 "sigma": float(sigma[i]),
                 "prior_mean": float(expected[i]),
                 "prior_sigma": float(self.prior[i]),
+                "prior_factor": float(wider[i]),
                 "unit": UNITS.get(kind(name), "share"),
                 "observable": bool(sigma[i] <= OBSERVABLE * self.prior[i]),
             }
