@@ -139,10 +139,10 @@ def with_jumps(solution: Solution, jumps: Jumps) -> Solution:
     origins = solution.keyframes.map_T_camera[keyframe, :3, 3]
     stamps = solution.keyframes.stamps[keyframe]
     factor = jumps.spread(stamps, origins, association.object[used], estimate.positions)
-    covariance = estimate.covariance + factor @ np.swapaxes(factor, 1, 2)
+    estimate = estimate.with_errors(factor @ np.swapaxes(factor, 1, 2))
     factor = np.nan_to_num(factor)
     correlated = factor if estimate.correlated is None else np.concatenate([estimate.correlated, factor], axis=2)
-    return replace(solution, estimate=replace(estimate, covariance=covariance, correlated=correlated))
+    return replace(solution, estimate=replace(estimate, correlated=correlated))
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:

@@ -75,18 +75,19 @@ def with_lasting_errors(
         return solution, None
     from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
 
-    covariance = solution.estimate.covariance.copy()
+    added = np.zeros(solution.estimate.covariance.shape)
     found = [lasting_variances(cells) for cells in seen]
     if with_bodies is not None and max(one.sum() for one in found) > _SMALL**2:
         seen = _cells_of(as_centres(with_bodies(solution)), settings)
         found = [lasting_variances(cells) for cells in seen]
     for cells, variances in zip(seen, found, strict=True):
         objects, more = cells.covariances(variances)
-        covariance[objects] += more
+        added[objects] += more
     if (tilt := noise_up(solution.keyframes, settings)[0]) > 0:  # The variances of the last cells are those of the ground.
         at, rolls = solution.keyframes, tilt * np.sqrt(found[-1][0])
-        covariance[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
-    wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
+        added[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
+    wider = solution.estimate.with_errors(added)
+    wider = replace(wider, seen_sigma=largest_sigma(wider.covariance))
     if not is_planar(solution.keyframes.map_T_base):  # A camera in the hand keeps its view, so errors of boxes last as well.
         return replace(solution, estimate=wider), None
     noise = LastingNoise.of(seen[0], found[0], *noise_of_poses(solution.keyframes, settings))
