@@ -148,11 +148,12 @@ def _run(
             diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
     lasting, late = None, None
-    if settings.mode == "fixed":
-        solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
     if diagnosis.jumps is not None:
         solution = with_jumps(solution, diagnosis.jumps)
-    solution = with_bodies(solution, cameras, settings)
+    if settings.mode == "fixed":
+        solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
+    if solution.bodies is None:
+        solution = with_bodies(solution, cameras, settings)
     if settings.mode == "fixed":  # After the bodies: their edges tell depths that the rays of a point do not tell.
         solution = with_far_sides(solution)
     solution = with_hidden_parts(solution, cameras)
