@@ -10,10 +10,8 @@ from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.estimate import Estimate
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
-from objslam.graph.calibration.correlated_errors import correlation_factors
-from objslam.graph.calibration.information import covariance_of, likelihood, without_shrinking
+from objslam.graph.calibration.information import likelihood, without_shrinking
 from objslam.graph.calibration.inner_solve import InnerSolve
-from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import linearise
 from objslam.graph.factors.odometry_motions import find_ties
 from objslam.graph.factors.range import share_bias
@@ -23,8 +21,9 @@ from objslam.graph.multiframes import Multiframes
 def predict(errors: CalibratedMeasurements, association: Association, estimate: Estimate, theta: Floats) -> Calibration:
     """Return the shared errors after one Gauss-Newton step from a solution, with their covariance.
 
-    Where a held error bends the path, the residuals are correlated because of it. So the step takes them for independent. If
-    it did not, it would be a third as long.
+    A held error bends the path, so it correlates the residuals, and its effect on the odometry looks like noise. So the step
+    takes the residuals for white noise. If it did not, it would be a third as long. The covariance is also that of white
+    noise.
 
     errors: the estimated and the held errors of the same keyframes and rays, at the noise of the solution. theta: (P,) their
     values in the solution. SolveError if the linear system is not finite.
@@ -37,12 +36,9 @@ def predict(errors: CalibratedMeasurements, association: Association, estimate: 
     map_T_camera = (estimate.map_T_base @ keyframes.base_T_camera)[multiframes.first]
     used = (estimate.weight > 0) & (association.object >= 0)
     state = InnerSolve(measured, association, map_T_camera, estimate.positions, used).ordered(None)
-    system = linearise(state, errors, theta)
-    system = system.with_noise(noise_shares(state, system, errors))
-    reduced = without_shrinking(state, system.reduce(), errors, theta)
+    reduced = without_shrinking(state, linearise(state, errors, theta).reduce(), errors, theta)
     prior = np.asarray(np.linalg.inv(errors.prior))
-    wider = correlation_factors(state, system)
     weights, information = likelihood(reduced)
-    step = np.linalg.solve(information + prior, weights @ reduced.gradient - prior @ (theta - errors.mean))
-    covariance = covariance_of(reduced, prior, wider)
+    covariance = np.asarray(np.linalg.inv(information + prior))
+    step = covariance @ (weights @ reduced.gradient - prior @ (theta - errors.mean))
     return Calibration(errors.names, theta + step, covariance, np.sqrt(np.diagonal(errors.prior)))

@@ -35,9 +35,9 @@ _USUAL = {"translation": USUAL_PLACE, "focal": USUAL_FOCAL}
 _GROSS = 3.0
 """A held error is gross beyond this many standard deviations of usual errors. With a smaller number, the path may bend to
 fit a small error that is not there: at 1.5, an image centre that was off by 20 px became a wrong place."""
-_SUSPECT, _SUSPECT_SIGMAS = 0.6, 1.5
-"""The least predicted error for which a solve estimates it: as a multiple of what counts as gross, and in posterior standard
-deviations. A step from a bent path predicts 65 to 90 % of an error. Smaller values do more solves for nothing."""
+_SUSPECT = 0.6
+"""The least predicted error for which a solve estimates it, as a multiple of what counts as gross, or of a turn that counts.
+A step from a bent path predicts 65 to 90 % of an error. A smaller value does more solves for nothing."""
 _FEWEST = 60
 """The fewest boxes of each half of a drive that show whether a camera turned between them. Fewer boxes agree by chance."""
 
@@ -73,7 +73,7 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
         kinds = {_SETTING.get(kind(name), "") for name, one in zip(found.names, far.tolist(), strict=True) if one}
         return [name for name in held if name in kinds]
 
-    suspected = gross(_predicted(freed(held), solved), _SUSPECT * _GROSS, _SUSPECT_SIGMAS)
+    suspected = gross(_predicted(freed(held), solved), _SUSPECT * _GROSS, 0.0)
     if not suspected:
         return None
     there = gross(_solved(freed(held), solved), _GROSS, SIGMAS)
@@ -90,7 +90,7 @@ def check_turned_camera(errors: SharedErrors, solution: Solution) -> list[Findin
     if min(of_late.sum(), (~of_late).sum()) < _FEWEST or not _can_tell(errors):
         return []
     halves = _halves(errors, late)
-    if not turns(_predicted(halves, solved), _SUSPECT * MOVED, _SUSPECT_SIGMAS):
+    if not turns(_predicted(halves, solved), _SUSPECT * MOVED, 0.0):
         return []
     return finding_of_turns(turns(_solved(halves, solved), MOVED, SIGMAS))
 
