@@ -1,5 +1,6 @@
 """What holds for all tests."""
 
+import gc
 import os
 import signal
 import sys
@@ -67,6 +68,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     nothing to do."""
     first = ("forks", "long")
     items.sort(key=lambda item: next((i for i, name in enumerate(first) if item.get_closest_marker(name)), len(first)))
+
+
+def pytest_collection_finish() -> None:
+    """The garbage collector looks no more at what is there before the first test: modules and tests, half a million objects.
+    Each full collection took 0.35 s, a fiftieth of the time of the tests."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="module")
