@@ -129,8 +129,8 @@ def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
     """Return -2 ln of the likelihood (F,), up to a constant, of a mean (C,) with covariance 1 + f times `covariance`, for
     each of the factors f (F,).
 
-    covariance: (C, C) symmetric. Only its lower triangle counts, and it is overwritten. It is made tridiagonal once, and all factors together are
-    one tridiagonal system. This takes a third of the time of eigenvalues with their vectors.
+    covariance: (C, C) symmetric. Only its lower triangle counts, and it is overwritten. It is made tridiagonal once, and all
+    factors together are one tridiagonal system. This takes a third of the time of eigenvalues with their vectors.
     """
     from scipy.linalg.lapack import dormqr, dptsv, dsytrd, dsytrd_lwork  # Here, so that `load_libraries` comes first.
 
