@@ -25,7 +25,7 @@ from objslam.graph.calibration.inner_solve import InnerSolve
 from objslam.graph.calibration.localization_noise import noise_of_localization
 from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
-from objslam.graph.calibration.shrinkage import shrinking_force
+from objslam.graph.calibration.shrinkage import without_shrinking
 from objslam.graph.calibration.variance_components import estimate_noise
 from objslam.graph.outlier_rejection import JointSolution, known_landmarks, misfit, reject_outliers
 
@@ -53,13 +53,6 @@ _SAME_NOISE = 0.1
 _SAME_SHARES = 0.5
 """The shares of noise in the information are computed again if the noise changes by more than this share. They change slowly
 with the noise. A larger value computes them less often."""
-
-_LEAST_GROWTH = 0.5
-"""The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
-1. An exact map would grow by 1. With a larger value, the projection is used more rarely."""
-_FAR = 3.0
-"""Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
-determined landmarks count too."""
 
 Measure = Callable[[Keyframes, Rays, Settings], Measurements]
 """A function that collects the measurements of keyframes and rays with the noise of the settings."""
@@ -116,7 +109,8 @@ def calibrate(
             break
     if len(theta):
         fit = replace(fit, wider=correlation_factors(at.state, at.system))
-        at = fit.shared_errors(state, theta, _CONVERGED, at.noise)
+        first = at.system if state is at.state else None  # The widening leaves the linear system as it is.
+        at = fit.shared_errors(state, theta, _CONVERGED, at.noise, first)
         state, theta, steps = at.state, at.theta, steps + at.steps
     nothing = np.zeros(len(state.used), dtype=bool)
     near = state.landmarks, state.factored
@@ -133,7 +127,7 @@ def calibrate(
             inliers = InnerSolve(state.measured, association, final.map_T_camera, final.positions, final.used)
             state = inliers.ordered(final.near)
             system = linearise(state, fit.errors, theta, at.noise)
-            reduced = _without_shrinking(state, system.reduce(), fit.errors, theta)
+            reduced = without_shrinking(state, system.reduce(), fit.errors, theta)
         covariance = _covariance(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
         by_landmark = (len(state.landmarks), 3, len(theta))
         sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
@@ -228,11 +222,18 @@ class _Fit:
         """The weight of the nominal noise, as a number of residuals."""
         return self.errors.settings.noise.prior
 
-    def shared_errors(self, state: InnerSolve, theta: Floats, converged: float, noise: Floats | None = None) -> _Found:
+    def shared_errors(
+        self,
+        state: InnerSolve,
+        theta: Floats,
+        converged: float,
+        noise: Floats | None = None,
+        first: LinearSystem | None = None,
+    ) -> _Found:
         """Return the parameters that fit best. The search starts at theta (P,).
 
         converged: the number of posterior standard deviations below which a step ends the search. noise: (P,) from
-        `noise_shares`, if known.
+        `noise_shares`, if known. first: the linear system at the start, if known.
         """
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
@@ -244,12 +245,12 @@ class _Fit:
             """Return half the squared Mahalanobis distance of parameters (P,) from their prior."""
             return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
 
-        first = linearise(state, errors, theta)
+        first = linearise(state, errors, theta) if first is None else first
         shares = noise_shares(state, first, errors) if noise is None else noise
 
         def outer(state: InnerSolve, theta: Floats, linear: LinearSystem) -> _Outer:
             linear = linear.with_noise(shares)
-            system = _without_shrinking(state, linear.reduce(), errors, theta)
+            system = without_shrinking(state, linear.reduce(), errors, theta)
             weights, information = _likelihood(system.with_wider(self.wider))
             gradient = weights @ system.gradient
             step = np.linalg.solve(information + prior, gradient - prior @ (theta - errors.mean))
@@ -318,33 +319,3 @@ def _covariance(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats:
     size, axes = np.linalg.eigh(root.T @ inverse @ varies @ inverse @ root)
     axes = np.linalg.solve(root.T, axes)
     return np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)
-
-
-def _without_shrinking(
-    state: InnerSolve, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats
-) -> ReducedSystem:
-    """Return the system without the force that makes a solution too small, because this force would move the parameters.
-
-    The more the size of the map depends on a parameter, the more the force acts on the parameter. If all lengths have an
-    unknown scale, everything can grow in proportion at no cost. Then nothing but the force determines the common scale. So
-    the common scale is projected out (the gauge of a free network; Meissl 1969). If some length is known, the force is
-    computed and subtracted.
-    """
-    landmarks = state.positions[state.landmarks]
-    if not len(landmarks):
-        return system
-    away = np.linalg.norm(landmarks - np.median(landmarks, axis=0), axis=1)
-    near = away <= _FAR * np.median(away)  # A far landmark is poorly determined, and does not grow with the map.
-    around = landmarks[near] - landmarks[near].mean(axis=0)  # Without the mean, a shift of the map would count as growth.
-    moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
-    size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
-    growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
-    if not growing @ size > _LEAST_GROWTH:
-        return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
-    project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
-    return replace(
-        system,
-        gradient=project @ system.gradient,
-        slope=project @ system.slope @ project.T,
-        variance=project @ system.variance @ project.T,
-    )
