@@ -9,8 +9,8 @@ settings, and the table has these columns:
 said: the names of the findings (with * if no object is called ok because of it), and the first words of warnings that the
 unchanged log does not give. ok: the objects that are called ok. over: how many of them are more than 3 sigmas from the true
 object of their label (squared Mahalanobis distance above 13.9). squared: the median of the squared distances; 2.4 is honest.
-off: the median error, m. A map in the frame of the odometry is laid on the truth first. Without true objects, the map of the
-unchanged log is the truth.
+off: the median error, m. A map in the frame of the odometry is laid on the truth first, and its objects are judged by the
+covariances that this alignment leaves. Without true objects, the map of the unchanged log is the truth.
 verdict: right (no more objects over 3 sigmas than in the unchanged log, or a median that is at most 1.5 times larger), named
 (no object is called ok), or WRONG, with or without a word.
 """
@@ -172,8 +172,15 @@ def mapped(log: Log, truth: Truth | None, settings: Settings) -> Row | str:
     align = "se2" if result.summary["map_frame"] == "odometry" else "none"
     found = evaluate(result.map, truth, align=align, radius=RADIUS).objects
     assert found is not None
+    matches = {match.object.id: match for match in found.matches}
     off, squared = [], []
     for item in objects:
+        match = matches.get(item.id)
+        if match is not None and match.squared_3d is not None:
+            # The alignment takes out what all objects share, and spreads the rest, so it changes the covariances too.
+            off.append(match.error)
+            squared.append(match.squared_3d)
+            continue
         turn = found.transform.pose[:3, :3]
         covariance = turn @ item.covariance @ turn.T
         offsets = [

@@ -53,6 +53,8 @@ class Calibration:
     names: P names, such as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P). prior:
     (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None if all are 0.
     prior_covariance: (P, P) before the solve, None if the parameters were independent.
+    prior_factor: (P,) by how much the covariance takes each prior for wider, because the values are far from it. None if it
+    takes none for wider.
     """
 
     names: tuple[str, ...]
@@ -61,6 +63,7 @@ class Calibration:
     prior: Floats
     prior_mean: Floats | None = None
     prior_covariance: Floats | None = None
+    prior_factor: Floats | None = None
 
     @property
     def sigma(self) -> Floats:
@@ -101,6 +104,7 @@ class Calibration:
             prior=self.prior[own],
             prior_mean=self.expected[own],
             prior_covariance=self.before[square],
+            prior_factor=None if self.prior_factor is None else self.prior_factor[own],
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -110,12 +114,14 @@ class Calibration:
         A later run with this file in `calibration.file` takes the values and the covariance as its prior.
         """
         sigma, expected = self.sigma, self.expected
+        wider = np.ones(len(self.names)) if self.prior_factor is None else self.prior_factor
         parameters = {
             name: {
                 "value": float(self.values[i]),
                 "sigma": float(sigma[i]),
                 "prior_mean": float(expected[i]),
                 "prior_sigma": float(self.prior[i]),
+                "prior_factor": float(wider[i]),
                 "unit": UNITS.get(kind(name), "share"),
                 "observable": bool(sigma[i] <= OBSERVABLE * self.prior[i]),
             }

@@ -1,7 +1,10 @@
 """The result type of every solver."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
 
 from objslam.core.arrays import Bools, Floats
 from objslam.core.bodies.tag_pose import TagPose
@@ -26,6 +29,7 @@ class Estimate:
     tags: the rotation and the size of each fiducial that has them, by the index of its object. log_evidence: the log
     evidence of the association, up to a constant. It compares associations of the same rays. -inf if it is not known.
     uncalibrated: whether the estimation of the shared errors failed. Then the covariances lack these errors.
+    error_covariance: (N, 3, 3) m^2, the part of the covariance that was added by `with_errors`, None if nothing was added.
     """
 
     map_T_base: Floats
@@ -44,3 +48,9 @@ class Estimate:
     tags: Mapping[int, TagPose] = field(default_factory=dict)
     log_evidence: float = float("-inf")
     uncalibrated: bool = False
+    error_covariance: Floats | None = None
+
+    def with_errors(self, more: Floats) -> Self:
+        """Return the estimate with the covariances (N, 3, 3), m^2, that errors cause beside the noise of the rays."""
+        before = np.zeros(more.shape) if self.error_covariance is None else self.error_covariance
+        return replace(self, covariance=self.covariance + more, error_covariance=before + more)

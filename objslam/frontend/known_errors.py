@@ -19,14 +19,14 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import half_widths_of_rays, with_known_surfaces
 from objslam.io.calibration_yaml import load_calibration
 
-_PLACE = 0.05
+USUAL_PLACE = 0.05
 """The prior standard deviation (m) of each axis of the place of a camera: a place that was measured with a ruler. With a
 larger value, a log must show more before an error counts as known."""
 _PLACE_BESIDE_ODOMETRY = 0.02
-"""In joint mode with localisation and odometry, this replaces `_PLACE`, because poses that may move can take up the effect
-of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by 11 cm with `_PLACE`. Logs with
-places that were 1.5 cm off were as good with both."""
-_FOCAL = 0.02
+"""In joint mode with localisation and odometry, this replaces `USUAL_PLACE`, because poses that may move can take up the
+effect of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by 11 cm with `USUAL_PLACE`.
+Logs with places that were 1.5 cm off were as good with both."""
+USUAL_FOCAL = 0.02
 """The prior standard deviation of the focal length, as a share, as of a field of view from a data sheet. A calibrated camera
 errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone bends
 to fit a wrong focal length, and then a wrong association fits too: one of 36 parts of recorded drives had four landmarks
@@ -53,8 +53,8 @@ def usual_place(log: Log, settings: Settings) -> float:
     odometry alone moves with the camera.
     """
     if settings.mode == "fixed":
-        return _PLACE
-    return 0.0 if log.localization is None else _PLACE if log.odometry is None else _PLACE_BESIDE_ODOMETRY
+        return USUAL_PLACE
+    return 0.0 if log.localization is None else USUAL_PLACE if log.odometry is None else _PLACE_BESIDE_ODOMETRY
 
 
 def prior_sigma(name: str, settings: Settings, place: float) -> float:
@@ -69,7 +69,7 @@ def prior_sigma(name: str, settings: Settings, place: float) -> float:
     setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
     sigma = getattr(settings.calibration, setting)
     if sigma == "auto":
-        return place if setting == "translation" else _FOCAL * (place > 0)
+        return place if setting == "translation" else USUAL_FOCAL * (place > 0)
     return float(sigma)
 
 

@@ -20,6 +20,7 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements, fixed_pose_factors
 from objslam.graph.factors.odometry_motions import find_ties
+from objslam.graph.factors.range import share_bias
 from objslam.graph.fixed_pose_triangulation import flat_noise
 from objslam.graph.init_known_correspondences import initialize_known
 from objslam.graph.multi_start import MultiStart
@@ -71,7 +72,7 @@ def solve_fixed(
     member = start.ok & np.isfinite(start.gradient) if loss == "l1" else start.ok
     used = np.flatnonzero((start.weight > 0) & np.isin(association.object, np.flatnonzero(member)))
     landmark = association.object[used]
-    some = share_bias(rays, association, settings).take(used)
+    some = share_bias(rays, association).take(used)
     angle, place, scale = flat_noise(rays, keyframes, settings)
     angle = angle[used]
     # The solve is in the flattened world, where a ray has one noise in all directions.
@@ -161,7 +162,7 @@ def solve_joint(
     ties = find_ties(multiframes.keyframes(given[0]), given[2])
 
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:
-        return Measurements.of(keyframes, share_bias(rays, association, settings), settings, multiframes, tags, ties)
+        return Measurements.of(keyframes, share_bias(rays, association), settings, multiframes, tags, ties)
 
     measured = measure(*given)
     keyframes, rays = measured.keyframes, measured.rays
@@ -287,17 +288,6 @@ def solve_joint(
 def _distances(origins: Floats, points: Floats) -> Floats:
     """Return the distances (R,) m of points (R, 3) from origins (R, 3), at least `MIN_DEPTH`."""
     return np.maximum(np.linalg.norm(points - origins, axis=1), MIN_DEPTH)
-
-
-def share_bias(rays: Rays, association: Association, settings: Settings) -> Rays:
-    """Increase the noise of ranges to account for the bias that all ranges of an object share."""
-    # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. The mean of n independent
-    # ranges with the variance s^2 + n b^2 has the same variance.
-    ranged = np.isfinite(rays.range) & (association.object >= 0)
-    number = np.bincount(association.object[ranged], minlength=association.count)
-    sigma = rays.range_sigma.copy()
-    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * rays.range_bias[ranged] ** 2)
-    return replace(rays, range_sigma=sigma)
 
 
 def _weights(loss: Loss, residual: Floats, optimum: Optimum) -> Floats:

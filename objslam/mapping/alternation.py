@@ -48,6 +48,7 @@ def solve(
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     doubted: tuple[str, ...] = ()
     unsettled = 0
+    estimated = errors
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
         if errors is None:
@@ -59,11 +60,14 @@ def solve(
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:  # The fixed mode does without these modules, and the many below them.
         from objslam.mapping.bodies.centre_bearings import solve_to_centres
-        from objslam.mapping.joint_alternation import JointState
+        from objslam.mapping.joint.joint_alternation import JointState
         from objslam.mapping.joint_solve import solve_joint
 
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
         state = solve_joint(begin, start)
+        if errors is not None and state.errors is not None and state.errors.names != errors.names:
+            estimated = errors = state.errors.with_noise(errors.noise)
+            begin = replace(begin, errors=errors, settings=errors.settings)
         assert state.association is not None
         assert state.estimate is not None
         association, estimate, rounds = state.association, state.estimate, state.rounds
@@ -79,4 +83,4 @@ def solve(
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     solved = Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)
-    return replace(solved, doubted=doubted, unsettled=unsettled)
+    return replace(solved, doubted=doubted, unsettled=unsettled, errors=estimated)

@@ -14,7 +14,12 @@ from objslam.core.geometry import inverse
 from objslam.errors import SolveError
 from objslam.frontend.tracks import associate_tracks
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.mapping.doubted_labels import (
+from objslam.mapping.exploration.errors_of_tracks import along, with_errors_of_tracks
+from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
+from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
+from objslam.mapping.fixed.camera_calibration import associate_at_poses
+from objslam.mapping.fixed.fixed_poses import FixedPoses
+from objslam.mapping.joint.doubted_labels import (
     CLEAR_ODDS,
     doubted_names,
     evidence_against,
@@ -22,13 +27,9 @@ from objslam.mapping.doubted_labels import (
     has_several,
     needs_noisy_boxes,
 )
-from objslam.mapping.exploration.errors_of_tracks import along, with_errors_of_tracks
-from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
-from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
-from objslam.mapping.fixed.camera_calibration import associate_at_poses
-from objslam.mapping.fixed.fixed_poses import FixedPoses
-from objslam.mapping.joint_alternation import JointState
-from objslam.mapping.labels import (
+from objslam.mapping.joint.held_errors import Solved, with_gross_errors
+from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.joint.labels import (
     angles_to_objects,
     clock_explains,
     labels_tell,
@@ -53,22 +54,54 @@ _NOISIER = 1.5
 simulated map with doubles. With a smaller factor, more logs are tried from other starts."""
 
 
-def solve_joint(state: JointState, start: InitialEstimate | None) -> JointState:
+def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve of a log. It has an association and an estimate.
 
-    start: a known start. With it, the log is not explored, and labels are not trusted.
+    If the map shows a gross error that was held, the log is solved once more, and the state has this error among its shared
+    errors. start: a known start. With it, the log is not explored, and labels are not trusted.
     """
-    state = _with_noise_of_poses(_with_clocks(state))
+    state = _begun(begin)
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
-        return _associated(state, start)
+        return _associated_again(begin, state, start)
     named, agree = _by_label(state)
+    if (wider := _with_gross_errors(begin, named)) is not None:
+        other = _begun(wider.attempt())
+        again, agrees = _by_label(other)
+        if agrees:
+            begin, state, named, agree = wider, state.replaced(other), state.replaced(again), True
     sure = state.settings.association.method == "by_label" or not doubted_names(named)
     if agree:
         return named if sure else _with_several_a_label(state, named)
     # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
     # With a localisation, such a path shows as noise of the localisation, and no label is doubted.
     bent = not sure or state.keyframes.localized_every
-    return _associated(state if bent else replace(named, association=None, estimate=None), None)
+    return _associated_again(begin, state if bent else replace(named, association=None, estimate=None), None)
+
+
+def _associated_again(begin: JointState, state: JointState, start: InitialEstimate | None) -> JointState:
+    """Return the state after association and solve. If its map shows a gross error that was held, this is done again."""
+    before = state.ledger.copy()
+    found = _associated(state, start)
+    wider = _with_gross_errors(begin, found)
+    if wider is None:
+        return found
+    state.ledger.restore(before)
+    return _associated(_begun(wider), start)
+
+
+def _begun(state: JointState) -> JointState:
+    """Return the state with what a log tells before its first solve: clocks, and the noise of localised poses."""
+    return _with_noise_of_poses(_with_clocks(state))
+
+
+def _with_gross_errors(begin: JointState, found: JointState) -> JointState | None:
+    """Return the begin of a solve that also estimates the held errors that the map of `found` shows, None if there are
+    none."""
+    if begin.errors is None or found.errors is None or found.association is None or found.estimate is None:
+        return None
+    errors = found.errors.with_noise(begin.errors.noise)
+    wider = with_gross_errors(errors, Solved(found.association, found.estimate, found.keyframes))
+    return None if wider is None else replace(begin, errors=wider, settings=wider.settings)
 
 
 def _with_several_a_label(state: JointState, named: JointState) -> JointState:

@@ -133,7 +133,7 @@ def _solve(
     settings: Settings,
 ) -> MappedDrive:
     from objslam.graph.assembly import Measurements
-    from objslam.graph.batch_solver import share_bias
+    from objslam.graph.factors.range import share_bias
     from objslam.graph.maps.prior_map import MapObjects, solve_in_map
     from objslam.graph.multiframes import Multiframes
 
@@ -150,7 +150,7 @@ def _solve(
             images = errors.keyframes
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
             rays = replace(rays, direction=solution.rays.direction)  # They may point to centres of bodies.
-        rays = share_bias(rays, solution.association, settings)
+        rays = share_bias(rays, solution.association)
         measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images))
     resolved = np.array(there, dtype=np.int64)
     return solve_in_map(solution.estimate, solution.association, resolved, matched, found.b_T_a, measured)

@@ -38,6 +38,7 @@ from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasti
 from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
+from objslam.mapping.joint.held_errors import check_turned_camera
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.progress import Progress
@@ -126,15 +127,19 @@ def _run(
         # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.
         spoilt = diagnosis.spoilt and settings.mode == "fixed"
         errors = None if spoilt else shared_errors(log, *seen_something(frames, rays), settings)
-        before = shared_errors(log, frames, rays, settings) if settings.mode == "joint" else None
         try:
             solution = solve(frames, rays, cameras, settings, ledger, of_solve, errors=errors)
         except SolveError:
             say(diagnosis, ledger)
             raise
+        if solution.errors is not None:  # It may have more errors, and settings for them.
+            errors, settings = solution.errors, solution.errors.settings
+        before = shared_errors(log, frames, rays, settings) if settings.mode == "joint" else None
     if settings.mode == "joint" and diagnosis.refutable:
         with _stage("checks", seconds, progress):
             diagnosis = without_refuted(diagnosis, solution, log, settings, progress)
+    if settings.mode == "joint" and settings.checks.use and errors is not None and not diagnosis.spoilt:
+        diagnosis = diagnosis.with_findings(check_turned_camera(errors, solution))
     say(diagnosis, ledger)
     if errors is not None:
         solution, log = corrected(solution, errors, ledger)
@@ -143,11 +148,12 @@ def _run(
             diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
     lasting, late = None, None
-    if settings.mode == "fixed":
-        solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
     if diagnosis.jumps is not None:
         solution = with_jumps(solution, diagnosis.jumps)
-    solution = with_bodies(solution, cameras, settings)
+    if settings.mode == "fixed":
+        solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
+    if solution.bodies is None:
+        solution = with_bodies(solution, cameras, settings)
     if settings.mode == "fixed":  # After the bodies: their edges tell depths that the rays of a point do not tell.
         solution = with_far_sides(solution)
     solution = with_hidden_parts(solution, cameras)

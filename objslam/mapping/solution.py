@@ -95,7 +95,8 @@ class Solution:
     the box. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
     object in the box of each ray. bodies, body_share, to_centre and hidden are None if no bodies were solved. doubted: the
     labels that may name one object or several. unsettled: the objects that the last round changed, as in `objects_changed`,
-    although no further round was allowed.
+    although no further round was allowed. errors: the estimated errors, as a function of the measurements. They
+    are more than those that were given if a held error is gross. None if none were estimated.
     """
 
     keyframes: Keyframes
@@ -110,6 +111,7 @@ class Solution:
     hidden: Bools | None = None
     doubted: tuple[str, ...] = ()
     unsettled: int = 0
+    errors: SharedErrors | None = None
 
 
 def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:
@@ -137,10 +139,10 @@ def with_jumps(solution: Solution, jumps: Jumps) -> Solution:
     origins = solution.keyframes.map_T_camera[keyframe, :3, 3]
     stamps = solution.keyframes.stamps[keyframe]
     factor = jumps.spread(stamps, origins, association.object[used], estimate.positions)
-    covariance = estimate.covariance + factor @ np.swapaxes(factor, 1, 2)
+    estimate = estimate.with_errors(factor @ np.swapaxes(factor, 1, 2))
     factor = np.nan_to_num(factor)
     correlated = factor if estimate.correlated is None else np.concatenate([estimate.correlated, factor], axis=2)
-    return replace(solution, estimate=replace(estimate, covariance=covariance, correlated=correlated))
+    return replace(solution, estimate=replace(estimate, correlated=correlated))
 
 
 def seen_something(keyframes: Keyframes, rays: Rays) -> tuple[Keyframes, Rays]:

@@ -15,7 +15,7 @@ from objslam.association.correlative_alignment import align
 from objslam.core.appearance.features import FeatureTable, unit_vectors
 from objslam.core.arrays import Floats, Ints
 from objslam.core.types import Association, Rays
-from objslam.mapping.merge_and_split import merge_unseen_together
+from objslam.mapping.joint.merge_and_split import merge_unseen_together
 from objslam.simulation import AppearanceNoise, DriveSettings
 
 ONE = np.zeros(1, dtype=np.int64)

@@ -20,7 +20,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import joint_solve, pipeline
 from objslam.mapping.checks.agreement import agreement, bounded_part
 from objslam.mapping.checks.diagnosis import diagnose
-from objslam.mapping.doubted_labels import doubted_labels, unchecked_labels
+from objslam.mapping.joint.doubted_labels import doubted_labels, unchecked_labels
 from objslam.simulation import make_camera
 
 LAMP = ("lamp", 1.2, 3.5, 1.2)

@@ -76,6 +76,22 @@ def test_large_objects_do_not_move_the_camera_in_fixed_mode(seed):
     assert worst["true"] < 0.6 * worst["false"]
 
 
+def test_how_rays_meet_does_not_change_how_sure_a_body_is():
+    """The rays of large things miss one point by far, so the covariance of Eq. 1 is far larger than that of squares."""
+    log = drive(1)
+    log = replace(log, odometry=None, localization=log.truth.trajectory)
+    sigmas = []
+    for loss in ("l1", "cauchy"):
+        settings = load_settings(None, ("mode=fixed", "output.recording=false", f"fixed.loss={loss}"))
+        found = pipeline.run(log, settings, Ledger()).map.resolved()
+        sigmas.append({o.label: np.sqrt(np.trace(o.covariance)) for o in found if o.ray_point is not None})
+    one, other = sigmas
+    both = one.keys() & other.keys()
+    assert len(both) >= 4
+    for label in both:
+        assert one[label] == pytest.approx(other[label], rel=0.25)
+
+
 def test_a_known_size_is_kept():
     log = drive(1)
     length, width, height = log.truth.objects[3].size.tolist()

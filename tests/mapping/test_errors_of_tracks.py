@@ -15,7 +15,7 @@ from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import joint_solve, pipeline
 from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
-from objslam.mapping.joint_alternation import JointState
+from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.joint_solve import _or_from
 from objslam.simulation import preset, simulate
 

@@ -13,8 +13,8 @@ from objslam.core.types import Association, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.mapping import joint_alternation
-from objslam.mapping.joint_alternation import JointState
+from objslam.mapping.joint import joint_alternation
+from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import objects_changed, seen_something
 from objslam.simulation import DepthNoise, preset, simulate

@@ -11,7 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.types import Association, Log
 from objslam.mapping import pipeline
-from objslam.mapping.labels import labels_tell
+from objslam.mapping.joint.labels import labels_tell
 from objslam.simulation import preset, simulate
 
 pytestmark = pytest.mark.usefixtures("one_start")

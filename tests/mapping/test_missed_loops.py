@@ -10,7 +10,7 @@ from turning_drive import errors_of
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, inverse
 from objslam.core.types import Association
-from objslam.mapping.joint_alternation import JointState
+from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.moves.missed_loops import with_missed_loops
 from objslam.simulation import preset, simulate
 

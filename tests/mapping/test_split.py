@@ -15,8 +15,8 @@ from objslam.core.types import Association, CameraLog, Detections, Log, Trajecto
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors
-from objslam.mapping.joint_alternation import JointState
-from objslam.mapping.merge_and_split import split_at_gaps
+from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.joint.merge_and_split import split_at_gaps
 from objslam.mapping.solution import seen_something
 
 BASE_T_CAMERA = make_pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 1.0]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -50,6 +50,12 @@ class PlacedBody:
     centre: Floats | None
     covariance: Floats
     behind: bool = False
+
+    def with_errors(self, more: Floats) -> Self:
+        """Return the body with the covariance (3, 3), m^2, that errors add to its centre."""
+        covariance = self.covariance.copy()
+        covariance[:3, :3] += more
+        return replace(self, covariance=covariance)
 
 
 def surer_body(a: Body | None, b: Body | None) -> Body | None:

@@ -18,6 +18,7 @@ from objslam.core.geometry import lengths
 from objslam.core.rotation import cross
 from objslam.core.types import Association
 from objslam.errors import SolveError
+from objslam.graph.calibration.prior_conflict import with_wider_priors
 
 _ROUNDS = 12
 """The most Gauss-Newton steps. More steps are more exact, and a step is cheap."""
@@ -106,7 +107,7 @@ def calibrate_at_poses(
     sensitivity = np.zeros((association.count, 3, len(theta)))
     sensitivity[number] = system.back
     found = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
-    return FixedCalibration(found, sensitivity)
+    return FixedCalibration(with_wider_priors(found, errors.mean, errors.prior), sensitivity)
 
 
 def noise_of_errors(errors: CalibratedMeasurements, calibration: Calibration) -> Floats:

@@ -17,15 +17,15 @@ from objslam.core.calibration import CalibratedMeasurements, Calibration
 from objslam.core.noise import NOMINAL
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
+from objslam.graph.calibration.information import covariance_of, likelihood, without_shrinking
 from objslam.graph.calibration.inner_solve import InnerSolve
 from objslam.graph.calibration.localization_noise import noise_of_localization
 from objslam.graph.calibration.noise_in_instruments import noise_shares
+from objslam.graph.calibration.prior_conflict import with_wider_priors
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
-from objslam.graph.calibration.shrinkage import without_shrinking
 from objslam.graph.calibration.variance_components import estimate_noise
 from objslam.graph.outlier_rejection import JointSolution, known_landmarks, misfit, reject_outliers
 
@@ -41,10 +41,6 @@ shared errors."""
 _HALVINGS = 3
 """The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
-_RIDGE = 1e-9
-"""The share of the variance of a gradient that is added to its diagonal. It prevents a division by zero if a log cannot tell
-two parameters apart. A larger share mixes such parameters more."""
-
 _NOISE_ROUNDS = 3
 """The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
 _SAME_NOISE = 0.1
@@ -128,11 +124,12 @@ def calibrate(
             state = inliers.ordered(final.near)
             system = linearise(state, fit.errors, theta, at.noise)
             reduced = without_shrinking(state, system.reduce(), fit.errors, theta)
-        covariance = _covariance(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
+        covariance = covariance_of(reduced, np.asarray(np.linalg.inv(errors.prior)), correlation_factors(state, system))
         by_landmark = (len(state.landmarks), 3, len(theta))
         sensitivity[state.landmarks] = reduced.sensitivity[: 3 * len(state.landmarks)].reshape(by_landmark)
     final = replace(final, cost_before=found.cost_before, iterations=found.iterations + steps + final.iterations)
     calibration = Calibration(errors.names, theta, covariance, np.sqrt(np.diagonal(errors.prior)))
+    calibration = with_wider_priors(calibration, errors.mean, errors.prior)
     return CalibratedSolution(calibration, fit.errors, state.measured, final, sensitivity)
 
 
@@ -251,7 +248,7 @@ class _Fit:
         def outer(state: InnerSolve, theta: Floats, linear: LinearSystem) -> _Outer:
             linear = linear.with_noise(shares)
             system = without_shrinking(state, linear.reduce(), errors, theta)
-            weights, information = _likelihood(system.with_wider(self.wider))
+            weights, information = likelihood(system.with_wider(self.wider))
             gradient = weights @ system.gradient
             step = np.linalg.solve(information + prior, gradient - prior @ (theta - errors.mean))
             return _Outer(state, theta, linear, system, gradient, information, information + prior, np.asarray(step))
@@ -285,37 +282,3 @@ class _Fit:
     def remeasured(self, state: InnerSolve, theta: Floats) -> InnerSolve:
         """Return the same poses and landmarks with the measurements at the present noise."""
         return state.measuring(self.measure(*self.errors.at(theta)))
-
-
-def _likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:
-    """Return the weights (P, P) of the system's gradient, and the information (P, P) that it has about the parameters.
-
-    The gradient g is Gaussian: its mean is the slope C times the error of the parameters, and V is its variance. So the
-    weights are C' V^-1 and the information is C' V^-1 C (limited information likelihood; Kim 2002). If the derivatives by
-    the parameters have no noise, the weights are 1 and the information is C. If they are only noise, V is large, C is small,
-    and the parameters stay at their prior. SolveError if the system is not finite.
-    """
-    variance, slope = system.variance, system.slope
-    if not (np.isfinite(variance).all() and np.isfinite(slope).all()):
-        raise SolveError("the information about the shared errors is not finite")
-    size = np.sqrt(np.maximum(np.diagonal(variance), 1e-300))
-    scaled = variance / np.outer(size, size) + _RIDGE * np.eye(len(size))
-    weights = np.linalg.solve(scaled, slope / size[:, None]).T / size
-    information = weights @ slope
-    return np.asarray(weights), np.asarray((information + information.T) / 2)
-
-
-def _covariance(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats:
-    """Return the covariance (P, P) of the parameters, at most the covariance of their prior in every direction.
-
-    prior: (P, P) information. wider: (P,) factors on the standard deviations of the gradient, for noise that is not white.
-    With them, the covariance is a sandwich (Huber 1967). Its weights are those of white noise, because the factors are known
-    only roughly, and with too large a factor, other weights would promise too much.
-    """
-    weights, information = _likelihood(system)
-    inverse = np.linalg.inv(information + prior)
-    varies = weights @ system.with_wider(wider).variance @ weights.T + prior
-    root = np.linalg.cholesky(prior)
-    size, axes = np.linalg.eigh(root.T @ inverse @ varies @ inverse @ root)
-    axes = np.linalg.solve(root.T, axes)
-    return np.asarray((axes * np.minimum(size, 1.0)) @ axes.T)

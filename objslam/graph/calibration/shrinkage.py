@@ -1,25 +1,15 @@
 """How much a joint solution shrinks, because noise in the rays makes the path jitter (Neyman and Scott 1948)."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import inverse
 from objslam.graph.calibration.instruments import from_neighbours
 from objslam.graph.calibration.linearised_graph import Linearised
-from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
 
 _LEAST_TOLD = 0.3
 """`shrinking_force` predicts motions by their neighbours if the prediction explains at least this share of the squared
 motions. A larger share uses it more rarely."""
-_LEAST_GROWTH = 0.5
-"""The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
-1. An exact map would grow by 1. With a larger value, the projection is used more rarely."""
-_FAR = 3.0
-"""Landmarks up to this multiple of the median distance from the middle of the map show its size. With a larger value, poorly
-determined landmarks count too."""
 
 
 def shrinking_force(of: Linearised) -> tuple[float, float]:
@@ -56,34 +46,6 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
     ranged = np.isfinite(rays.range)
     lengths = ways + float(((rays.range[ranged] / rays.range_sigma[ranged]) ** 2).sum()) + _of_tags(of)
     return max(force, 0.0), max(lengths, 1.0)
-
-
-def without_shrinking(of: Linearised, system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats) -> ReducedSystem:
-    """Return the system without the force that makes a solution too small, because this force would move the parameters.
-
-    The more the size of the map depends on a parameter, the more the force acts on the parameter. If all lengths have an
-    unknown scale, everything can grow in proportion at no cost. Then nothing but the force determines the common scale. So
-    the common scale is projected out (the gauge of a free network; Meissl 1969). If some length is known, the force is
-    computed and subtracted.
-    """
-    landmarks = of.positions[of.landmarks]
-    if not len(landmarks):
-        return system
-    away = np.linalg.norm(landmarks - np.median(landmarks, axis=0), axis=1)
-    near = away <= _FAR * np.median(away)  # A far landmark is poorly determined, and does not grow with the map.
-    around = landmarks[near] - landmarks[near].mean(axis=0)  # Without the mean, a shift of the map would count as growth.
-    moved = system.sensitivity[: landmarks.size].reshape(*landmarks.shape, system.sensitivity.shape[1])[near]
-    size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
-    growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
-    if not growing @ size > _LEAST_GROWTH:
-        return replace(system, gradient=system.gradient + shrinking_force(of)[0] * size)
-    project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
-    return replace(
-        system,
-        gradient=project @ system.gradient,
-        slope=project @ system.slope @ project.T,
-        variance=project @ system.variance @ project.T,
-    )
 
 
 def _of_tags(of: Linearised) -> float:

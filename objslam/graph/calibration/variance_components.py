@@ -320,7 +320,7 @@ def _range_noise(
 
 
 def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
-    """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `batch_solver.share_bias`."""
+    """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `factors.range.share_bias`."""
     number = np.bincount(rows.owner)[rows.owner] if len(rows.owner) else np.zeros(0)
     return np.sqrt((rows.range_sigma * noise.ranges) ** 2 + number * (rows.bias * noise.range_bias) ** 2)
 

@@ -1,9 +1,12 @@
-"""Factors for the measured range of a box. The camera pose is a variable or fixed."""
+"""Factors for the measured range of a box, and their noise. The camera pose is a variable or fixed."""
+
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.types import Association, Rays
 from objslam.graph.factors.noise import Noise, huber
 from objslam.graph.variables import L0, X0
 
@@ -41,3 +44,14 @@ def along_ray(
         gtsam.PriorFactorPoint3(L0 + j, point, huber(make(root)))
         for j, point, root in zip(landmark.tolist(), points, roots, strict=True)
     ]
+
+
+def share_bias(rays: Rays, association: Association) -> Rays:
+    """Increase the noise of ranges to account for the bias that all ranges of an object share."""
+    # If n ranges have noise s and share a bias b, their mean has the variance b^2 + s^2 / n. The mean of n independent
+    # ranges with the variance s^2 + n b^2 has the same variance.
+    ranged = np.isfinite(rays.range) & (association.object >= 0)
+    number = np.bincount(association.object[ranged], minlength=association.count)
+    sigma = rays.range_sigma.copy()
+    sigma[ranged] = np.sqrt(sigma[ranged] ** 2 + number[association.object[ranged]] * rays.range_bias[ranged] ** 2)
+    return replace(rays, range_sigma=sigma)

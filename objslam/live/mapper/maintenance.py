@@ -20,7 +20,7 @@ from objslam.live.mapper.loop_closure import close_loop
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.track_promotion import AGREE, SLACK, add_landmark, fit_if_observable
-from objslam.mapping.labels import MANY, SECOND
+from objslam.mapping.joint.labels import MANY, SECOND
 
 _EVERY = 10  # The period of every task in keyframes. A larger period keeps duplicates and false landmarks for longer.
 _GROWING = 3  # The keyframe of each period after which tracks and keyframes are dropped and all rays are tested.

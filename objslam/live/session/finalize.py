@@ -25,8 +25,8 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
-from objslam.mapping.doubted_labels import doubted_names
-from objslam.mapping.labels import labels_tell
+from objslam.mapping.joint.doubted_labels import doubted_names
+from objslam.mapping.joint.labels import labels_tell
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
 
@@ -55,7 +55,8 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         warn_of_others(m.calibration, log, settings, ledger)
     cameras = tuple(one.camera for one in log.cameras)
     solution = _solved(found, m.by_label, cameras, settings, ledger)
-    if errors is not None:
+    if solution.errors is not None:
+        errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
     solution = with_bodies(solution, cameras, settings)

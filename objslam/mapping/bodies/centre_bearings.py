@@ -20,7 +20,7 @@ from objslam.mapping.solution import CentreShift, Solution, with_noise_of, witho
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
-    from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.joint.joint_alternation import JointState
 
 _KEPT = 0.5
 """The share of joint.min_parallax_deg that an object needs to stay in the graph. A larger share loses more objects. The

@@ -15,7 +15,6 @@ from objslam.core.geometry import angles_off
 from objslam.core.statistics import grouped_median, widening
 from objslam.frontend.surface_ranges import centre_factors, half_widths_of_rays
 from objslam.frontend.up import up_axis
-from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.bodies.box_views import BoxViews
 from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes
@@ -182,17 +181,18 @@ def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
     """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2.
 
-    The rays of a large thing miss the point, which makes its covariance wider. This is no error of the body.
+    At given poses, these are errors that were added to it. The rest of the covariance is no error of the body. The rays of a
+    large thing miss the point, which makes it wider. Eq. 1 also has a bias along the rays that edges of boxes do not have.
     """
     estimate, rays, keyframes = solution.estimate, solution.rays, solution.keyframes
-    if settings.mode != "joint" and estimate.calibration is None and not keyframes.localized_every:
-        return np.zeros((len(views.objects), 3, 3))
+    if settings.mode != "joint":
+        added = estimate.error_covariance
+        return np.zeros((len(views.objects), 3, 3)) if added is None else added[views.objects]
     use = views.ray[estimate.weight[views.ray] > 0]
     origin, direction = (part[use] for part in rays.in_map(estimate.map_T_base @ keyframes.base_T_camera))
     owner = solution.association.object[use]
     distance = np.maximum(np.linalg.norm(estimate.positions[owner] - origin, axis=1), MIN_DEPTH)
-    noise, place = (rays.sigma, 0.0) if settings.mode == "joint" else pose_noise(rays, keyframes, settings)
-    across = 1 / np.hypot(noise[use] * distance, place) ** 2
+    across = 1 / (rays.sigma[use] * distance) ** 2
     residual = angles_off(origin, direction, estimate.positions[owner]) * distance * np.sqrt(across)
     wider = widening(residual, owner, solution.association.count)[views.objects]
     along = np.where(np.isfinite(rays.range[use]), 1 / rays.range_sigma[use], 0.0) ** 2

@@ -3,7 +3,7 @@
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.calibration import Calibration, kind
+from objslam.core.calibration import OBSERVABLE, Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.noise import MOST_NOISE, MOST_POSE_NOISE, NoiseFactors
@@ -12,6 +12,11 @@ from objslam.mapping.checks.finding import Finding
 MOST_SIGMAS = 3.0
 """A shared error of more than this many standard deviations of its prior causes a warning. A larger value warns less
 often."""
+_WIDENED, _PART = 1.5, 0.25
+"""Errors that the log tells only together cause a warning if the prior of one was taken to be wider by more than the factor
+`_WIDENED` (`Calibration.prior_factor`). The factor is 1.5 for a sum that is 2.3 standard deviations from its prior. An error
+is named if its variance was widened by at least the share `_PART` of that one's. Larger values warn less often, and name
+fewer errors."""
 
 _CAUSES = {
     "clock": "do the stamps of the camera and of the poses use the same clock?",
@@ -63,6 +68,24 @@ def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
             if expected:
                 far += f" from the {expected:.3g}{unit} of the calibration file; if it has changed, calibrate again"
             ledger.warn(f"the shared error {name} is {of['value']:.3g}{unit}, {far}: {cause}")
+    _warn_of_sums(calibration, ledger)
+
+
+def _warn_of_sums(calibration: Calibration, ledger: Ledger) -> None:
+    """Warn of errors that the log tells only together, and that are too large together."""
+    if calibration.prior_factor is None:
+        return
+    left = (calibration.sigma > OBSERVABLE * calibration.prior) & [kind(name) in _CAUSES for name in calibration.names]
+    excess = np.where(left, calibration.prior_factor**2 - 1, 0.0)
+    some = np.flatnonzero(excess >= _PART * excess.max()).tolist()
+    if excess.max() <= _WIDENED**2 - 1 or len(some) < 2:
+        return
+    names = [calibration.names[i] for i in some]
+    said = ", ".join(f"{name} {calibration.values[i]:+.2g}" for i, name in zip(some, names, strict=True))
+    causes = ", or: ".join(dict.fromkeys(_CAUSES[kind(name)] for name in names))
+    ledger.warn(
+        f"some shared errors are larger than usual, and the log does not tell which ({said}), so their sigmas grow: {causes}"
+    )
 
 
 def at_bounds(estimate: Estimate, bounds: Floats) -> list[Finding]:

@@ -14,7 +14,7 @@ from objslam.frontend.tracks import associate_tracks
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Bools, Floats, Ints
-    from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.joint.joint_alternation import JointState
 
 _ROUNDS = 2
 """The number of times that tracks are found and solved. In the second round, the odometry expects each box at the place that

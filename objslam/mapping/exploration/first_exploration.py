@@ -12,7 +12,7 @@ from objslam.mapping.exploration.second_exploration import surface_of
 
 if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
-    from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.joint.joint_alternation import JointState
 
 
 def explored(state: JointState) -> tuple[InitialEstimate, bool]:

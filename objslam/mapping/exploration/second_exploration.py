@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from objslam.core.arrays import Floats
     from objslam.core.types import Association
     from objslam.frontend.shared_errors import SharedErrors
-    from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.joint.joint_alternation import JointState
 
 _NOISIER = 1.5
 """A looser odometry is tried as well if a solve finds more than this factor on the noise of rays or odometry. A larger

@@ -293,10 +293,10 @@ def _with_covariance(estimate: Estimate, found: FixedCalibration) -> Estimate:
     from objslam.graph.posterior.marginals import largest_sigma
 
     told = found.calibration
-    covariance = estimate.covariance + found.sensitivity @ told.covariance @ np.swapaxes(found.sensitivity, 1, 2)
-    covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
-    sigma, correlated = largest_sigma(covariance), np.nan_to_num(found.sensitivity @ told.root)
-    return replace(estimate, covariance=covariance, seen_sigma=sigma, calibration=told, correlated=correlated)
+    more = found.sensitivity @ told.covariance @ np.swapaxes(found.sensitivity, 1, 2)
+    wider = estimate.with_errors((more + np.swapaxes(more, 1, 2)) / 2)
+    sigma, correlated = largest_sigma(wider.covariance), np.nan_to_num(found.sensitivity @ told.root)
+    return replace(wider, seen_sigma=sigma, calibration=told, correlated=correlated)
 
 
 def _parameters(calibration: Calibration) -> Parameters:

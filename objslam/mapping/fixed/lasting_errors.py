@@ -66,7 +66,8 @@ def with_lasting_errors(
     and Thompson 1971), and averaged over their posterior.
 
     The centre of the box of a large thing nearby lies beside the image of its centre, for as long as the robot drives by.
-    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres.
+    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was needed, the
+    returned solution has them.
     """
     if not solution.keyframes.localized_every:
         return solution, None
@@ -75,18 +76,25 @@ def with_lasting_errors(
         return solution, None
     from objslam.graph.posterior.marginals import largest_sigma  # Here, so that `load_libraries` comes first.
 
-    covariance = solution.estimate.covariance.copy()
+    added = np.zeros(solution.estimate.covariance.shape)
     found = [lasting_variances(cells) for cells in seen]
     if with_bodies is not None and max(one.sum() for one in found) > _SMALL**2:
-        seen = _cells_of(as_centres(with_bodies(solution)), settings)
+        solution = with_bodies(solution)
+        seen = _cells_of(as_centres(solution), settings)
         found = [lasting_variances(cells) for cells in seen]
     for cells, variances in zip(seen, found, strict=True):
         objects, more = cells.covariances(variances)
-        covariance[objects] += more
+        added[objects] += more
     if (tilt := noise_up(solution.keyframes, settings)[0]) > 0:  # The variances of the last cells are those of the ground.
         at, rolls = solution.keyframes, tilt * np.sqrt(found[-1][0])
-        covariance[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
-    wider = replace(solution.estimate, covariance=covariance, seen_sigma=largest_sigma(covariance))
+        added[:, 2, 2] += rise_of(at.stamps, at.map_T_base, rolls, np.array(TIMES)) ** 2
+    wider = solution.estimate.with_errors(added)
+    wider = replace(wider, seen_sigma=largest_sigma(wider.covariance))
+    if solution.bodies is not None:
+        bodies = (
+            None if body is None else body.with_errors(more) for body, more in zip(solution.bodies, added, strict=True)
+        )
+        solution = replace(solution, bodies=tuple(bodies))
     if not is_planar(solution.keyframes.map_T_base):  # A camera in the hand keeps its view, so errors of boxes last as well.
         return replace(solution, estimate=wider), None
     noise = LastingNoise.of(seen[0], found[0], *noise_of_poses(solution.keyframes, settings))

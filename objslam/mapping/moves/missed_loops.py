@@ -9,12 +9,12 @@ import numpy as np
 
 from objslam.core.statistics import grouped_median
 from objslam.errors import SolveError
-from objslam.mapping.merge_and_split import joined
+from objslam.mapping.joint.merge_and_split import joined
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
     from objslam.graph.loop_closure import Closure, Landmarks
-    from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.joint.joint_alternation import JointState
 
 _TRIED = 4
 """The most loops that are tried before the search ends, those with the most evidence first. Each takes a solve. A larger

@@ -9,14 +9,14 @@ import numpy as np
 
 from objslam.core.statistics import grouped_median
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.joint.relocalization import relocalize
 from objslam.mapping.moves.odometry_witness import lasting_by_odometry, lasting_long
-from objslam.mapping.relocalization import relocalize
 
 if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.arrays import Ints
     from objslam.frontend.shared_errors import SharedErrors
-    from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.joint.joint_alternation import JointState
     from objslam.mapping.solution import Solution
 
 _LARGE = 1.0

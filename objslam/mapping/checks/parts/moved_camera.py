@@ -5,6 +5,7 @@ first. They are estimated together with the turn. Otherwise they look like a tur
 while the robot turns left, and to the other side while it turns right.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -26,18 +27,18 @@ _TURN = 0.2
 _SAME = 1e-3
 """The prior standard deviation of the change of all other errors, as a share of the prior standard deviation of the errors.
 The graph divides by it, so it is not 0. A larger value lets the other errors change too."""
-_MOVED = 0.05
+MOVED = 0.05
 """If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
 less often."""
-_SIGMAS = 5.0
+SIGMAS = 5.0
 """The least difference of a camera's rotation between the halves, in standard deviations. A larger number warns less
 often."""
 _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
-"""The least difference for which another round of the estimation follows: as a multiple of `_MOVED`, and in standard
+"""The least difference for which another round of the estimation follows: as a multiple of `MOVED`, and in standard
 deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer
 turns."""
 _MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
-"""For poses by odometry, `_MOVED_BY_ODOMETRY` (rad) replaces `_MOVED`, and a turn must also let the score
+"""For poses by odometry, `_MOVED_BY_ODOMETRY` (rad) replaces `MOVED`, and a turn must also let the score
 (`Agreement.score`) grow by `_GAIN_BY_ODOMETRY`. The reason is drift: it looks like a rotation of the camera, and the
 standard deviations do not contain it. Larger values warn less often."""
 
@@ -51,18 +52,23 @@ def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Fi
     start = agreement(halves, halves.log, settings)
     if start is None:
         return []
-    least, gain = (_MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY) if part.drifts else (_MOVED, 0.0)
+    least, gain = (_MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY) if part.drifts else (MOVED, 0.0)
 
     def suspect(found: Calibration) -> bool:
-        return bool(_turns(found, _SUSPECT * least, _SUSPECT_SIGMAS))
+        return bool(turns(found, _SUSPECT * least, _SUSPECT_SIGMAS))
 
-    apart, turned = without_usual_errors(halves, start, settings, partial(_prior, turn=_TURN), suspect)
-    turns = {} if turned is None else _turns(turned, least, _SIGMAS)
-    if not turns:
+    apart, turned = without_usual_errors(halves, start, settings, one_rotation_each, suspect)
+    moved = {} if turned is None else turns(turned, least, SIGMAS)
+    if not moved:
         return []
-    same, _ = without_usual_errors(halves, start, settings, partial(_prior, turn=0.0))
+    same, _ = without_usual_errors(halves, start, settings, partial(one_rotation_each, turn=0.0))
     if apart.score <= same.score + gain:
         return []
+    return finding_of_turns(moved)
+
+
+def finding_of_turns(moved: Mapping[str, float]) -> list[Finding]:
+    """Return a finding for each turn, rad, of a camera between the halves of a log."""
     return [
         Finding(
             "camera moved",
@@ -70,8 +76,22 @@ def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Fi
             "somebody moved the camera on the robot",
             basis="halves",
         )
-        for name, change in turns.items()
+        for name, change in moved.items()
     ]
+
+
+def in_halves(cameras: Sequence[CameraLog]) -> tuple[CameraLog, ...]:
+    """Return two cameras in place of each one: first those of the first half, then those of the second half.
+
+    All of them have the boxes of both halves.
+    """
+    later = [replace(one, camera=replace(one.camera, name=one.camera.name + _LATER)) for one in cameras]
+    return (*cameras, *later)
+
+
+def first_half(name: str) -> str:
+    """Return the name of a shared error without the mark of the second half."""
+    return name.replace(_LATER, "")
 
 
 def _halves(part: Part, middle: float) -> Part:
@@ -91,10 +111,10 @@ def _halves(part: Part, middle: float) -> Part:
     return replace(part, log=replace(part.log, cameras=tuple(cameras)), window=tuple(windows))
 
 
-def _prior(errors: SharedErrors, turn: float) -> Floats:
+def one_rotation_each(errors: SharedErrors, turn: float = _TURN) -> Floats:
     """Return a prior covariance (P, P) that lets only the rotations of a camera differ between the halves.
 
-    turn: rad, the standard deviation of this difference. With 0, nothing differs.
+    errors: those of the cameras of two halves. turn: rad, the standard deviation of the difference. With 0, nothing differs.
     """
     sigma = np.sqrt(np.diagonal(errors.prior))
     prior = np.diag(sigma**2)
@@ -112,7 +132,7 @@ def _pairs(names: tuple[str, ...]) -> list[tuple[int, int]]:
     return [(i, names.index(later)) for i, later in pairs if later in names]
 
 
-def _turns(found: Calibration, least: float, sigmas: float) -> dict[str, float]:
+def turns(found: Calibration, least: float, sigmas: float) -> dict[str, float]:
     """Return the turns (rad) between the halves that are larger than `least`, and larger than a number of standard
     deviations."""
     turns = {}

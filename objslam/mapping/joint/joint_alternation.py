@@ -18,9 +18,9 @@ from objslam.core.trace import Trace, Why
 from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.merge_and_split import merge_unseen_together, split_at_gaps
+from objslam.mapping.joint.merge_and_split import merge_unseen_together, split_at_gaps
+from objslam.mapping.joint.relocalization import relocalize
 from objslam.mapping.progress import Progress
-from objslam.mapping.relocalization import relocalize
 from objslam.mapping.solution import objects_changed, rays_moved, without_errors
 
 if TYPE_CHECKING:

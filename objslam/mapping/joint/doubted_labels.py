@@ -15,11 +15,11 @@ import numpy as np
 from objslam.core.arrays import Bools, Ints
 from objslam.core.noise import NoiseFactors
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.mapping.labels import MANY, SECOND
+from objslam.mapping.joint.labels import MANY, SECOND
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
-    from objslam.mapping.joint_alternation import JointState
+    from objslam.mapping.joint.joint_alternation import JointState
     from objslam.mapping.solution import Solution
 
 _WITNESSES = 2

@@ -1,0 +1,52 @@
+"""Shared errors that lie far from their priors: by how much the priors were too narrow.
+
+An estimate that is 3 standard deviations from its prior is improbable. It is far more probable that the prior is too narrow
+for this robot. If the log determines the error alone, the prior hardly matters. If it determines only the sum of two errors,
+the priors decide how the sum is shared out, and then narrow priors promise too much.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.calibration import Calibration
+
+_CHANCE = 2.0
+"""Up to this many standard deviations, the distance from a prior is chance. A larger number widens fewer priors. Beyond it,
+the widening is near that of a Student prior with 4 degrees of freedom: for a sum that is 3 and 4.5 standard deviations from
+0 for its two parts, the standard deviation of the shares grows by a factor of 1.8, and by 2 with the Student prior."""
+_TOLD = 0.9
+"""A direction is determined by the log if its variance is at most this share of its prior variance. With a larger share,
+directions count that the log hardly tells."""
+_LEAST = 1e-12
+"""The least variance of a prior. An error with a smaller one is known."""
+
+
+def with_wider_priors(found: Calibration, mean: Floats, prior: Floats) -> Calibration:
+    """Return the calibration with a covariance that takes the priors for wider if the values are too far from them.
+
+    The values stay, and so does the information of the log itself. If the prior (P, P) and the covariance are right, the
+    values minus the mean (P,) of their prior have the covariance `prior - covariance` (prior predictive check; Box 1980).
+    The check is done along each direction that the log determines. The part of a parameter in it tells how far its prior is
+    widened.
+    """
+    if not len(mean):
+        return found
+    size, axes = np.linalg.eigh(prior)
+    inverse = (axes / np.sqrt(np.maximum(size, _LEAST))) @ axes.T
+    share, along = np.linalg.eigh(inverse @ found.covariance @ inverse)
+    told = share <= _TOLD
+    along = along[:, told].T
+    off = along @ inverse @ (found.values - mean)
+    excess = np.maximum(off**2 / (1 - share[told]) - _CHANCE**2, 0.0)
+    if not excess.any():
+        return found
+    parts = along**2 / (along**2).max(axis=1, keepdims=True)
+    factor = np.sqrt(1 + excess @ parts)
+    before = np.linalg.inv(prior)
+    information = np.linalg.inv(found.covariance) - before
+    size, axes = np.linalg.eigh((information + information.T) / 2)
+    information = (axes * np.maximum(size, 0.0)) @ axes.T  # Rounding may make information negative.
+    wider = np.linalg.inv(information + before / np.outer(factor, factor))
+    return replace(found, covariance=np.asarray(wider), prior_factor=factor)

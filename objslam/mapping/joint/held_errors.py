@@ -1,0 +1,152 @@
+"""Errors of a camera that joint mode holds, and that are so large that the map shows them.
+
+With odometry alone, the place and the focal length of a camera are held, because a path that is free to bend fits usual
+errors of them too. A gross error bends the path, and the objects move by many of their sigmas. So it is estimated after all.
+A camera that somebody turned during the drive cannot be corrected, because no box tells when that was.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats
+from objslam.core.calibration import Calibration, kind
+from objslam.core.diagnostics import Ledger
+from objslam.core.estimate import Estimate
+from objslam.core.types import Association, Keyframes
+from objslam.errors import SolveError
+from objslam.frontend.known_errors import USUAL_FOCAL, USUAL_PLACE, shared_errors
+from objslam.frontend.shared_errors import SharedErrors
+from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.parts.moved_camera import (
+    MOVED,
+    SIGMAS,
+    finding_of_turns,
+    first_half,
+    in_halves,
+    one_rotation_each,
+    turns,
+)
+from objslam.mapping.solution import Solution
+
+_SETTING = {"x": "translation", "y": "translation", "focal": "focal"}
+"""The setting of each kind of held error. The height of a camera is none of them, because it only lifts the map."""
+_USUAL = {"translation": USUAL_PLACE, "focal": USUAL_FOCAL}
+_GROSS = 3.0
+"""A held error is gross beyond this many standard deviations of usual errors. With a smaller number, the path may bend to
+fit a small error that is not there: at 1.5, an image centre that was off by 20 px became a wrong place."""
+_SUSPECT, _SUSPECT_SIGMAS = 0.6, 1.5
+"""The least predicted error for which a solve estimates it: as a multiple of what counts as gross, and in posterior standard
+deviations. A step from a bent path predicts 65 to 90 % of an error. Smaller values do more solves for nothing."""
+_FEWEST = 60
+"""The fewest boxes of each half of a drive that show whether a camera turned between them. Fewer boxes agree by chance."""
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A solved association, and the keyframes that were solved."""
+
+    association: Association
+    estimate: Estimate
+    keyframes: Keyframes
+
+
+def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | None:
+    """Return the shared errors with held errors that are gross, to be estimated too, None if no held error is gross.
+
+    errors: those of the solve, as measured. The settings of the returned errors have the prior of the new errors. A setting
+    that is not `auto` is kept.
+    """
+    settings, of = errors.settings, errors.settings.calibration
+    held = [name for name in _USUAL if getattr(of, name) == "auto" and not _estimated(errors, name)]
+    if not held or not _can_tell(errors):
+        return None
+
+    def freed(names: list[str]) -> SharedErrors:
+        more = of.model_copy(update={name: _USUAL[name] for name in names})
+        other = shared_errors(errors.log, errors.keyframes, errors.rays, settings.model_copy(update={"calibration": more}))
+        assert other is not None  # It has at least the errors that the solution has.
+        return replace(other, noise=errors.noise)
+
+    def gross(found: Calibration, least: float, sigmas: float) -> list[str]:
+        far = np.abs(found.values) > np.maximum(least * found.prior, sigmas * found.sigma)
+        kinds = {_SETTING.get(kind(name), "") for name, one in zip(found.names, far.tolist(), strict=True) if one}
+        return [name for name in held if name in kinds]
+
+    suspected = gross(_predicted(freed(held), solved), _SUSPECT * _GROSS, _SUSPECT_SIGMAS)
+    if not suspected:
+        return None
+    there = gross(_solved(freed(held), solved), _GROSS, SIGMAS)
+    return freed(there) if there else None
+
+
+def check_turned_camera(errors: SharedErrors, solution: Solution) -> list[Finding]:
+    """Return a finding for each rotation of a camera that differs between the halves of a drive, by the solved map."""
+    stamps = errors.keyframes.stamps
+    late = np.asarray(stamps > np.median(stamps))
+    solved = Solved(solution.association, solution.estimate, solution.keyframes)
+    boxes = (solved.estimate.weight > 0) & (solved.association.object >= 0)
+    of_late = late[errors.rays.keyframe[boxes]]
+    if min(of_late.sum(), (~of_late).sum()) < _FEWEST or not _can_tell(errors):
+        return []
+    halves = _halves(errors, late)
+    if not turns(_predicted(halves, solved), _SUSPECT * MOVED, _SUSPECT_SIGMAS):
+        return []
+    return finding_of_turns(turns(_solved(halves, solved), MOVED, SIGMAS))
+
+
+def _halves(errors: SharedErrors, late: Bools) -> SharedErrors:
+    """Return the errors with a camera of its own for each half of the drive. late: (K,) the keyframes of the second half."""
+    keyframes = replace(errors.keyframes, camera=errors.keyframes.camera + len(errors.log.cameras) * late)
+    log = replace(errors.log, cameras=in_halves(errors.log.cameras))
+    found = shared_errors(log, keyframes, errors.rays, errors.settings)
+    assert found is not None  # It has at least the errors that the solution has.
+    return replace(found, prior=one_rotation_each(found), noise=errors.noise)
+
+
+def _estimated(errors: SharedErrors, setting: str) -> bool:
+    return any(_SETTING.get(kind(name)) == setting for name in errors.names)
+
+
+def _can_tell(errors: SharedErrors) -> bool:
+    """Return whether the solve estimates shared errors, and all rays are rays of boxes: the corners of fiducials are rays of
+    other landmarks."""
+    return bool(errors.names) and errors.rays.corner_sigma is None
+
+
+def _predicted(errors: SharedErrors, solved: Solved) -> Calibration:
+    from objslam.graph.calibration.next_step import predict
+
+    try:
+        return predict(_like(errors, solved), solved.association, solved.estimate, _values(errors, solved))
+    except (SolveError, np.linalg.LinAlgError):
+        return _unknown(errors)
+
+
+def _solved(errors: SharedErrors, solved: Solved) -> Calibration:
+    from objslam.graph.batch_solver import solve_joint
+
+    start = solved.estimate.map_T_base @ solved.keyframes.base_T_camera
+    like, values = _like(errors, solved), _values(errors, solved)
+    given = errors.keyframes, errors.rays, solved.association, errors.settings, Ledger()
+    found = solve_joint(*given, start=start, errors=like, theta=values)
+    return _unknown(errors) if found.calibration is None or found.uncalibrated else found.calibration
+
+
+def _like(errors: SharedErrors, solved: Solved) -> SharedErrors:
+    """Return the errors at the noise of the solved."""
+    noise = solved.estimate.noise
+    return errors if noise is None else errors.with_noise(noise)
+
+
+def _values(errors: SharedErrors, solved: Solved) -> Floats:
+    """Return the values (P,) of the errors in the solved. A held error has its mean there."""
+    found = solved.estimate.calibration
+    known = {} if found is None else dict(zip(found.names, found.values.tolist(), strict=True))
+    means = zip(errors.names, errors.mean.tolist(), strict=True)
+    return np.array([known.get(first_half(name), mean) for name, mean in means])
+
+
+def _unknown(errors: SharedErrors) -> Calibration:
+    """Return the errors as they are expected before a solve."""
+    return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))

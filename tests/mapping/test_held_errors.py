@@ -1,0 +1,115 @@
+"""Gross errors of a camera that joint mode holds are found in the map, and usual ones stay held."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from added_errors import add_shared_errors
+from quick import NOTHING_DRAWN
+from test_moved_camera import turned
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import inverse, lift_se2
+from objslam.core.types import Log, Trajectory
+from objslam.evaluation.evaluate import evaluate
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
+from objslam.frontend.known_errors import shared_errors
+from objslam.mapping import pipeline
+from objslam.mapping.alternation import solve
+from objslam.mapping.joint.held_errors import Solved, with_gross_errors
+from objslam.mapping.solution import seen_something
+from objslam.simulation import preset, simulate
+
+SETTINGS = (*NOTHING_DRAWN, "mode=joint", "bodies.use=false")
+
+
+@cache
+def drive(seed: int) -> Log:
+    """A drive from odometry alone, with one label for each object."""
+    room = {"objects": 10, "classes": 10, "pixel_sigma": 2.0, "missed": 0.1, "false": 0.01, "frames": 300}
+    return simulate(preset("demo", **room, odometry=Odometry(), localization=None), seed)
+
+
+def run(log: Log, *more: str):
+    ledger = Ledger()
+    return pipeline.run(log, load_settings(None, (*SETTINGS, *more)), ledger), ledger
+
+
+GROSS = [("front.y", -0.2), ("front.x", 0.25), ("front.focal", 0.1), ("front.focal", -0.1)]
+
+
+@pytest.mark.parametrize(("name", "value"), GROSS)
+def test_a_gross_error_is_estimated_and_named(name, value):
+    log = add_shared_errors(drive(3), {name: value})
+    result, ledger = run(log)
+    found = result.calibration
+    at = found.names.index(name)
+    assert abs(found.values[at]) > 0.7 * abs(value)
+    assert np.sign(found.values[at]) == np.sign(value)
+    assert any(f"the shared error {name} is" in warning for warning in ledger.warnings)
+    matches = evaluate(result.map, log.truth, align="se2", radius=1.0).objects.matches
+    assert len(matches) == 10
+    assert max(match.squared_3d for match in matches) < 13.9
+
+
+@pytest.mark.parametrize("errors", [{}, {"front.y": 0.05, "front.x": -0.05}, {"front.focal": 0.02, "front.cx": 0.04}])
+def test_usual_errors_stay_held(errors):
+    result, ledger = run(add_shared_errors(drive(0), errors))
+    assert {"front.x", "front.y", "front.focal"}.isdisjoint(result.calibration.names)
+    assert not any("moved the camera" in warning for warning in ledger.warnings)
+
+
+def test_a_setting_of_the_user_is_kept():
+    log = add_shared_errors(drive(0), {"front.y": -0.2})
+    settings = load_settings(None, (*SETTINGS, "calibration.translation=0"))
+    frames = build_keyframes(log, settings, Ledger())
+    rays = build_rays(log, frames, settings, Ledger())
+    errors = shared_errors(log, *seen_something(frames, rays), settings)
+    cameras = tuple(one.camera for one in log.cameras)
+    solution = solve(frames, rays, cameras, settings, Ledger(), lambda *_: None, errors=errors)
+    assert solution.errors.names == errors.names
+    solved = Solved(solution.association, solution.estimate, solution.keyframes)
+    assert with_gross_errors(errors, solved) is None
+    other = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"translation": "auto"})})
+    wider = with_gross_errors(replace(errors, settings=other), solved)
+    assert set(wider.names) - set(errors.names) == {"front.x", "front.y", "front.z"}
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "roll"), (1, "tilt"), (2, "yaw")])
+def test_a_camera_that_was_turned_in_the_middle_spoils_the_map(axis, name):
+    result, _ = run(turned(drive(0), axis, 8.0))
+    (found,) = [one for one in result.summary["wrong_input"] if one["name"] == "camera moved"]
+    assert f"front.{name} changes by" in found["message"]
+    assert result.map.resolved() == ()
+
+
+def test_an_odometry_that_turns_in_the_middle_is_no_turned_camera():
+    """The robot turns as well, so it drives where its camera looks."""
+    log = drive(0)
+    path = log.odometry
+    middle = path.poses[len(path) // 2]
+    jump = middle @ lift_se2(np.array([0.0, 0.0, np.radians(10.0)])) @ inverse(middle)
+    late = (np.arange(len(path)) > len(path) // 2)[:, None, None]
+    result, _ = run(replace(log, odometry=Trajectory(path.stamps, np.where(late, jump @ path.poses, path.poses))))
+    assert not any(one["name"] == "camera moved" for one in result.summary["wrong_input"])
+
+
+def test_a_step_from_an_optimum_stays_there():
+    from objslam.graph.calibration.next_step import predict
+
+    log = add_shared_errors(drive(0), {"front.yaw": 0.03, "front.clock": 0.1})
+    settings = load_settings(None, SETTINGS)
+    frames = build_keyframes(log, settings, Ledger())
+    rays = build_rays(log, frames, settings, Ledger())
+    errors = shared_errors(log, *seen_something(frames, rays), settings)
+    cameras = tuple(one.camera for one in log.cameras)
+    solution = solve(frames, rays, cameras, settings, Ledger(), lambda *_: None, errors=errors)
+    found = solution.estimate.calibration
+    again = predict(errors.with_noise(solution.estimate.noise), solution.association, solution.estimate, found.values)
+    assert np.abs((again.values - found.values) / found.sigma).max() < 0.25
+    np.testing.assert_allclose(again.sigma, found.sigma, rtol=0.1)
