@@ -1,10 +1,11 @@
 """What holds for all tests."""
 
+import gc
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import pytest
@@ -61,12 +62,34 @@ def no_waiting_for_the_disk() -> None:
     os.fsync = os.fdatasync = sync  # type: ignore[assignment]
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """Every second process collects from the last file to the first. Without compiled files, it takes as long to rewrite the
+    tests as to import them. So each of two processes rewrites one half, and finds the other half done."""
+    report = yield
+    worker = getattr(collector.config, "workerinput", {}).get("workerid", "gw0")
+    if isinstance(collector, pytest.Dir | pytest.Session) and int(worker.removeprefix("gw")) % 2:
+        report.result.reverse()
+    return report
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the tests that fork their process many times. A fork takes longer the more memory the process has, and that
     is least at first. Then come the tests that take longest. At the end, one process would run them while the others have
-    nothing to do."""
+    nothing to do. Otherwise, files come in the order of their paths, in all processes."""
     first = ("forks", "long")
-    items.sort(key=lambda item: next((i for i, name in enumerate(first) if item.get_closest_marker(name)), len(first)))
+
+    def place(item: pytest.Item) -> tuple[int, tuple[str, ...]]:
+        return next((i for i, name in enumerate(first) if item.get_closest_marker(name)), len(first)), item.path.parts
+
+    items.sort(key=place)
+
+
+def pytest_collection_finish() -> None:
+    """The garbage collector looks no more at what is there before the first test: modules and tests, half a million objects.
+    Each full collection took 0.35 s, a fiftieth of the time of the tests."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="module")

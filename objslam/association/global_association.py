@@ -23,7 +23,9 @@ from objslam.association.observations import PosedRays, observe
 from objslam.association.refinement import grouped_sums
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import lengths
 from objslam.core.ground.flattening import flattened_points
+from objslam.core.rotation import cross
 from objslam.core.statistics import grouped_quantile
 from objslam.core.types import Association
 
@@ -194,7 +196,7 @@ def _add_distant(task: _Task, state: State) -> State:
     index, direction = state.owner, state.obs.direction[state.assigned]
     mean = grouped_sums(direction, index, state.count)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-    off = np.linalg.norm(np.cross(direction, mean[index]), axis=1)
+    off = lengths(cross(direction, mean[index]))
     narrow = np.nan_to_num(grouped_quantile(off, index, len(mean), 1.0)) < np.sin(_PARALLAX)
     state = state.keep(narrow | (np.arange(len(narrow)) < known))
     return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)

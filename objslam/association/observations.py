@@ -13,6 +13,7 @@ from objslam.core.appearance.features import FeatureTable
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, box_sizes
 from objslam.core.ground.flattening import LEVEL, flattened_lines
+from objslam.core.rotation import cross
 from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 from objslam.core.types import Association, Keyframes, Rays
 
@@ -93,12 +94,13 @@ def closest_approach(obs: Observations, first: Ints, second: Ints) -> tuple[Floa
     and the squared sine of the angle between the rays (P,).
     """
     m, n, o, p = obs.origin[first], obs.direction[first], obs.origin[second], obs.direction[second]
-    between, cos, normal = o - m, np.einsum("pi,pi->p", n, p), np.cross(n, p)
+    between, cos, normal = o - m, np.einsum("pi,pi->p", n, p), cross(n, p)
     sin2 = np.maximum(np.einsum("pi,pi->p", normal, normal), 1e-12)
     a, b = np.einsum("pi,pi->p", between, n), np.einsum("pi,pi->p", between, p)
     along_first, along_second = (a - cos * b) / sin2, (cos * a - b) / sin2
     one, two = m + along_first[:, None] * n, o + along_second[:, None] * p
-    return along_first, along_second, (one + two) / 2, ((one - two) ** 2).sum(axis=1), sin2
+    gap = one - two
+    return along_first, along_second, (one + two) / 2, np.einsum("pi,pi->p", gap, gap), sin2
 
 
 @dataclass(frozen=True)

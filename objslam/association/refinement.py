@@ -21,8 +21,6 @@ refinement down."""
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
 _FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 """The rows and the columns of the six entries that determine a symmetric 3 x 3 matrix. The diagonal comes first."""
-_MATRIX = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
-"""The index of each entry of a symmetric 3 x 3 matrix among the six entries of `_FIRST` and `_SECOND`."""
 
 
 def variance(obs: Observations, distance: Floats, noise: Floats | float, of: Ints | slice = slice(None)) -> Floats:
@@ -118,16 +116,28 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
             each[:6] += along * direction[_FIRST] * direction[_SECOND]
         sums[:, some] = np.add.reduceat(each, begin, axis=1) if len(some) else 0.0
         sums[:3] += sums[9]
-        total = sums[_MATRIX].transpose(2, 0, 1)
-        total = total + (_DAMPING * np.trace(total, axis1=1, axis2=2) + 1e-12)[:, None, None] * np.eye(3)
-        step = np.linalg.solve(total, sums[6:9].T[:, :, None])[:, :, 0]
+        sums[:3] += _DAMPING * (sums[0] + sums[1] + sums[2]) + 1e-12
+        step = _solve_symmetric(sums[:6], sums[6:9])
         # With little parallax, full steps are unreliable. So no step is longer than the mean distance of the point.
-        length, reach = np.linalg.norm(step, axis=1), sums[10] / np.maximum(number, 1)
-        position = position + step * np.minimum(1.0, reach / np.maximum(length, 1e-12))[:, None]
+        length, reach = np.sqrt(dots(step, step)), sums[10] / np.maximum(number, 1)
+        position = position + (step * np.minimum(1.0, reach / np.maximum(length, 1e-12))).T
     return position
 
 
-def dots(a: Floats, b: Floats) -> Floats:
+def _solve_symmetric(matrices: Floats, right: Floats) -> Floats:
+    """Return the solutions (3, N) of N symmetric systems by Cramer's rule, in a third of the time of LAPACK.
+
+    matrices: (6, N) their entries in the order of `_FIRST` and `_SECOND`. The damping keeps the determinants above rounding
+    errors. right: (3, N).
+    """
+    xx, yy, zz, xy, xz, yz = matrices
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    solution = np.stack([dots((a, b, c), right), dots((b, d, e), right), dots((c, e, f), right)])
+    return np.asarray(solution / (xx * a + xy * b + xz * c))
+
+
+def dots(a: Floats | tuple[Floats, ...], b: Floats) -> Floats:
     """Return the products (P,) of vectors (3, P)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 

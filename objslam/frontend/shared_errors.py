@@ -108,8 +108,10 @@ class SharedErrors:
         return np.zeros(0) if self.log.odometry is None else self.log.odometry.stamps
 
     def with_noise(self, noise: NoiseFactors) -> Self:
-        """Return the same measurements with other noise."""
-        return replace(self, noise=noise)
+        """Return the same measurements with other noise. They share the kept poses, which do not depend on the noise."""
+        other = replace(self, noise=noise)
+        vars(other).update(_kept_poses=self._kept_poses, _kept_drift=self._kept_drift)
+        return other
 
     def with_unknown_noise(self) -> Self:
         """Return the same measurements with all kinds of noise unknown, whatever the settings say."""

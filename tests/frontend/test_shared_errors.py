@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from objslam.config import load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
+from objslam.core.noise import NoiseFactors
 from objslam.core.trajectory import correct_poses
 from objslam.core.types import Images, Trajectory
 from objslam.errors import ConfigError
@@ -20,6 +21,7 @@ from objslam.frontend.corrected_log import refocused, take_out
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors, take_out_known
 from objslam.frontend.odometry_drift import gathered_drift
+from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import measured_ranges
 from objslam.graph.factors.odometry import motions
 from objslam.io.calibration_yaml import dump_calibration
@@ -79,6 +81,21 @@ def test_no_error_changes_nothing(clean):
     assert_allclose(same_rays.range, rays.range)
     assert_allclose(same_rays.direction, rays.direction)
     assert settings == SETTINGS
+
+
+@pytest.mark.parametrize(("noise", "same"), [({"turning": 2.0, "heading": 3.0}, True), ({"shrinkage": 0.02}, False)])
+def test_other_noise_needs_new_poses_only_if_it_moves_them(clean, monkeypatch, noise, same):
+    """Only the shrinkage does: it lengthens the odometry."""
+    errors = measured(add_shared_errors(clean, ERRORS))[2]
+    values, made, compute = np.full(len(errors.names), 0.01), [], SharedErrors._computed_poses
+    monkeypatch.setattr(SharedErrors, "_computed_poses", lambda *args: made.append(args) or compute(*args))
+    before, *_ = errors.at(values)
+    after, *_ = errors.with_noise(NoiseFactors(**noise)).at(values)
+    anew, *_ = replace(errors, noise=NoiseFactors(**noise)).at(values)
+    assert len(made) == (2 if same else 3)
+    assert np.allclose(before.map_T_base, after.map_T_base) == same
+    for name in ("stamps", "map_T_base", "odom_T_base", "base_T_camera", "drift"):
+        assert_allclose(getattr(after, name), getattr(anew, name), rtol=0, atol=0)
 
 
 def test_the_corrected_log_has_the_same_keyframes(clean):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log
 from objslam.mapping import pipeline
-from objslam.mapping.fixed.lasting_noise import Cells, lasting_variances
+from objslam.mapping.fixed.lasting_noise import _FACTORS, _KINDS, _LOOSE, TIMES, Cells, lasting_variances
 from objslam.simulation import PoseNoise, preset, simulate
 
 
@@ -93,6 +94,24 @@ def test_the_size_of_lasting_errors_is_found(factors, time):
     found = np.sqrt(lasting_variances(cells).sum(axis=1))
     assert found[0] == pytest.approx(factors[0], rel=0.3, abs=0.15)
     assert np.hypot(*found) == pytest.approx(np.hypot(*factors), rel=0.3, abs=0.2)
+
+
+@pytest.mark.parametrize("objects", [1, 2, 12])
+def test_the_likelihood_is_that_of_the_normal_distribution(objects):
+    """The variances, from the covariance of all cells for each hypothesis."""
+    rng = np.random.default_rng(2)
+    cells = drawn(rng.uniform(0, 60, objects**2), np.repeat(np.arange(objects), objects), (1.0, 0.5), 4.0, rng)
+    same = cells.owner[:, None] == cells.owner
+    known = np.diag(cells.white**2) + _LOOSE**2 * same * (cells.shift @ cells.shift.T)
+    posterior = np.zeros((len(_KINDS), len(TIMES), len(_FACTORS)))
+    for (m, (turned, moved)), (t, time), (f, factor) in product(*map(enumerate, (_KINDS, TIMES, _FACTORS))):
+        errors = turned * cells.turn @ cells.turn.T + moved * cells.move @ cells.move.T
+        covariance = known + factor**2 * errors * np.exp(-np.abs(cells.times[:, None] - cells.times) / time)
+        fit = cells.mean @ np.linalg.solve(covariance, cells.mean) + np.linalg.slogdet(covariance)[1]
+        posterior[m, t, f] = -0.5 * (factor**2 + fit)
+    weight = np.exp(posterior - posterior.max()) * np.gradient(_FACTORS)
+    expected = np.einsum("mtf,f,mk->kt", weight / weight.sum(), _FACTORS**2, _KINDS)
+    np.testing.assert_allclose(lasting_variances(cells), expected, rtol=1e-8)
 
 
 def test_objects_that_were_seen_once_show_the_errors_that_they_share():

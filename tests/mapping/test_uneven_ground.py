@@ -15,6 +15,7 @@ from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.mapping import pipeline
 from objslam.mapping.checks.agreement import agreement, bounded_part
+from objslam.mapping.ground.common_tilt import _PLACE, _Poses
 from objslam.mapping.ground.uneven_ground import uneven_ground, with_uneven_ground
 
 QUIET = ("output.recording=false", "output.picture=false")
@@ -119,3 +120,25 @@ def test_ground_that_tilts_rises_over_its_way_but_not_over_more_than_the_site():
     assert rise_of(stamps, line, np.array([0.01]), np.array([5.0])) == pytest.approx(0.05)
     assert rise_of(stamps, line, np.array([0.01]), np.array([1e4])) == pytest.approx(0.01 * stamps.std(), rel=1e-6)
     assert rise_of(stamps, line, np.array([0.03, 0.04]), np.array([1.0, 1.0])) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("lasts", [False, True])
+@pytest.mark.parametrize("kinds", [3, 5])
+def test_the_likelihood_is_that_of_the_normal_distribution(kinds, lasts):
+    """The cost, the effects and the errors of the poses, from the covariance of all rays."""
+    rng, poses, count = np.random.default_rng(0), 8, 30
+    pose = np.sort(np.append(np.arange(poses), rng.integers(0, poses, count - poses)))
+    miss, by_pose, effects = rng.standard_normal(count), rng.standard_normal((count, kinds)), rng.standard_normal((count, 4))
+    alike = np.exp(-np.abs(np.arange(poses)[:, None] - np.arange(poses)) / 3) if lasts else np.eye(poses)
+    factor, tilt, height = sizes = np.array([1.3, 0.5, 0.7])
+    cost, found, errors = _Poses.of(miss, by_pose, effects, pose, 20.0).solve(np.log(sizes), alike if lasts else None)
+    sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[:kinds]
+    of_poses = np.zeros((count, poses, kinds))
+    of_poses[np.arange(count), pose] = by_pose * sigma
+    shared = np.einsum("rki,kl->rli", of_poses, alike)
+    covariance = factor**2 * np.eye(count) + np.einsum("rki,ski->rs", shared, of_poses) + effects @ effects.T
+    pull = np.linalg.solve(covariance, miss)
+    fit = miss @ pull + np.linalg.slogdet(covariance)[1] + 20 * (2 * np.log(factor) + factor**-2)
+    assert cost == pytest.approx(fit, rel=1e-7)
+    np.testing.assert_allclose(found, effects.T @ pull, rtol=1e-6)
+    np.testing.assert_allclose(errors, sigma * np.einsum("rki,r->ki", shared, pull), rtol=1e-6, atol=1e-9)

@@ -7,6 +7,7 @@ A Gauss-Newton step moves the errors and the objects together. Each object is el
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -188,22 +189,21 @@ def linearise_points(
     camera = errors.keyframes.camera[errors.rays.keyframe[held]]
     by_error = _slopes(lambda values: misses(values).deviation, errors, theta, camera)
     n, p = len(points), len(theta)
-    h_pp, h_pt, g_p = np.zeros((n, 3, 3)), np.zeros((n, 3, p)), np.zeros((n, 3))
-    weighted = weight[:, None, None] * by_point
-    np.add.at(h_pp, owner, np.einsum("nki,nkj->nij", weighted, by_point))
-    np.add.at(h_pt, owner, np.einsum("nki,nkp->nip", weighted, by_error))
-    np.add.at(g_p, owner, np.einsum("nki,nk->ni", weighted, e))
-    h_pp += _FREE * np.eye(3)
-    back, own = -np.linalg.solve(h_pp, h_pt), -np.linalg.solve(h_pp, g_p[..., None])[..., 0]
-    reduced = by_error + np.einsum("nki,nip->nkp", by_point, back[owner])
-    left = e + np.einsum("nki,ni->nk", by_point, own[owner])
-    scores = weight[:, None] * np.einsum("nkp,nk->np", reduced, e)
-    matrix = np.einsum("n,nkp,nkq->pq", weight, reduced, reduced)
-    cost = float((weight[:, None] * left**2).sum())
+    # All rows of a point lie together, so that each sum over its rays is one product of matrices.
+    order, root = np.argsort(owner, kind="stable"), np.sqrt(weight)[:, None, None]
+    rows = (root * np.concatenate([by_point, by_error, e[..., None]], axis=2))[order].reshape(2 * len(owner), 3 + p + 1)
+    ends = 2 * np.searchsorted(owner[order], np.arange(n + 1))
+    own_rows = [rows[begin:end] for begin, end in pairwise(ends.tolist())]
+    products = np.array([some[:, :3].T @ some for some in own_rows])
+    moves = -np.linalg.solve(products[..., :3] + _FREE * np.eye(3), products[..., 3:])
+    left = np.concatenate([some[:, 3:] + some[:, :3] @ move for some, move in zip(own_rows, moves, strict=True)])
+    scores = np.empty((len(owner), p))
+    scores[order] = (left[:, :p] * rows[:, -1:]).reshape(-1, 2, p).sum(axis=1)
+    matrix, cost = left[:, :p].T @ left[:, :p], float(left[:, p] @ left[:, p])
     variance = max(1.0, cost / max(2 * len(e) - 3 * n, 1))
     # For the weight w, the curvature is 2 w^2 - w along a deviation and w across it. The mean is w^2.
     curvature = float((weight**2).sum() / max(weight.sum(), 1e-300))
-    return PointSystem(matrix, scores.sum(axis=0), cost, variance, curvature, scores, np.asarray(back), np.asarray(own))
+    return PointSystem(matrix, scores.sum(axis=0), cost, variance, curvature, scores, moves[..., :p], moves[..., p])
 
 
 def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:

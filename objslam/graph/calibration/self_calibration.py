@@ -105,7 +105,8 @@ def calibrate(
             break
     if len(theta):
         fit = replace(fit, wider=correlation_factors(at.state, at.system))
-        at = fit.shared_errors(state, theta, _CONVERGED, at.noise)
+        first = at.system if state is at.state else None  # The widening leaves the linear system as it is.
+        at = fit.shared_errors(state, theta, _CONVERGED, at.noise, first)
         state, theta, steps = at.state, at.theta, steps + at.steps
     nothing = np.zeros(len(state.used), dtype=bool)
     near = state.landmarks, state.factored
@@ -218,11 +219,18 @@ class _Fit:
         """The weight of the nominal noise, as a number of residuals."""
         return self.errors.settings.noise.prior
 
-    def shared_errors(self, state: InnerSolve, theta: Floats, converged: float, noise: Floats | None = None) -> _Found:
+    def shared_errors(
+        self,
+        state: InnerSolve,
+        theta: Floats,
+        converged: float,
+        noise: Floats | None = None,
+        first: LinearSystem | None = None,
+    ) -> _Found:
         """Return the parameters that fit best. The search starts at theta (P,).
 
         converged: the number of posterior standard deviations below which a step ends the search. noise: (P,) from
-        `noise_shares`, if known.
+        `noise_shares`, if known. first: the linear system at the start, if known.
         """
         errors = self.errors
         prior = np.asarray(np.linalg.inv(errors.prior), dtype=np.float64)
@@ -234,7 +242,7 @@ class _Fit:
             """Return half the squared Mahalanobis distance of parameters (P,) from their prior."""
             return float((values - errors.mean) @ prior @ (values - errors.mean)) / 2
 
-        first = linearise(state, errors, theta)
+        first = linearise(state, errors, theta) if first is None else first
         shares = noise_shares(state, first, errors) if noise is None else noise
 
         def outer(state: InnerSolve, theta: Floats, linear: LinearSystem) -> _Outer:

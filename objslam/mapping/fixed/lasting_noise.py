@@ -107,19 +107,43 @@ def lasting_variances(cells: Cells) -> Floats:
     posterior.
     """
     cells = cells.take(_counted(cells.times))
+    from scipy.linalg.lapack import dpotrf, dsygst, dtrtrs  # Here, so that `load_libraries` comes first.
+
     same = cells.owner[:, None] == cells.owner
     known = np.diag(cells.white**2) + _LOOSE**2 * np.where(same, cells.shift @ cells.shift.T, 0.0)
-    whiten = np.linalg.inv(np.linalg.cholesky(known))
-    mean, squared = whiten @ cells.mean, _FACTORS**2
+    root, _ = dpotrf(np.asfortranarray(known), lower=1, overwrite_a=1)
+    mean, squared = dtrtrs(root, cells.mean, lower=1)[0], _FACTORS**2
     likelihood = np.tile(-0.5 * squared, (len(_KINDS), len(TIMES), 1))
+    kinds = [cells._errors(one) for one in np.eye(2)]
     for column, time in enumerate(TIMES):
-        errors = whiten @ (np.stack([cells._errors(one) for one in np.eye(2)]) * cells.alike(time)) @ whiten.T
-        for row, kind in zip(likelihood[:, column], _KINDS, strict=True):
-            size, vectors = np.linalg.eigh(np.tensordot(kind, errors, 1))
-            variance = 1 + squared[:, None] * np.maximum(size, 0.0)
-            row -= 0.5 * ((vectors.T @ mean) ** 2 / variance + np.log(variance)).sum(axis=1)
+        alike = cells.alike(time)
+        # The errors in units of what is known, L^-1 E L^-T. LAPACK makes the lower triangles, and reads columns.
+        turned, moved = (dsygst((errors * alike).T, root, itype=1, lower=1, overwrite_a=1)[0] for errors in kinds)
+        for row, (turns, moves) in zip(likelihood[:, column], _KINDS.tolist(), strict=True):
+            row -= 0.5 * _misfits(turns * turned + moves * moved, mean, squared)
     weight = np.exp(likelihood - likelihood.max()) * np.gradient(_FACTORS)
     return np.asarray(np.einsum("mtf,f,mk->kt", weight, squared, _KINDS) / weight.sum())
+
+
+def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
+    """Return -2 ln of the likelihood (F,), up to a constant, of a mean (C,) with covariance 1 + f times `covariance`, for
+    each of the factors f (F,).
+
+    covariance: (C, C) symmetric. Only its lower triangle counts, and it is overwritten. It is made tridiagonal once, and all
+    factors together are one tridiagonal system. This takes a third of the time of eigenvalues with their vectors.
+    """
+    from scipy.linalg.lapack import dormqr, dptsv, dsytrd, dsytrd_lwork  # Here, so that `load_libraries` comes first.
+
+    diagonal, beside, count = np.diagonal(covariance), np.zeros(0), len(mean)
+    if count > 1:
+        space = int(dsytrd_lwork(count, lower=1)[0])
+        reflectors, diagonal, beside, scales, _ = dsytrd(covariance, lower=1, lwork=space, overwrite_a=1)
+        turned = dormqr("L", "T", reflectors[1:, :-1], scales, mean[1:, None], space)[0][:, 0]
+        mean = np.append(mean[0], turned)
+    right = np.tile(mean, len(factors))
+    of_all = (1 + np.outer(factors, diagonal)).ravel(), np.outer(factors, np.append(beside, 0.0)).ravel()[:-1]
+    pivots, _, solved, _ = dptsv(*of_all, right)
+    return np.asarray((right * solved + np.log(pivots)).reshape(len(factors), count).sum(axis=1))
 
 
 def _counted(times: Floats) -> Ints:
