@@ -12,6 +12,7 @@ from objslam.core.rotation import rotation_vector
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.moving_boxes import boxes_move
 
 FASTEST = 40.0
 """Poses are not in metres if their typical speed (m/s) is above this, the speed of a car on a motorway. A larger speed warns
@@ -47,9 +48,6 @@ for a stop."""
 _FROZEN_SECONDS = 8.0
 """The shortest time (s) without motion that may be a frozen path. If a robot really stands still, its boxes do not move in
 the image either. A larger value finds fewer frozen paths."""
-_MOVING_PX = 12.0
-"""A camera moves if the boxes of one label spread by more than this (px) about their median, within seconds. A larger spread
-finds fewer frozen paths."""
 _LEAST_STEP = 0.01
 """The noise (m) of a position. The direction of a motion is judged if the motion is longer than three times this noise. A
 larger value suits noisy poses."""
@@ -231,7 +229,7 @@ def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
     frozen, begin = 0.0, None
     for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         start, end = float(path.stamps[first]), float(path.stamps[last])
-        if end - start >= _FROZEN_SECONDS and _boxes_move(log, start, end):
+        if end - start >= _FROZEN_SECONDS and boxes_move(log, start, end):
             begin = start if begin is None else begin
             frozen += end - start
     if begin is not None:
@@ -241,24 +239,6 @@ def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
             f"the {name} stands still for {frozen:.0f} of {whole:.0f} s while the boxes move (from stamp {begin:.3f}): "
             "the poses are probably frozen",
         )
-
-
-def _boxes_move(log: Log, start: float, end: float) -> bool:
-    """Return whether the boxes of most labels move through the image between two stamps."""
-    moving, still = 0, 0
-    for one in log.cameras:
-        found = one.detections
-        if found is None or one.mount is not None:  # An arm moves a camera while the base stands still.
-            continue
-        inside = (found.stamps >= start + 1) & (found.stamps <= end - 1)
-        centre = (found.boxes[inside, :2] + found.boxes[inside, 2:]) / 2
-        label = found.label[inside]
-        for name in np.unique(label):
-            mine = centre[label == name]
-            if len(mine) >= 5:
-                spread = float(np.median(np.abs(mine - np.median(mine, axis=0)).max(axis=1)))
-                moving, still = moving + (spread > _MOVING_PX), still + (spread <= _MOVING_PX / 2)
-    return moving > 2 * still and moving > 0
 
 
 def steps(poses: Floats) -> tuple[Floats, Floats]:
