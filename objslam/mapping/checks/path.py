@@ -9,6 +9,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.rotation import rotation_vector
+from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
@@ -193,13 +194,12 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
 def _pulses(path: Trajectory, moving: Bools) -> Bools:
     """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
 
-    moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose until the next one is known.
+    moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose until the next one is known. A
+    jump is one with the times as given, and also if no step takes less time than usual (`usual_seconds`).
     """
-    seconds = np.diff(path.stamps)
-    velocity = np.diff(path.poses[:, :3, 3], axis=0) / seconds[:, None]
-    beside = _beside(velocity)
-    steady = seconds <= 2 * np.median(seconds)  # In a gap of the poses, a robot can do anything.
-    off = np.where(steady, beside * seconds, 0.0)
+    seconds, way = np.diff(path.stamps), np.diff(path.poses[:, :3, 3], axis=0)
+    off = np.min([_beside(way / time[:, None]) * time for time in (seconds, usual_seconds(seconds))], axis=0)
+    off[seconds > 2 * np.median(seconds)] = 0.0  # In a gap of the poses, a robot can do anything.
     least = np.maximum(_JUMP_WAY + _ACCELERATION * seconds**2, _TIMES_ODD * np.quantile(off[moving], 0.9))
     return np.asarray(off > least)
 
