@@ -63,6 +63,19 @@ def test_a_jump_of_half_a_metre_is_named(back: float | None) -> None:
     assert "stamp 30.1" in found.message or "stamp 30.0" in found.message
 
 
+def test_a_short_jump_of_a_fast_car_is_not_another_map() -> None:
+    """The car drives 0.84 m in a step anyway. Only what the step is too long counts."""
+    slow = circle(0.1)
+    poses = slow.poses.copy()
+    poses[:, :3, 3] *= 14
+    fast = jumped(replace(slow, poses=poses), 30.0, 0.6)
+    (found,) = check_path(Log("log", (), localization=fast), FIXED)
+    assert found.name == "localisation jumps"
+    assert not found.spoils
+    assert "first by 0.57 m" in found.message
+    assert check_path(Log("log", (), localization=jumped(fast, 40.0, 1.5)), FIXED)[0].spoils
+
+
 def test_a_jump_between_rare_poses_is_named_by_the_odometry() -> None:
     path = jumped(circle(0.5, 0.03), 30.2, 0.6)
     assert names(path) == []

@@ -178,28 +178,38 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
     # A gap in the poses is no jump. The speed over the gap is one that a robot can reach.
     jumps = (speed > max(_JUMP, _TIMES * fast[0])) & (way > _JUMP_WAY)
     jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1])) & (angle > _JUMP_ANGLE)
-    jumps |= _pulses(path, moving)
+    odd = _oddness(path)
+    jumps |= _pulses(path, odd, moving)
     if jumps.any():
         first = int(np.argmax(jumps))
         yield Finding(
             f"{name} jumps",
-            f"the {name} jumps {jumps.sum()} time{'' if jumps.sum() == 1 else 's'} (first by {way[first]:.2f} m and "
+            f"the {name} jumps {jumps.sum()} time{'' if jumps.sum() == 1 else 's'} (first by {odd[first]:.2f} m and "
             f"{np.degrees(angle[first]):.0f} deg at stamp {path.stamps[first + 1]:.3f}): "
             "poses before and after a jump do not belong together"
             + ("; map both parts of the log (--end, --begin)" if name == "odometry" and jumps.sum() == 1 else ""),
-            spoils=name == "odometry" or log_is_split(way, jumps),
+            spoils=name == "odometry" or log_is_split(odd, jumps),
         )
 
 
-def _pulses(path: Trajectory, moving: Bools) -> Bools:
-    """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
+def _oddness(path: Trajectory) -> Floats:
+    """Return by how much (N-1,), m, the steps of a path differ from the steps beside them, which is the size of a jump.
 
-    moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose until the next one is known. A
-    jump is one with the times as given, and also if no step takes less time than usual (`usual_seconds`).
+    A step is as odd as it is with the times as given, or, if this is less, with times that are not shorter than usual
+    (`usual_seconds`).
     """
     seconds, way = np.diff(path.stamps), np.diff(path.poses[:, :3, 3], axis=0)
-    off = np.min([_beside(way / time[:, None]) * time for time in (seconds, usual_seconds(seconds))], axis=0)
-    off[seconds > 2 * np.median(seconds)] = 0.0  # In a gap of the poses, a robot can do anything.
+    return np.asarray(np.min([_beside(way / t[:, None]) * t for t in (seconds, usual_seconds(seconds))], axis=0))
+
+
+def _pulses(path: Trajectory, odd: Floats, moving: Bools) -> Bools:
+    """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
+
+    odd: (N-1,) as from `_oddness`. moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose
+    until the next one is known.
+    """
+    seconds = np.diff(path.stamps)
+    off = np.where(seconds <= 2 * np.median(seconds), odd, 0.0)  # In a gap of the poses, a robot can do anything.
     least = np.maximum(_JUMP_WAY + _ACCELERATION * seconds**2, _TIMES_ODD * np.quantile(off[moving], 0.9))
     return np.asarray(off > least)
 
@@ -216,7 +226,8 @@ def _beside(steps: Floats) -> Floats:
 def log_is_split(way: Floats, jumps: Bools) -> bool:
     """Return whether a localisation jumps by more than 1 m, as if it changed to another map. A shorter jump is a correction.
 
-    way: (N-1,) m, the steps of the path. jumps: (N-1,) which steps are jumps.
+    way: (N-1,) m, by how much the steps are too long: a fast robot drives farther than 1 m without a jump. jumps: (N-1,)
+    which steps are jumps.
     """
     return bool(jumps.any() and way[jumps].max() > 1.0)
 
