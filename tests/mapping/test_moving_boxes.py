@@ -7,7 +7,7 @@ import pytest
 
 from objslam.core.camera import Camera
 from objslam.core.types import CameraLog, Detections, Log
-from objslam.mapping.checks.moving_boxes import boxes_move
+from objslam.mapping.checks.parts.moving_boxes import boxes_move
 
 SIZE = np.array([640, 480])
 THINGS = (("chair", 120.0, 250.0), ("chair", 400.0, 260.0), ("cup", 200.0, 330.0), ("cup", 520.0, 300.0))

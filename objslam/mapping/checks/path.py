@@ -13,7 +13,7 @@ from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
-from objslam.mapping.checks.moving_boxes import boxes_move
+from objslam.mapping.checks.parts.moving_boxes import boxes_move
 
 FASTEST = 40.0
 """Poses are not in metres if their typical speed (m/s) is above this, the speed of a car on a motorway. A larger speed warns
