@@ -25,6 +25,14 @@ def rates(path: Trajectory, stamps: Floats) -> tuple[Floats, Floats]:
     return speed, turn
 
 
+def usual_seconds(seconds: Floats) -> Floats:
+    """Return the times (N, ...), s, of the steps of a path, none of them shorter than the median.
+
+    Poses that are stamped when they arrive come in groups if they had to wait. Steps inside a group seem to take no time.
+    """
+    return np.maximum(seconds, np.median(seconds))
+
+
 def travel(poses: Floats) -> Floats:
     """Return how far a path with poses (N, 4, 4) goes from each pose to the next: (N - 1, 3).
 

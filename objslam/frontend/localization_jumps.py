@@ -15,6 +15,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import interpolate, is_planar
 from objslam.core.rotation import cross, rotation_from_vector, rotation_vector
 from objslam.core.statistics import NORMAL_MEDIAN
+from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Log, Trajectory
 
 ANOTHER_MAP = 1.0
@@ -193,14 +194,16 @@ def _by_neighbours(path: Trajectory) -> tuple[Floats, Floats, Bools]:
     Returns the differences (N-1, 2, 3) between each step and a step at the median velocity of four steps, the two before it
     and the two after it. Also returns the oddness (N-1, 2) of each step, and which steps (N-1,) are judged. In the axis of
     length 2, the first entry is the move, m, and the second is the turn, rad. The oddness is the difference from the more
-    similar of the two neighbouring steps.
+    similar of the two neighbouring steps, with the times as given, or with times that are not shorter than usual
+    (`usual_seconds`) if this is less.
     """
-    seconds = np.diff(path.stamps)
-    velocity = _steps(path.poses) / seconds[:, None, None]
+    seconds, steps = np.diff(path.stamps), _steps(path.poses)
+    off = np.min([_unlike(steps / t[:, None, None]) * t[:, None] for t in (seconds, usual_seconds(seconds))], axis=0)
+    velocity = steps / seconds[:, None, None]
     around = np.clip(np.arange(len(velocity))[:, None] + [-2, -1, 1, 2], 0, len(velocity) - 1)
     odd = (velocity - np.median(velocity[around], axis=1)) * seconds[:, None, None]
     judged = seconds <= 2 * np.median(seconds)  # In a gap of the poses, a robot can do anything.
-    return odd, _unlike(velocity) * seconds[:, None], judged
+    return odd, off, judged
 
 
 def _by_odometry(path: Trajectory, odometry: Trajectory, max_gap: float) -> tuple[Floats, Floats, Bools]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse, log_se3
+from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Trajectory
 
 _SHARED = 1.0
@@ -41,18 +42,18 @@ class OdometryBridge:
         same mean as p T^3 / 15 * s (1 - s), which is used instead. Between a step and the next but one, white noise gives
         the same variance as between neighbours, and a random walk gives 2.5 times as much. This tells, for each axis, which
         share of the changes is a random walk.
+
+        Messages that waited come together. If they are stamped then, their steps take almost no time, and their velocities
+        mean nothing. So each change is also taken as if no step were shorter than usual, and the smaller change counts.
         """
         seconds = np.diff(odometry.stamps)[:, None]
-        velocity = log_se3(inverse(odometry.poses[:-1]) @ odometry.poses[1:]) / seconds
-        if len(velocity) < 2:
-            return cls(odometry.stamps, np.zeros_like(velocity))
-        change = np.diff(velocity, axis=0) ** 2
-        once = change.mean(axis=0)
-        twice = ((velocity[2:] - velocity[:-2]) ** 2).mean(axis=0) if len(velocity) > 2 else once
-        walk = np.clip((twice - once) / 1.5 / np.maximum(once, 1e-300), 0.0, 1.0)
-        white = _beside(change / (1 / seconds[1:] + 1 / seconds[:-1])) * seconds
-        walked = _beside(3 * change / (seconds[1:] + seconds[:-1])) * seconds**3 / 15
-        return cls(odometry.stamps, (1 - walk) * white + walk * walked)
+        step = log_se3(inverse(odometry.poses[:-1]) @ odometry.poses[1:])
+        if len(step) < 2:
+            return cls(odometry.stamps, np.zeros_like(step))
+        given, spread = (_densities(step, time) for time in (seconds, usual_seconds(seconds)))
+        once, twice, white, walked = (np.minimum(*pair) for pair in zip(given, spread, strict=True))
+        walk = np.clip((twice.mean(axis=0) / once.mean(axis=0).clip(1e-300) - 1) / 1.5, 0.0, 1.0)
+        return cls(odometry.stamps, (1 - walk) * _beside(white) * seconds + walk * _beside(walked) * seconds**3 / 15)
 
     def at(self, stamps: Floats) -> tuple[Floats, Floats]:
         """Return the places of stamps (K,), s, among the steps, and the variance (K, 6) of the step at each place.
@@ -65,6 +66,19 @@ class OdometryBridge:
         if last == 0:
             return step, np.zeros((len(step), 6))
         return step, self.wander[np.minimum(step.astype(np.int64), last - 1)]
+
+
+def _densities(step: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the squared changes of velocity from a step to the next (n-1, 6) and to the next but one (n-2, 6), and the
+    densities that the first of them show: of a white velocity (n-1, 6), and of one that is a random walk (n-1, 6).
+
+    step: (n, 6) twists. seconds: (n, 1) the time of each step. With two steps, no step has a next but one, and the first
+    changes count in both places.
+    """
+    velocity = step / seconds
+    once = np.diff(velocity, axis=0) ** 2
+    twice = (velocity[2:] - velocity[:-2]) ** 2 if len(velocity) > 2 else once
+    return once, twice, once / (1 / seconds[1:] + 1 / seconds[:-1]), 3 * once / (seconds[1:] + seconds[:-1])
 
 
 def _beside(density: Floats) -> Floats:

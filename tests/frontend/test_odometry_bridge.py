@@ -80,6 +80,22 @@ def test_fast_odometry_has_next_to_nothing():
     assert (np.sqrt(bridge.wander.mean(axis=0) / 4)[2:4] < 0.1 * floor).all()
 
 
+def test_poses_that_are_stamped_late_have_errors_of_the_way_that_the_robot_drives_meanwhile():
+    """The poses of 10 ms come in groups, a microsecond apart. The bridge was 1000 times as large."""
+    rng, count = np.random.default_rng(5), 6000
+    true = driven(np.full(count, 0.5), np.full(count, 0.3), 0.01)
+    stamps = np.arange(count + 1) * 0.01
+    late = stamps + np.abs(rng.normal(0, 0.02, len(stamps)))
+    late = np.maximum.accumulate(late - np.arange(len(late)) * 1e-6) + np.arange(len(late)) * 1e-6
+    assert (np.diff(late) < 1e-4).mean() > 0.3
+    bridge = OdometryBridge.of(Trajectory(late, true))
+    off_late = log_se3(inverse(interpolate(late, true, stamps, np.inf)[0]) @ true)
+    spread = off_late[:, [2, 3]].std(axis=0)
+    largest = np.sqrt(bridge.wander[:, [2, 3]].max(axis=0)) / 2
+    assert (largest < 3 * spread).all(), (largest, spread)
+    assert (largest > 0.1 * spread).all(), (largest, spread)
+
+
 def test_a_gap_of_a_fast_odometry_is_bridged_as_its_neighbours_show():
     """One second is missing at 20 Hz, in which the robot begins to turn."""
     turning = np.where(np.arange(400) < 200, 0.0, 0.8)

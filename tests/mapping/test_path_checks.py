@@ -10,6 +10,7 @@ import pytest
 from objslam.config import load_settings
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Log, Trajectory
+from objslam.frontend.localization_jumps import find_jumps
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.path import check_path
 from objslam.simulation import preset, simulate
@@ -62,10 +63,45 @@ def test_a_jump_of_half_a_metre_is_named(back: float | None) -> None:
     assert "stamp 30.1" in found.message or "stamp 30.0" in found.message
 
 
+def test_a_short_jump_of_a_fast_car_is_not_another_map() -> None:
+    """The car drives 0.84 m in a step anyway. Only what the step is too long counts."""
+    slow = circle(0.1)
+    poses = slow.poses.copy()
+    poses[:, :3, 3] *= 14
+    fast = jumped(replace(slow, poses=poses), 30.0, 0.6)
+    (found,) = check_path(Log("log", (), localization=fast), FIXED)
+    assert found.name == "localisation jumps"
+    assert not found.spoils
+    assert "first by 0.57 m" in found.message
+    assert check_path(Log("log", (), localization=jumped(fast, 40.0, 1.5)), FIXED)[0].spoils
+
+
 def test_a_jump_between_rare_poses_is_named_by_the_odometry() -> None:
     path = jumped(circle(0.5, 0.03), 30.2, 0.6)
     assert names(path) == []
     assert names(path, circle(0.05)) == ["localisation jumps"]
+
+
+def stamped_late(path: Trajectory, sigma: float, apart: float = 1e-6) -> Trajectory:
+    """The path if each pose is stamped after a random time (s). A pose that waits holds up those after it."""
+    late = path.stamps + np.abs(np.random.default_rng(1).normal(0, sigma, len(path)))
+    order = np.arange(len(path)) * apart
+    return replace(path, stamps=np.maximum.accumulate(late - order) + order)
+
+
+@pytest.mark.parametrize("every", [0.02, 0.05])
+def test_poses_that_are_stamped_when_they_arrive_do_not_jump(every: float) -> None:
+    """Poses that come together have hardly any time between them, so their speeds mean nothing."""
+    path = stamped_late(circle(every), every)
+    assert (np.diff(path.stamps) < 0.01 * every).sum() > 30
+    assert names(None, path) == names(path) == []
+    assert find_jumps(Log("log", (), localization=path), FIXED) is None
+    moved = circle(every)
+    for at in (30.01, 32.01, 33.01, 34.01):  # One of the poses may wait for so long that it counts as a gap.
+        moved = jumped(moved, at, 0.6)
+    moved = stamped_late(moved, every)
+    assert names(None, moved) == ["odometry jumps"]
+    assert names(moved) == ["localisation jumps"]
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,11 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.rotation import rotation_vector
+from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.parts.moving_boxes import boxes_move
 
 FASTEST = 40.0
 """Poses are not in metres if their typical speed (m/s) is above this, the speed of a car on a motorway. A larger speed warns
@@ -47,9 +49,6 @@ for a stop."""
 _FROZEN_SECONDS = 8.0
 """The shortest time (s) without motion that may be a frozen path. If a robot really stands still, its boxes do not move in
 the image either. A larger value finds fewer frozen paths."""
-_MOVING_PX = 12.0
-"""A camera moves if the boxes of one label spread by more than this (px) about their median, within seconds. A larger spread
-finds fewer frozen paths."""
 _LEAST_STEP = 0.01
 """The noise (m) of a position. The direction of a motion is judged if the motion is longer than three times this noise. A
 larger value suits noisy poses."""
@@ -179,29 +178,38 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
     # A gap in the poses is no jump. The speed over the gap is one that a robot can reach.
     jumps = (speed > max(_JUMP, _TIMES * fast[0])) & (way > _JUMP_WAY)
     jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1])) & (angle > _JUMP_ANGLE)
-    jumps |= _pulses(path, moving)
+    odd = _oddness(path)
+    jumps |= _pulses(path, odd, moving)
     if jumps.any():
         first = int(np.argmax(jumps))
         yield Finding(
             f"{name} jumps",
-            f"the {name} jumps {jumps.sum()} time{'' if jumps.sum() == 1 else 's'} (first by {way[first]:.2f} m and "
+            f"the {name} jumps {jumps.sum()} time{'' if jumps.sum() == 1 else 's'} (first by {odd[first]:.2f} m and "
             f"{np.degrees(angle[first]):.0f} deg at stamp {path.stamps[first + 1]:.3f}): "
             "poses before and after a jump do not belong together"
             + ("; map both parts of the log (--end, --begin)" if name == "odometry" and jumps.sum() == 1 else ""),
-            spoils=name == "odometry" or log_is_split(way, jumps),
+            spoils=name == "odometry" or log_is_split(odd, jumps),
         )
 
 
-def _pulses(path: Trajectory, moving: Bools) -> Bools:
+def _oddness(path: Trajectory) -> Floats:
+    """Return by how much (N-1,), m, the steps of a path differ from the steps beside them, which is the size of a jump.
+
+    A step is as odd as it is with the times as given, or, if this is less, with times that are not shorter than usual
+    (`usual_seconds`).
+    """
+    seconds, way = np.diff(path.stamps), np.diff(path.poses[:, :3, 3], axis=0)
+    return np.asarray(np.min([_beside(way / t[:, None]) * t for t in (seconds, usual_seconds(seconds))], axis=0))
+
+
+def _pulses(path: Trajectory, odd: Floats, moving: Bools) -> Bools:
     """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
 
-    moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose until the next one is known.
+    odd: (N-1,) as from `_oddness`. moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose
+    until the next one is known.
     """
     seconds = np.diff(path.stamps)
-    velocity = np.diff(path.poses[:, :3, 3], axis=0) / seconds[:, None]
-    beside = _beside(velocity)
-    steady = seconds <= 2 * np.median(seconds)  # In a gap of the poses, a robot can do anything.
-    off = np.where(steady, beside * seconds, 0.0)
+    off = np.where(seconds <= 2 * np.median(seconds), odd, 0.0)  # In a gap of the poses, a robot can do anything.
     least = np.maximum(_JUMP_WAY + _ACCELERATION * seconds**2, _TIMES_ODD * np.quantile(off[moving], 0.9))
     return np.asarray(off > least)
 
@@ -218,7 +226,8 @@ def _beside(steps: Floats) -> Floats:
 def log_is_split(way: Floats, jumps: Bools) -> bool:
     """Return whether a localisation jumps by more than 1 m, as if it changed to another map. A shorter jump is a correction.
 
-    way: (N-1,) m, the steps of the path. jumps: (N-1,) which steps are jumps.
+    way: (N-1,) m, by how much the steps are too long: a fast robot drives farther than 1 m without a jump. jumps: (N-1,)
+    which steps are jumps.
     """
     return bool(jumps.any() and way[jumps].max() > 1.0)
 
@@ -231,7 +240,7 @@ def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
     frozen, begin = 0.0, None
     for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         start, end = float(path.stamps[first]), float(path.stamps[last])
-        if end - start >= _FROZEN_SECONDS and _boxes_move(log, start, end):
+        if end - start >= _FROZEN_SECONDS and boxes_move(log, start, end):
             begin = start if begin is None else begin
             frozen += end - start
     if begin is not None:
@@ -241,24 +250,6 @@ def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
             f"the {name} stands still for {frozen:.0f} of {whole:.0f} s while the boxes move (from stamp {begin:.3f}): "
             "the poses are probably frozen",
         )
-
-
-def _boxes_move(log: Log, start: float, end: float) -> bool:
-    """Return whether the boxes of most labels move through the image between two stamps."""
-    moving, still = 0, 0
-    for one in log.cameras:
-        found = one.detections
-        if found is None or one.mount is not None:  # An arm moves a camera while the base stands still.
-            continue
-        inside = (found.stamps >= start + 1) & (found.stamps <= end - 1)
-        centre = (found.boxes[inside, :2] + found.boxes[inside, 2:]) / 2
-        label = found.label[inside]
-        for name in np.unique(label):
-            mine = centre[label == name]
-            if len(mine) >= 5:
-                spread = float(np.median(np.abs(mine - np.median(mine, axis=0)).max(axis=1)))
-                moving, still = moving + (spread > _MOVING_PX), still + (spread <= _MOVING_PX / 2)
-    return moving > 2 * still and moving > 0
 
 
 def steps(poses: Floats) -> tuple[Floats, Floats]:

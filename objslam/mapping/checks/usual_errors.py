@@ -36,13 +36,15 @@ def without_usual_errors(
     settings: Settings,
     prior: Callable[[SharedErrors], Floats] = lambda errors: errors.prior,
     goes_on: Callable[[Calibration], bool] = lambda found: True,
+    known: Calibration | None = None,
 ) -> tuple[Agreement, Calibration | None]:
     """Fit points and estimate the errors in turns. Return the agreement with the best score, and the last errors.
 
     start: the agreement of the part as it is. prior: returns the covariance (P, P) of the errors before the estimate.
-    goes_on: whether the errors of a round are worth another round. The errors are None if no round could estimate them.
+    goes_on: whether the errors of a round are worth another round. known: errors from which the first round starts, so that
+    `start` is the agreement without them. The returned errors are None if there are none, and no round could estimate them.
     """
-    best, now, known = start, start, None
+    best, now = start, start
     for _ in range(_ROUNDS):
         errors = shared(part.log, now.keyframes, now.rays, settings, _PRIORS)
         total = np.zeros(len(errors.names)) if known is None else known.values

@@ -3,18 +3,24 @@
 All other errors of a camera are the same in both halves: its clock, its place, its lens, and the rotation that it had at
 first. They are estimated together with the turn. Otherwise they look like a turn: a late clock moves all rays to one side
 while the robot turns left, and to the other side while it turns right.
+
+The errors of poses last for seconds, and many boxes share them. The covariance of an estimate takes each box as new, so it
+is too small at the poses of a particle filter. So the estimate is repeated without each eighth of the boxes. How much it
+changes tells its real error (jackknife with blocks, Kuensch 1989). A turn must be far larger than this error.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import Calibration, kind
 from objslam.core.types import CameraLog
+from objslam.frontend.corrected_log import take_out
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.agreement import Part, agreement, take_frames
 from objslam.mapping.checks.finding import Finding
@@ -31,12 +37,15 @@ MOVED = 0.05
 """If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
 less often."""
 SIGMAS = 5.0
-"""The least difference of a camera's rotation between the halves, in standard deviations. A larger number warns less
-often."""
+"""The least difference of a camera's rotation between the halves, in standard deviations, both of the estimate and of the
+jackknife. A larger number warns less often."""
 _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
 """The least difference for which another round of the estimation follows: as a multiple of `MOVED`, and in standard
 deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer
 turns."""
+_BLOCKS = 8
+"""The number of pieces of time, with equally many boxes, that are left out one at a time. They must be longer than errors of
+poses last. More pieces are shorter, and take longer."""
 _MOVED_BY_ODOMETRY, _GAIN_BY_ODOMETRY = 0.1, 0.03
 """For poses by odometry, `_MOVED_BY_ODOMETRY` (rad) replaces `MOVED`, and a turn must also let the score
 (`Agreement.score`) grow by `_GAIN_BY_ODOMETRY`. The reason is drift: it looks like a rotation of the camera, and the
@@ -64,7 +73,9 @@ def check_moved_camera(part: Part, middle: float, settings: Settings) -> list[Fi
     same, _ = without_usual_errors(halves, start, settings, partial(one_rotation_each, turn=0.0))
     if apart.score <= same.score + gain:
         return []
-    return finding_of_turns(moved)
+    assert turned is not None  # Without an estimate, there is no turn.
+    spread = _spreads(halves, turned, settings)
+    return finding_of_turns({name: turn for name, turn in moved.items() if abs(turn) > SIGMAS * spread[name]})
 
 
 def finding_of_turns(moved: Mapping[str, float]) -> list[Finding]:
@@ -92,6 +103,38 @@ def in_halves(cameras: Sequence[CameraLog]) -> tuple[CameraLog, ...]:
 def first_half(name: str) -> str:
     """Return the name of a shared error without the mark of the second half."""
     return name.replace(_LATER, "")
+
+
+def _spreads(halves: Part, turned: Calibration, settings: Settings) -> dict[str, float]:
+    """Return the standard deviation (rad) of each turn between the halves, by the jackknife.
+
+    turned: the errors of the whole log. Each estimate without a block starts from them, because fewer rays fit without them.
+    A block without which nothing can be estimated changes nothing.
+    """
+    stamps = [np.zeros(0) if one.detections is None else one.detections.frame_stamps for one in halves.log.cameras]
+    every = np.sort(np.concatenate([one.detections.stamps for one in halves.log.cameras if one.detections is not None]))
+    edges = np.append(every[np.arange(_BLOCKS) * len(every) // _BLOCKS], np.inf)
+    values = dict(zip(turned.names, turned.values.tolist(), strict=True))
+    changes = []
+    for begin, end in pairwise(edges.tolist()):
+        part = _take(halves, [(one < begin) | (one >= end) for one in stamps])
+        start = agreement(part, take_out(part.log, values, stay=True), settings)
+        if start is not None:
+            _, found = without_usual_errors(part, start, settings, one_rotation_each, known=turned)
+            changes.append(_changes(turned if found is None else found))
+    off = {name: np.array([one.get(name, change) for one in changes]) for name, change in _changes(turned).items()}
+    share = (_BLOCKS - 1) / _BLOCKS
+    return {name: float(np.sqrt(share * len(one) * np.var(one))) if len(one) else np.inf for name, one in off.items()}
+
+
+def _take(part: Part, kept: Sequence[Bools]) -> Part:
+    """Return the part with some of the frames of each camera. kept: (F,) for each camera."""
+    cameras = [
+        one if one.detections is None else replace(one, detections=take_frames(one, mine))
+        for one, mine in zip(part.log.cameras, kept, strict=True)
+    ]
+    windows = [window[mine] if len(mine) else window for window, mine in zip(part.window, kept, strict=True)]
+    return replace(part, log=replace(part.log, cameras=tuple(cameras)), window=tuple(windows))
 
 
 def _halves(part: Part, middle: float) -> Part:
@@ -132,13 +175,19 @@ def _pairs(names: tuple[str, ...]) -> list[tuple[int, int]]:
     return [(i, names.index(later)) for i, later in pairs if later in names]
 
 
+def _changes(found: Calibration) -> dict[str, float]:
+    """Return by how much (rad) each rotation of a camera changes between the halves, by the name of the first half."""
+    pairs = [(i, j) for i, j in _pairs(found.names) if kind(found.names[i]) in _AXES]
+    return {found.names[i]: float(found.values[j] - found.values[i]) for i, j in pairs}
+
+
 def turns(found: Calibration, least: float, sigmas: float) -> dict[str, float]:
     """Return the turns (rad) between the halves that are larger than `least`, and larger than a number of standard
     deviations."""
-    turns = {}
+    turns, changes = {}, _changes(found)
     for i, j in _pairs(found.names):
-        change, of = float(found.values[j] - found.values[i]), found.covariance
+        change, of = changes.get(found.names[i], 0.0), found.covariance
         sigma = float(np.sqrt(max(of[i, i] + of[j, j] - 2 * of[i, j], 0.0)))
-        if kind(found.names[i]) in _AXES and abs(change) > max(least, sigmas * sigma):
+        if abs(change) > max(least, sigmas * sigma):
             turns[found.names[i]] = change
     return turns
