@@ -554,6 +554,20 @@ def test_clocks_that_contradict_each_other_explain_nothing():
     assert found(0.44, 0.3, 0.3).message.endswith("the camera ahead")
 
 
+@pytest.mark.parametrize(
+    ("before", "by_chance", "best", "named"),
+    [(0.26, 0.48, 0.6, False), (0.29, 0.42, 0.58, False), (0.44, 0.66, 0.9, True), (0.1, 0.16, 0.5, True)],
+)
+def test_what_fits_hardly_better_than_chance_explains_nothing(before, by_chance, best, named):
+    """Poses that err for seconds spoil what really fits. The first two are simulated robots with a particle filter."""
+    part = bounded_part(drive("fixed"), load_settings(None, ("mode=fixed",)))
+    mount = Hypothesis("mount turned", "the camera turned", "the camera is turned", lambda log: log, of_mount=True)
+    others = [Trial(mount, score, score + 0.2, 1.0) for score in np.linspace(by_chance, 0.0, 20)[1:].tolist()]
+    trials = [Trial(None, before, before, 1.0), Trial(mount, best, best + 0.2, 1.0)]
+    trials += [Trial(mount, by_chance, by_chance + 0.2, 1.0)] * 2 + others
+    assert (verdict(trials, part, 0.0) is not None) == named
+
+
 @pytest.mark.parametrize("seed", [1, 3, 5])
 def test_poses_of_another_drive_are_named(seed):
     (found,) = findings(replace(drive("fixed"), localization=drive("fixed", seed).localization), "fixed")

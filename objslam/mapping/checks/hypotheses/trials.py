@@ -47,6 +47,12 @@ score. A smaller share names fewer clocks."""
 _CHANCE = 90.0
 """The percentage of all turned mounts that have at most the score of chance. With a larger percentage, more agreement counts
 as chance."""
+_LEFT, _TIMES_CHANCE = 0.62, 1.5
+"""At poses of a localisation, a hypothesis must leave at most the share `_LEFT` of the misfit (1 - score) that turned mounts
+leave by chance, or have at least `_TIMES_CHANCE` times their score. Noisy poses spoil what really fits, but hardly what fits
+by chance, so a wrong hypothesis may fit better than the unchanged log. In 80 logs of 16 simulated robots with a mistake, the
+right hypothesis leaves at most 0.57. In noisy logs without a mistake, the best hypothesis leaves at least 0.68, and has at
+most 1.36 times the score. A larger share and a smaller multiple name more causes."""
 _BEYOND, _FAR_BETTER = 1.3, 1.5
 """A mount is clear if its score is at least `_BEYOND` times the score by chance, and at least `_FAR_BETTER` times the score
 of the unchanged log. Logs of five kinds of simulated robots and of three real robots were tried, with odometry alone and a
@@ -106,11 +112,14 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     because the run corrects the error.
     """
     first, rest = trials[0], trials[1:]
+    by_chance = None if part.drifts else chance(rest)
+    least_score = -np.inf if by_chance is None else min(1 - _LEFT * (1 - by_chance), _TIMES_CHANCE * by_chance)
 
     def holds(trial: Trial, before: float) -> bool:
         times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
         more = trial.score > max(times * before, before + least)
         more &= (trial.score - before) * part.boxes > _MORE_BOXES and (part.drifts or trial.share >= _HALF)
+        more &= trial.score >= least_score
         # Better boxes are no reason to make a straight path crooked.
         return bool(more and not (_is_straight(first) and trial.straight is not None and trial.straight < _CROOKED))
 
