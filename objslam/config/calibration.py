@@ -39,7 +39,8 @@ class CalibrationSettings(Section):
     """rad; the rotation of each camera on the base about the forward axis."""
     translation: Literal["auto"] | NotNegative = "auto"
     """m; the offset of each camera's place on the base, along each axis. auto: 0.05 in fixed mode and with a localisation,
-    0.02 in joint mode with odometry beside it, and 0 in joint mode with odometry alone."""
+    0.02 in joint mode with odometry beside it, and 0 in joint mode with odometry alone, unless its map shows a gross
+    error."""
     range_scale: NotNegative = 0.02
     """share by which all ranges are too long or too short. Data sheets of depth cameras promise 2 % of the distance, and six
     recorded runs of two kinds of sensors err by 1.2 to 2.3 %."""
@@ -54,7 +55,7 @@ class CalibrationSettings(Section):
     and the detector of the corners each add to it. It is estimated in joint mode only."""
     focal: Literal["auto"] | NotNegative = "auto"
     """share by which the focal length of each camera is too long or too short. auto: 0.02 in fixed mode and with a
-    localisation, 0 in joint mode with odometry alone."""
+    localisation, 0 in joint mode with odometry alone, unless its map shows a gross error."""
     centre: NotNegative = 0.02
     """share of the focal length by which the image centre of each camera is off, along each axis. The
     default is usual for a centre that is assumed in the middle of the image. A calibrated centre errs by less."""
