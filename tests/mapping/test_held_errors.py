@@ -12,6 +12,7 @@ from quick import NOTHING_DRAWN
 from test_moved_camera import turned
 
 from objslam.config import Odometry, load_settings
+from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Log, Trajectory
@@ -19,10 +20,12 @@ from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors
+from objslam.io.calibration_yaml import dump_calibration
 from objslam.mapping import pipeline
 from objslam.mapping.alternation import solve
 from objslam.mapping.joint.held_errors import Solved, with_gross_errors
 from objslam.mapping.solution import seen_something
+from objslam.output.viewer.recording import write_recording
 from objslam.simulation import preset, simulate
 
 SETTINGS = (*NOTHING_DRAWN, "mode=joint", "bodies.use=false")
@@ -78,6 +81,30 @@ def test_a_setting_of_the_user_is_kept():
     other = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"translation": "auto"})})
     wider = with_gross_errors(replace(errors, settings=other), solved)
     assert set(wider.names) - set(errors.names) == {"front.x", "front.y", "front.z"}
+
+
+def test_errors_of_a_calibration_file_are_neither_gross_nor_a_turn(tmp_path):
+    """The log is corrected by them before the solve, so the map must not show them a second time."""
+    true = {"front.clock": 0.15, "front.yaw": 0.03, "front.x": 0.06, "front.y": -0.05, "front.focal": 0.03}
+    sigma = np.array([0.005, 0.003, 0.008, 0.008, 0.003])
+    known = Calibration(tuple(true), np.array(list(true.values())), np.diag(sigma**2), 5 * sigma)
+    (tmp_path / "robot.yaml").write_text(dump_calibration(known))
+    log = add_shared_errors(drive(0), true)
+    result, _ = run(log, f"calibration.file={tmp_path}/robot.yaml")
+    assert {"front.x", "front.y", "front.focal"}.isdisjoint(result.calibration.names)
+    assert not any(one["name"] == "camera moved" for one in result.summary["wrong_input"])
+    matches = evaluate(result.map, log.truth, align="se2", radius=1.0).objects.matches
+    assert max(match.squared_3d for match in matches) < 7.8
+
+
+def test_the_recording_has_the_errors_of_both_solves(tmp_path):
+    """The first solve holds the place of the camera, so it has fewer errors than the last one."""
+    log = add_shared_errors(drive(3), {"front.y": -0.2})
+    result = pipeline.run(log, load_settings(None, ("mode=joint", "bodies.use=false")), Ledger())
+    steps = [step.parameters.names for one in result.trace for step in one.iterations if step.parameters is not None]
+    assert len(set(map(len, steps))) == 2
+    write_recording(result, tmp_path / "recording.rrd", log.truth)
+    assert (tmp_path / "recording.rrd").stat().st_size > 1000
 
 
 @pytest.mark.parametrize(("axis", "name"), [(0, "roll"), (1, "tilt"), (2, "yaw")])

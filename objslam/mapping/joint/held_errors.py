@@ -15,7 +15,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.types import Association, Keyframes
 from objslam.errors import SolveError
-from objslam.frontend.known_errors import USUAL_FOCAL, USUAL_PLACE, shared_errors
+from objslam.frontend.known_errors import USUAL_FOCAL, USUAL_PLACE, known_errors, shared_errors
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.parts.moved_camera import (
@@ -55,10 +55,13 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
     """Return the shared errors with held errors that are gross, to be estimated too, None if no held error is gross.
 
     errors: those of the solve, as measured. The settings of the returned errors have the prior of the new errors. A setting
-    that is not `auto` is kept.
+    that is not `auto` is kept, and so is an error of calibration.file, which the log is corrected by.
     """
     settings, of = errors.settings, errors.settings.calibration
-    held = [name for name in _USUAL if getattr(of, name) == "auto" and not _estimated(errors, name)]
+    file = known_errors(settings)
+    told = set(errors.names) if file is None else {*errors.names, *file.names}
+    known = {_SETTING.get(kind(name)) for name in told}
+    held = [name for name in _USUAL if getattr(of, name) == "auto" and name not in known]
     if not held or not _can_tell(errors):
         return None
 
@@ -73,10 +76,12 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
         kinds = {_SETTING.get(kind(name), "") for name, one in zip(found.names, far.tolist(), strict=True) if one}
         return [name for name in held if name in kinds]
 
-    suspected = gross(_predicted(freed(held), solved), _SUSPECT * _GROSS, 0.0)
-    if not suspected:
+    wider = freed(held)
+    if wider.names == errors.names:  # The poses are those of the camera, which has no errors of its own.
         return None
-    there = gross(_solved(freed(held), solved), _GROSS, SIGMAS)
+    if not gross(_predicted(wider, solved), _SUSPECT * _GROSS, 0.0):
+        return None
+    there = gross(_solved(wider, solved), _GROSS, SIGMAS)
     return freed(there) if there else None
 
 
@@ -104,11 +109,9 @@ def _halves(errors: SharedErrors, late: Bools) -> SharedErrors:
     log = replace(errors.log, cameras=in_halves(errors.log.cameras))
     found = shared_errors(log, keyframes, errors.rays, errors.settings)
     assert found is not None  # It has at least the errors that the solution has.
-    return replace(found, prior=one_rotation_each(found), noise=errors.noise)
-
-
-def _estimated(errors: SharedErrors, setting: str) -> bool:
-    return any(_SETTING.get(kind(name)) == setting for name in errors.names)
+    means = dict(zip(errors.names, errors.mean.tolist(), strict=True))  # A calibration file knows no second half.
+    mean = np.array([means[first_half(name)] for name in found.names])
+    return replace(found, mean=mean, prior=one_rotation_each(found), noise=errors.noise)
 
 
 def _can_tell(errors: SharedErrors) -> bool:

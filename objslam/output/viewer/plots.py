@@ -80,11 +80,13 @@ def log_parameters(recording: Any, result: RunResult) -> None:
         at += len(one.iterations)
     found = result.calibration
     rows.append((max(at - 1, 0), Parameters(found.names, found.values, found.sigma)))
-    numbers = np.array([number for number, _ in rows])
-    begun = np.append(max(numbers[0] - 1, 0), numbers)
     for i, name in enumerate(found.names):
-        values = np.array([row.values[i] / prior[name] for _, row in rows])
-        sigma = np.array([1.0, *(row.sigma[i] / prior[name] for _, row in rows)])
+        # A solve may have had fewer errors than the last one, which estimates an error that was held before.
+        steps = [(number, row, row.names.index(name)) for number, row in rows if name in row.names]
+        numbers = np.array([number for number, _, _ in steps])
+        begun = np.append(max(numbers[0] - 1, 0), numbers)
+        values = np.array([row.values[k] / prior[name] for _, row, k in steps])
+        sigma = np.array([1.0, *(row.sigma[k] / prior[name] for _, row, k in steps)])
         colour = _MANY[i % len(_MANY)]
         part = rr.escape_entity_path_part(name)
         _send(recording, f"plots/calibration/{part}", iteration_column(numbers), values, colour, name)
