@@ -58,7 +58,7 @@ def test_what_is_unlike_adds_to_smaller_shared_errors(share):
     sides = sides_of(edges, np.array([[0, 0, 0.25]]))
     shares, ones = np.full(2, share), np.ones(2)
     start = np.array([[0, 0, 0.25, np.log(0.06) / 2, np.log(1.5) / 2, 0.4, np.log(0.25)]])
-    found = fit(edges, start, Prior(start, np.eye(7)[None]), weights_of(edges, sides, ones, shares), CUBOID)
+    found = fit(edges, start, Prior(start, np.eye(7)[None]), weights_of(edges, sides.number, ones, shares), CUBOID)
     told, unlike = covariance_with_unlike(edges, found, sides, ones, shares)
     larger = covariance_of(edges, found, sides, ones, np.maximum(shares, UNLIKE))
     np.testing.assert_allclose(told + unlike, larger, rtol=1e-9, atol=1e-15)

@@ -42,10 +42,17 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of boxes. factors, share: as in `Bodies`."""
+    """The noise of B boxes. factors, share: as in `Bodies`. number: (B, 4) as in `Sides`. side: (B,) px as in
+    `log_evidence`."""
 
     factors: Floats
     share: Floats
+    number: Floats
+    side: Floats
+
+    def take(self, boxes: Ints) -> Noise:
+        """Select boxes."""
+        return replace(self, number=self.number[boxes], side=self.side[boxes])
 
 
 def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
@@ -72,32 +79,46 @@ def hidden_edges(
     for number in np.unique(shape).tolist():
         mine = np.flatnonzero(shape == number)
         at = np.flatnonzero(np.isin(edges.body, mine))
-        own, noise = _of_bodies(edges, at, mine), Noise(factors, share)
+        own = _of_bodies(edges, at, mine)
+        few = np.flatnonzero(chosen[at])
         loose = Prior(prior.mean[mine], prior.information[mine])
         if KINDS[number] is CUBOID:
             loose = cuboid_prior(loose, start[mine])
-        one = _of_kind(own, np.flatnonzero(chosen[at]), start[mine], KINDS[number], loose, side[at], noise)
+        # The bodies move little in the fits, so the sides of their boxes stay the same.
+        noise = Noise(factors, share, sides_of(own.take(few), start[mine, :3]).number, side[at[few]])
+        one = _of_kind(own, few, start[mine], KINDS[number], loose, noise)
         found.edges[at], found.between[mine] = one.edges, one.between
     return found
 
 
-def _of_kind(edges: BoxEdges, some: Ints, start: Floats, kind: Kind, prior: Prior, side: Floats, noise: Noise) -> Hidden:
-    """Return the hidden edges of bodies of one kind (see `hidden_edges`)."""
+def _of_kind(edges: BoxEdges, some: Ints, start: Floats, kind: Kind, prior: Prior, noise: Noise) -> Hidden:
+    """Return the hidden edges of bodies of one kind (see `hidden_edges`). noise: of the boxes `some`."""
     found = Hidden(np.zeros((len(edges), 4), dtype=bool), np.zeros((len(start), 6, 6)))
-    few, near = edges.take(some), side[some]
-    bent, before = _fitted(few, start, kind, prior, near, noise)
-    outer, _ = _fitted(replace(few, bound=np.where(few.bound, 1.0, 1 - _OUTER)), bent, kind, prior, near, noise)
+    few = edges.take(some)
+    bent, before = _fitted(few, start, kind, prior, noise)
+    outer, _ = _fitted(replace(few, bound=np.where(few.bound, 1.0, 1 - _OUTER)), bent, kind, prior, noise)
     mine = np.unique(few.body[_inside(few, outer, kind, noise).any(axis=1)])
     if not len(mine):
         return found
-    at = np.flatnonzero(np.isin(few.body, mine))
-    few, near = _of_bodies(few, at, mine), near[at]
-    prior, now, most = Prior(prior.mean[mine], prior.information[mine]), outer[mine], np.full(len(mine), -np.inf)
-    best = now
+    best, most = outer[mine], np.full(len(mine), -np.inf)
+    hidden = np.zeros((len(few), 4), dtype=bool)
+    now, moving = outer.copy(), mine
     for _ in range(_TURNS):
-        now, evidence = _fitted(with_hidden(few, _inside(few, now, kind, noise)), now, kind, prior, near, noise)
-        best = np.where((evidence > most)[:, None], now, best)
-        most = np.maximum(evidence, most)
+        at = np.flatnonzero(np.isin(few.body, moving))
+        own = _of_bodies(few, at, moving)
+        inside = _inside(own, now[moving], kind, noise)
+        # A body whose hidden edges stay as they are would be fitted to the same edges again.
+        changed = np.unique(own.body[(inside != hidden[at]).any(axis=1)])
+        if not len(changed):
+            break
+        hidden[at], moving = inside, moving[changed]
+        at = np.flatnonzero(np.isin(few.body, moving))
+        own = with_hidden(_of_bodies(few, at, moving), hidden[at])
+        its_prior = Prior(prior.mean[moving], prior.information[moving])
+        now[moving], evidence = _fitted(own, now[moving], kind, its_prior, noise.take(at))
+        row = np.searchsorted(mine, moving)
+        best[row] = np.where((evidence > most[row])[:, None], now[moving], best[row])
+        most[row] = np.maximum(evidence, most[row])
     chance = 1 / (1 + np.exp(-np.clip(most - before[mine], -50, 50)))
     off = _axes(best, kind) - _axes(bent[mine], kind)
     found.between[mine] = np.minimum(chance, 1 - chance)[:, None, None] * off[:, :, None] * off[:, None, :]
@@ -112,12 +133,11 @@ def _of_bodies(edges: BoxEdges, boxes: Ints, bodies: Ints) -> BoxEdges:
     return replace(own, body=np.searchsorted(bodies, own.body))
 
 
-def _fitted(edges: BoxEdges, start: Floats, kind: Kind, prior: Prior, side: Floats, noise: Noise) -> tuple[Floats, Floats]:
+def _fitted(edges: BoxEdges, start: Floats, kind: Kind, prior: Prior, noise: Noise) -> tuple[Floats, Floats]:
     """Return the best bodies (N, 7) of one kind, and the logarithm of their evidence (N,)."""
-    sides = sides_of(edges, start[:, :3])
-    weights = weights_of(edges, sides, noise.factors, noise.share)
+    weights = weights_of(edges, noise.number, noise.factors, noise.share)
     found = fit(edges, start, prior, weights, kind, still=ENOUGH, most=STEPS)
-    return found.values, log_evidence(edges, found, prior, weights, side)
+    return found.values, log_evidence(edges, found, prior, weights, noise.side)
 
 
 def _inside(edges: BoxEdges, values: Floats, kind: Kind, noise: Noise) -> Bools:

@@ -128,10 +128,13 @@ def spread_of(edges: BoxEdges, factors: Floats, share: Floats) -> Floats:
     return at_edges(edges, np.hypot(_white(edges, factors), _scale(edges, share)))
 
 
-def weights_of(edges: BoxEdges, sides: Sides, factors: Floats, share: Floats) -> Weights:
-    """Return how much the residuals count. The variances are such that the shared error of a side counts once."""
+def weights_of(edges: BoxEdges, number: Floats, factors: Floats, share: Floats) -> Weights:
+    """Return how much the residuals count. The variances are such that the shared error of a side counts once.
+
+    number: (B, 4) as in `Sides`.
+    """
     ranged = np.bincount(edges.body, np.isfinite(edges.range))  # All ranges of a body share their error.
-    number = np.column_stack([sides.number, ranged[edges.body]])
+    number = np.column_stack([number, ranged[edges.body]])
     own, shared = at_edges(edges, _white(edges, factors)), at_edges(edges, _scale(edges, share))
     return Weights(own**2 + number * shared**2, np.hypot(own, shared))
 

@@ -194,7 +194,7 @@ def _counted(edges: BoxEdges, now: _State) -> Floats | None:
 def _round(edges: BoxEdges, sides: Sides, now: _State, side: Floats, label: Ints, *, turn: bool) -> _State:
     """Return the state with the best body of each shape, and for each object the shape with the most evidence. turn: whether
     cuboids are also tried at other headings (`all_headings`)."""
-    weights, first = weights_of(edges, sides, now.factors, now.share), now.best is None
+    weights, first = weights_of(edges, sides.number, now.factors, now.share), now.best is None
     dots, dot_evidence = _dots(edges, now, weights, side)
     ball_prior = sphere_prior(now.prior)
     ball = fit(edges, now.fitted[_SPHERE], ball_prior, weights, ELLIPSOID, still=ENOUGH, most=STEPS)
@@ -250,7 +250,7 @@ def _refitted(edges: BoxEdges, others: BoxEdges, now: _State, found: Bodies) -> 
 
 def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bodies:
     """Return the bodies of the chosen shapes from all boxes. between: (N, 6, 6), see `Bodies.between_shapes`."""
-    weights = weights_of(edges, sides, now.factors, now.share)
+    weights = weights_of(edges, sides.number, now.factors, now.share)
     count, boxes = len(now.shape), len(edges)
     values, (covariance, unlike) = np.zeros((count, 7)), np.zeros((2, count, 7, 7))
     shift, weight = np.zeros((boxes, 2)), np.zeros(boxes)
