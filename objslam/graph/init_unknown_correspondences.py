@@ -274,7 +274,8 @@ class _Exploration:
         return truncated_cost(self.rays, self.owner, self.known.position, poses, *self.measured.odometry())
 
     def _renumber(self, into: Ints, positions: Floats, map_T_camera: Floats) -> None:
-        """Give the rays of each landmark to landmark into[j] (N,), -1 for none, in a graph that is made again.
+        """Make the graph again after landmarks were joined or dropped. The rays of landmark j go to landmark into[j] (N,),
+        or to none if it is -1.
 
         positions: (M, 3) m, of the new landmarks. map_T_camera: (K, 4, 4).
         """

@@ -1,5 +1,5 @@
-"""Slow work on a whole map of a running session, in rounds: a process beside the session works, then its answer corrects
-the map."""
+"""Slow work on the whole map of a running session. It is done in rounds: a process beside the session does the work, and
+then its answer corrects the map."""
 
 from __future__ import annotations
 

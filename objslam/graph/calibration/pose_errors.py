@@ -140,8 +140,9 @@ class ComparedPoses:
     def cost(self, model: PoseErrors) -> float:
         """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction.
 
-        Values are kept, because the searches come back to the same models. This takes a quarter less time. So are those of
-        places alone (`_Placed`), because a third of the models differ in headings only. This takes another third less.
+        Values are kept, because the searches come back to the same models. This takes a quarter less time. The values of
+        places alone (`_Placed`) are kept too, because a third of the models differ in headings only. This takes another
+        third less.
         """
         if model not in self._costs:
             self._costs[model] = self._cost(model)

@@ -28,8 +28,8 @@ _PARALLAX = np.sin(np.radians(5.0)) ** 2
 """The least squared sine of the angle between two axes that are crossed. Axes of cut off boxes point beside their thing, so
 narrower crossings tell no distance. With a larger value, fewer places are tried."""
 _NEAR, _FAR = 0.2, 3.0
-"""The least distance of a place, m, and its greatest distance as a multiple of the greatest distance of an object from the
-path. Larger values suit larger places."""
+"""The least distance of a place from a camera, m, and its greatest distance, as a multiple of the greatest distance at which
+an object was seen. Larger values suit larger places."""
 _MOST = 5
 """The most things of one label. Nobody reads a list of more."""
 _SAMPLE = 2000

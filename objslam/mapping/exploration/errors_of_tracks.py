@@ -27,7 +27,7 @@ _MOST = 3000
 and would take longer."""
 _BLOCK = 50
 """If more rays are left, this number of consecutive keyframes is solved at a time, and the next ones are left out. A track
-ends where its block ends. With a larger number, fewer tracks are cut, and fewer parts of the drive are heard."""
+ends where its block ends. With a larger number, fewer tracks are cut, and fewer parts of the drive count."""
 
 
 def with_errors_of_tracks(state: JointState) -> tuple[JointState, Floats]:

@@ -48,7 +48,8 @@ def has_lasting_errors(state: JointState) -> bool:
 
 
 def begins_with_lasting_errors(state: JointState) -> bool:
-    """Return whether the odometry alone says so, before any ray has an object. False objects hide errors from a solve."""
+    """Return whether the odometry alone says that the localisation errs for seconds, before any ray has an object. False
+    objects hide such errors from a solve."""
     return has_lasting_errors(state) and state.errors is not None and max(lasting_long(state.errors.noise)) >= _LARGE
 
 

@@ -49,7 +49,7 @@ class Noise:
 
 
 def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
-    """Return edges with those that are hidden (B, 4) as bounds."""
+    """Return the edges, of which those in the mask `hidden` (B, 4) are bounds too."""
     return replace(edges, bound=edges.bound | hidden)
 
 
