@@ -27,8 +27,8 @@ _SIZES = (0.0, -1.0, 1.0, -2.0, 2.0)
 between them is at most half a standard deviation from the nearest one, and the wide gates of the first round allow for this.
 More sizes take longer."""
 _WIDE = 0.5
-"""The share of the standard deviations of tilt and size by which the gates of the first round are wider. 0.5 is half the
-step of `_SIZES`. A larger value lets more wrong partners in."""
+"""The gates of the first round are wider by this share of the standard deviations of tilt and size. 0.5 is half the step of
+`_SIZES`. A larger value lets more wrong partners in."""
 _ROUNDS = 4
 """The number of rounds of matching and fitting. A larger number takes longer."""
 _TIGHT = 1e-6

@@ -76,9 +76,9 @@ class ComparedPoses:
 
     off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction by its
     noise. shared: (3 n, 3 n) the same by the shared errors, which are as large as their priors with any noise. times: (n,)
-    s. apart: s, the time between two poses that were measured independently, 0 if all were. nominal: of headings, rad, and
-    places, m. free: whether the size of the noise is unknown. prior: the weight of the noise of the prediction, as a number
-    of residuals.
+    s. apart: s, the time between two poses that were measured independently, 0 if all poses were. nominal: of headings, rad,
+    and places, m. free: whether the size of the noise is unknown. prior: the weight of the noise of the prediction, as a
+    number of residuals.
     """
 
     off: Floats
@@ -189,7 +189,7 @@ class _Placed:
 
 
 def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
-    """Return the poses (m,) that agree with what all other poses predict, or all of them if too many do not."""
+    """Return the poses (m,) that agree with what all other poses predict, or all poses if too many disagree."""
     inner = np.linalg.inv(data.expected(model))
     n = len(data.times)
     at = np.arange(n)[:, None] + n * np.arange(3)

@@ -14,8 +14,9 @@ from objslam.core.calibration import Calibration
 
 _CHANCE = 2.0
 """Up to this many standard deviations, the distance from a prior is chance. A larger number widens fewer priors. Beyond it,
-the widening is near that of a Student prior with 4 degrees of freedom: for a sum that is 3 and 4.5 standard deviations from
-0 for its two parts, the standard deviation of the shares grows by a factor of 1.8, and by 2 with the Student prior."""
+the widening is near that of a Student prior with 4 degrees of freedom. An example is a sum of two errors that is 3 prior
+standard deviations of the first error and 4.5 of the second. The standard deviation of each error grows by a factor of 1.5,
+and by 1.9 with the Student prior."""
 _TOLD = 0.9
 """A direction is determined by the log if its variance is at most this share of its prior variance. With a larger share,
 directions count that the log hardly tells."""

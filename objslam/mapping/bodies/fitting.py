@@ -34,9 +34,9 @@ _HIDDEN = 0.1
 """If something hides a part of more than this share of an object's boxes, the position is the centre of the body. The rays
 of these boxes miss the object, all to one side. With a larger share, more objects stay where their rays meet."""
 _UNLIKE = 0.02
-"""The least error of a centre that repeats from all sides, as a share of half the size, because no thing has exactly the
-shape of its body. The centres of simulated pots, cones, seats, monitors and people were off by 1 to 4 % of half the height
-(tools/bench_shapes.py). A larger share makes all centres less sure."""
+"""No thing has exactly the shape of its body, so its centre has an error that repeats from all sides. This is the least size
+of this error, as a share of half the size of the body. The centres of simulated pots, cones, seats, monitors and people were
+off by 1 to 4 % of half the height (tools/bench_shapes.py). A larger share makes all centres less sure."""
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:

@@ -68,7 +68,7 @@ def find_pairs(evidence: Evidence) -> Pairs:
     Two explanations are compared. If they are one object, the covariance of their offset is the sum of their covariances,
     and hardly any frame shows both (`TOGETHER`). If they are two objects, the second lies anywhere among the objects of its
     label, and each frame with both in view shows both. Objects that fill one space are candidates too, because two things
-    cannot do so.
+    cannot fill one space.
     """
     state, covariance = evidence.state, evidence.covariance
     position = state.landmarks.position

@@ -29,9 +29,9 @@ _NARROWER = (0.3, 0.0)
 """If a log fits poorly, narrower first associations are tried. Each of these shares gives one, which allows for this share
 of the uncertainty of the shared errors. Each further share takes the time of one association."""
 _FITS = 2.0
-"""The mean squared miss of a ray, in variances of its noise, up to which the widest association is taken without trying
-others. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take the time
-for others, and rows of equal things are confused more often."""
+"""If the mean squared miss of a ray, in variances of its noise, is at most this, the widest association is taken, and no
+other is tried. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take
+the time for others, and rows of equal things are confused more often."""
 _CLEARLY = 1.75
 """A narrower association is taken if it lowers the mean over all rays of -2 ln of their probability by at least this. In
 simulated orchards and shelves, the right association lowers it by 2.1 to 6.1. If the poses are noisy, one thing may look

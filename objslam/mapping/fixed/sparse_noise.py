@@ -2,8 +2,8 @@
 
 With the usual noise, the rays of such a log do not meet, and nothing is found whose residuals could show the noise. So the
 objects are searched with many noises. The noise with the most evidence counts: the odds of the objects over stray boxes, and
-how likely it is that they were detected and missed as they were. This is rough. So the noise is then taken from the
-residuals of the objects (`residual_noise`), from several starts.
+how likely their detections and misses are. This is rough. So the noise is then taken from the residuals of the objects
+(`residual_noise`), from several starts.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
     """Return the shared errors with held errors that are gross, to be estimated too, None if no held error is gross.
 
     errors: those of the solve, as measured. The settings of the returned errors have the prior of the new errors. A setting
-    that is not `auto` is kept, and so is an error of calibration.file, which the log is corrected by.
+    that is not `auto` is kept. An error of calibration.file is kept too, because the log is already corrected by it.
     """
     settings, of = errors.settings, errors.settings.calibration
     file = known_errors(settings)

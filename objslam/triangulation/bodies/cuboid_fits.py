@@ -38,7 +38,7 @@ class OtherCuboids:
 
     @property
     def axes(self) -> Floats:
-        """(M, N, 6) their centres and half axes, m."""
+        """(M, N, 6) the centres and half axes of the cuboids, m."""
         axes = [np.column_stack([one[:, :3], CUBOID.half_axes(one)]) for one in self.values]
         return np.stack(axes) if axes else np.zeros((*self.evidence.shape, 6))
 
