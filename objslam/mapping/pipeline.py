@@ -86,8 +86,9 @@ def _run(
     known: PriorMap | None,
     earlier: LastingNoise | None = None,
 ) -> tuple[RunResult, str, LastingNoise | None]:
-    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, else "", and their
-    errors that last, if these are a finding. earlier: such errors of an earlier map at the given poses."""
+    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, "" if they do not.
+    The third value is the lasting errors of the poses, None if they are too small for a finding. earlier: the lasting errors
+    that an earlier map at the given poses found."""
     given = log = chosen_poses(log, settings)
     unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)

@@ -28,8 +28,8 @@ slower."""
 _POINTS = 120
 """The most proposed points that are tried in pairs. A larger number is slower: all pairs of points are scored."""
 _RAYS = 300
-"""The most rays that score pairs of points, and that first compare the best pair with the two landmarks. All rays compare
-them only if the pair is then better. A larger number is slower."""
+"""The number of rays that score pairs of points. These rays also compare the best pair with the two landmarks. Only if the
+pair is better by them, all rays compare it too. A larger number is slower."""
 _LEAST_GAIN = 30.0
 """Two new points replace two landmarks if they lower -2 ln of the likelihood of the landmarks' rays by at least this. Rays
 share errors, so that a small decrease is chance. With a larger value, fewer ghosts are replaced."""

@@ -86,8 +86,8 @@ class UsualViews:
         return cls(state, _distances(state), _log_density(state), ln_size[:, side], size, view[side], mean, spread)
 
     def far_odds(self, distance: Floats, landmark: Ints) -> Floats:
-        """Return the log likelihood (G,), at most 0, that a bundle of rays comes from this far. It is relative to a usual
-        distance, and the boxes of the other landmarks of the class tell it.
+        """Return the log likelihood (G,) of the distances of bundles of rays, relative to a usual distance, at most 0. The
+        boxes of the other landmarks of the class show which distances are usual.
 
         distance: (G,) m. landmark: (G,) the landmark of each bundle. Its own boxes do not count.
         """

@@ -20,8 +20,8 @@ _BESIDE = 40
 """The largest number of shifts that are tried, beginning with the smallest shift. A shift moves one object onto another
 partner. A larger number looks farther around, and takes longer."""
 _MOST = 20_000
-"""The largest number of tried shifts times the number of objects in map a. So few shifts are tried in large maps, because
-there it hardly ever happens that all rows of objects match their neighbours. A larger number takes longer."""
+"""The number of tried shifts times the number of objects in map a is at most this large. So few shifts are tried in large
+maps. There it hardly ever happens that all rows of objects match their neighbours. A larger number takes longer."""
 _SIZES = (0.0, -1.0, 1.0, -2.0, 2.0)
 """The sizes at which a search starts, in standard deviations of the size of one map relative to the other. A true size
 between them is at most half a standard deviation from the nearest one, and the wide gates of the first round allow for this.

@@ -25,12 +25,12 @@ _LEAST = 1e-12
 
 
 def with_wider_priors(found: Calibration, mean: Floats, prior: Floats) -> Calibration:
-    """Return the calibration with a covariance that takes the priors for wider if the values are too far from them.
+    """Return the calibration with the covariance of wider priors if the values are too far from the priors.
 
     The values stay, and so does the information of the log itself. If the prior (P, P) and the covariance are right, the
     values minus the mean (P,) of their prior have the covariance `prior - covariance` (prior predictive check; Box 1980).
-    The check is done along each direction that the log determines. The part of a parameter in it tells how far its prior is
-    widened.
+    The check is done along each direction that the log determines. If it fails along a direction, the priors of the
+    parameters that have a part in this direction become wider. The larger its part, the wider a prior becomes.
     """
     if not len(mean):
         return found

@@ -204,8 +204,8 @@ def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Float
 
 
 def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
-    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the centre is the
-    position."""
+    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the object gets the centre
+    of the body as its position."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at] + found.unlike[at]
     covariance[:3, :3] += repeated_error(found.share[0], half) ** 2 * np.eye(3)

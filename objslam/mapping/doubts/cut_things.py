@@ -20,8 +20,9 @@ _FEWEST = 5
 """The fewest frames that show a thing. A cut off box has a wide cone, and few cones meet anywhere. A larger number names
 fewer things."""
 _SEEN = 0.5
-"""Of the frames that have the place in the image, at the distances of the boxes, at least this share must show the thing. A
-thing at rest is in most of them. The cones of a thing that moves meet anywhere. A larger share names fewer things."""
+"""A thing is named if at least this share of the frames that should show it have a box of it. Such a frame has the place of
+the thing in its image, and is about as far away as the frames with a box. A thing at rest is in most of them. The cones of a
+thing that moves meet anywhere. A larger share names fewer things."""
 _PAIRS = 1000
 """The number of pairs of boxes whose crossings are tried as the place of a thing. More pairs give a better place."""
 _PARALLAX = np.sin(np.radians(5.0)) ** 2

@@ -71,8 +71,8 @@ def along(state: JointState, path: Floats) -> JointState:
 
 
 def _excerpt(state: JointState) -> JointState:
-    """Return an attempt with images that are some time apart, in parts of the log that have few rays together.
-    With ranges, its noise is held."""
+    """Return an attempt with images that are some time apart. If they have more than `_MOST` rays, only some blocks of
+    consecutive keyframes stay. With ranges, the noise of the attempt is held."""
     assert state.errors is not None
     keep = _apart(state.keyframes.stamps, state.keyframes.camera)
     every = -(-int(keep[state.rays.keyframe].sum()) // _MOST)

@@ -14,8 +14,8 @@ from objslam.core.arrays import Floats
 from objslam.mapping.solution import Solution
 
 _SIGMAS = 2.0
-"""The far end of the ellipsoid, in standard deviations of the inverse depth: the ellipsoid of 95 % of a normal distribution
-reaches as far along one axis. A larger number widens more."""
+"""The distance of the far end from the mean, in standard deviations of the inverse depth. 2 is the reach of 95 % of a normal
+distribution along one axis. A larger number widens more."""
 _MOST = 0.4
 """The largest standard deviation, as a share of the depth, at which the far end counts. From 0.5 on, the far end is at
 infinity. With a larger share, objects whose place the rays hardly determine become wider."""

@@ -30,7 +30,8 @@ cases. A larger value warns of more maps."""
 NEIGHBOURS = "equal things nearer than the poses err"
 """The name of the finding that the errors of poses are as large as the distances of equal things."""
 BENT = "a path that may be bent to false objects"
-"""The name of the finding that the odometry contradicts both the poses and the boxes, where labels have several objects."""
+"""The name of the finding that the odometry contradicts both the poses and the boxes. The path may then be bent, because
+some labels have several objects."""
 _BENT = 3.0
 """The path may be bent to false objects, which hide how far the poses err, if two things come together. An earlier map at
 the given poses showed that they err, and the odometry now counts as at least this many times as noisy as the settings say.
