@@ -11,8 +11,8 @@ from objslam.core import camera
 from objslam.core.validity import camera_fault
 
 _OUTSIDE = 10.0
-"""How far outside the image a principal point may be, as a multiple of the image's size. A small part of an image has it
-outside by a few sizes. A larger multiple accepts more wrong numbers."""
+"""How far outside the image a principal point may be, as a multiple of the image's size. If the image is a small part cut
+out of another image, its principal point is outside by a few sizes. A larger multiple accepts more wrong numbers."""
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ _FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m
 _LANDMARK_SIGMA = 0.03
 """The assumed standard deviation (m) of a landmark's position. A larger value accepts rays farther from landmarks."""
 _MIN_LEVEL = 0.1
-"""The least cosine of an elevation. A ray's heading noise is its noise divided by this cosine. A larger value trusts steep
-rays more."""
+"""The heading noise of a ray is its noise divided by the cosine of its elevation. A smaller cosine counts as this one. A
+larger value trusts steep rays more."""
 _AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
 _MOST_RANGE_COST = 9.0
 """The most that a range adds to a cost, in squared deviations. Some ranges are wrong. A larger value trusts ranges more."""
@@ -38,9 +38,10 @@ def align(
 
     The cost of a ray is its squared deviation from the best landmark of its label, at most `STRAY_RAY`. positions, labels:
     (N, 3) m and (N,) of the landmarks. centre: (3,) m, the point about which a correction turns. spread: (3,) standard
-    deviations of the last correction in x, y (m) and yaw (rad). They define its prior and bound the grid. share: (K,) of its
-    variance that the drift has at each pose. This is also the part of the last correction that is expected there. alike:
-    (R, N) the log odds that each ray shows each landmark, from its appearance. None if this is not known.
+    deviations of the last correction in x, y (m) and yaw (rad). They define its prior and bound the grid. share: (K,) the
+    variance of the drift at each pose, as a share of its variance at the last pose. The same share of the last correction is
+    expected at the pose. alike: (R, N) the log odds that each ray shows each landmark, from its appearance. None if this is
+    not known.
     """
     x, y = (_steps(sigma, _FINE_SHIFT, _MOST_SHIFTS) for sigma in spread[:2])
     shifts, turns = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2), _steps(spread[2], _FINE_TURN, _MOST_TURNS)

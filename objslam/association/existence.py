@@ -80,8 +80,8 @@ class Rates:
 
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
     """Estimate the rate of each class (L,) as the median over its boxes. If a class has few boxes, its rate is near the rate
-    of all classes. The concentration is the lowest one whose likelihood is not clearly below the best. The likelihoods allow
-    any object to be a phantom. label: (N,) of the objects. labels: the number L of all labels."""
+    of all classes. The concentration is the lowest one whose likelihood is not clearly below the highest likelihood. In this
+    likelihood, any object may be a phantom. label: (N,) of the objects. labels: the number L of all labels."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)

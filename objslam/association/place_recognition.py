@@ -178,7 +178,8 @@ def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
 
 
 def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
-    """Return hypotheses (H, 2, 2) of two pairs each. The two have distances that fit, or are one pair listed twice."""
+    """Return hypotheses (H, 2, 2) of two pairs each. Either the distance between the two landmarks `here` fits the distance
+    between the two landmarks `there`, or both pairs are the same."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
     i, j = np.triu_indices(len(a), 1)
     differ = (a[i] != a[j]) & (b[i] != b[j])

@@ -59,7 +59,7 @@ class Depth(Section):
     """How far the centre of a thing is behind its visible surface, as a share of half its width: 0 for a sign, 1 for a ball.
     A depth ends on the surface. 0 is for depths of centres."""
     centre_sigma: NotNegative = 0.3
-    """Standard deviation of the difference of this share between the things of a log."""
+    """Standard deviation by which the share `centre` differs between the things of a log."""
 
 
 class Odometry(Section):

@@ -23,7 +23,7 @@ class Noise(Section):
     """the noise of ranges. depth.sigma and depth.sigma_per_m have one common factor, and depth.bias has a factor of its own.
     auto estimates none of them if a camera has its own depth_noise."""
     odometry: Estimated = "auto"
-    """the noise of the odometry along, across and in turning, with a factor for each."""
+    """the noise of the odometry along the path, across it and in turning, with a factor for each."""
     localization: Estimated = "auto"
     """the noise of localised poses, with a factor for localization.yaw and one for localization.xy, each at least 1. In
     fixed mode, it is estimated from frames that show several objects. In joint mode, it is estimated from odometry and rays,

@@ -151,7 +151,7 @@ def _detr_roles(outputs: Sequence[Output]) -> Roles | None:
 
 def _single(outputs: Sequence[Output]) -> Output | None:
     """Return the only output with predictions, or None if there is not exactly one. Other outputs (masks, raw heads) are
-    allowed if they do not have a row for each box. If one does, return None."""
+    allowed if they do not have a row for each box. If another output has a row for each box, return None."""
     lists = [o for o in outputs if o.values.dtype.kind == "f" and (_is_numbered(o) or _is_list(o))]
     if len(lists) != 1:
         return None

@@ -9,9 +9,9 @@ _INSIDE = 0.9
 """A box shows a part of the thing in another box only if at least this share of its area lies in the other box. With a
 smaller share, more boxes of neighbours that hide each other are dropped."""
 _AS_LARGE = 0.3
-"""The least area of a box that may show a part of the thing in another box, as a share of the area of the other box. The
-suppression of a detector leaves parts of about a half. A smaller box may show a second thing farther away. With a smaller
-share, more boxes are dropped."""
+"""A box may show a part of the thing in another box only if its area is at least this share of the area of the other box.
+The suppression of a detector leaves parts of about a half. A smaller box may show a second thing farther away. With a
+smaller share, more boxes are dropped."""
 _COMPARED = 32  # The most boxes of a label and frame that each box is compared with. A larger number takes longer.
 
 

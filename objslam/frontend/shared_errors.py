@@ -150,11 +150,11 @@ class SharedErrors:
     def at(self, values: Floats, drift: bool = True) -> tuple[Keyframes, Rays, Settings]:
         """Return keyframes, rays and settings corrected by the errors (P,).
 
-        The noise of distances and ranges follows their scale. If it did not, a smaller map would fit better. The noise of
-        directions follows the lens for the same reason: with a longer focal length, all angles are smaller.
-        Keyframes stay on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap
-        takes the nearest pose. drift: whether the drift is computed for the corrected odometry. If not, the drift and the
-        variance of the interpolated path stay as measured.
+        The noise of distances and ranges follows their scale. Otherwise a smaller map would fit better. The noise of
+        directions follows the lens for the same reason: with a longer focal length, all angles are smaller. Keyframes stay
+        on their path. A stamp beyond an end of the path takes the pose of that end, and a stamp in a gap takes the nearest
+        pose. drift: whether the drift is computed for the corrected odometry. If not, the drift and the variance of the
+        interpolated path stay as measured.
         """
         error = dict(zip(self.names, values.tolist(), strict=True))
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)

@@ -24,9 +24,9 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
     """Return shared errors (P,) from which a search can begin: their mean, but with the clocks that the robot's turns show.
 
     Two bearings of one label from neighbouring images differ by the turn of the robot between the images, and by parallax.
-    The offset at which they differ least from the turns of the odometry is judged with the prior of the clock, by Laplace's
-    distribution of unknown width. A search that begins at a clock 0.2 s off can end at a wrong optimum, where a large noise
-    of turns explains what the clock causes.
+    At the right offset, the turns in the bearings are nearest to the turns of the odometry. This offset is judged with the
+    prior of the clock, by Laplace's distribution of unknown width. A search that begins at a clock 0.2 s off can end at a
+    wrong optimum, where a large noise of turns explains what the clock causes.
     """
     theta, odometry, cameras = errors.mean.copy(), errors.log.odometry, [one.camera.name for one in errors.log.cameras]
     if odometry is None or len(odometry) < 2 or errors.keyframes.odom_T_base is None:

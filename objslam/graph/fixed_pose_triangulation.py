@@ -42,10 +42,9 @@ def triangulate_landmarks(
 
 
 def flat_noise(rays: Rays, keyframes: Keyframes, settings: Settings) -> tuple[Floats, float, float]:
-    """Return the noise of rays in a world that is flattened until it is equal in all directions, and the factor on z.
-
-    The noise is that of `pose_noise`, without the noise for what planar poses lack on uneven ground. The factor is `LEVEL`
-    on a flat floor.
+    """Return the noise of rays as `pose_noise` does, but as if the ground were even. Also return a factor on z. On uneven
+    ground, planar poses lack tilts and heights, so rays have more noise along z. In a world whose z is multiplied by the
+    factor, their noise is equal in all directions. The factor is `LEVEL` on a flat floor.
     """
     yaw, place = noise_of_poses(keyframes, settings)
     uneven = any(noise_up(keyframes, settings))

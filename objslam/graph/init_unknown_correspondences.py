@@ -38,7 +38,7 @@ _STRETCH = 150
 _TURNED = np.radians(4.0)
 """A step ends when the heading has drifted by this (rad, one standard deviation). One correction aligns all poses of a step,
 so the drift within the step blurs its rays. With a larger value, more steps with turns are aligned wrongly. Without a limit,
-a simulated robot lost its way within an hour. With 3 and 4 degrees, it did not."""
+a simulated robot lost its way within an hour. With 3 and with 4 degrees, it kept its way."""
 _PLACE = 0.1
 """A measured range may err by this (m) in addition to 4 standard deviations of its noise. A larger value accepts more wrong
 ranges."""
@@ -175,7 +175,8 @@ class _Exploration:
         return None if self.ratio is None else Looks.of(self.rays, self.owner, len(self.known), self.ratio)
 
     def _active(self, now: int) -> Bools:
-        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since it was last known there."""
+        """Return for each landmark (N,) whether the heading drifted by less than `HORIZON` since it was last known around
+        the landmark."""
         return np.sqrt(self.known.turned(self.heading, now)) < HORIZON
 
     def _recognise(self, new: Ints, begin: int, end: int) -> None:
@@ -274,7 +275,8 @@ class _Exploration:
         return truncated_cost(self.rays, self.owner, self.known.position, poses, *self.measured.odometry())
 
     def _renumber(self, into: Ints, positions: Floats, map_T_camera: Floats) -> None:
-        """Give the rays of each landmark to landmark into[j] (N,), -1 for none, in a graph that is made again.
+        """Make the graph again after landmarks were joined or dropped. The rays of landmark j go to landmark into[j] (N,),
+        or to none if it is -1.
 
         positions: (M, 3) m, of the new landmarks. map_T_camera: (K, 4, 4).
         """

@@ -22,9 +22,9 @@ _SLIPS = (1.0, 3.0, 10.0)
 """The search for a loop is done once with each of these factors on the standard deviations of the drift. Wheels can slip
 more than a Gaussian allows. Larger factors find loops after a slip, and more wrong candidates."""
 _BESIDE = 0.03
-"""The standard deviation (rad) of the heading around a landmark, if it is known around another one that some frame showed
-beside it. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after longer ways
-through the map, of which parts may be bent."""
+"""If the heading is known around one landmark, it has this standard deviation (rad) around another landmark that some frame
+showed beside the first. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after
+longer ways through the map, of which parts may be bent."""
 _STEPS = 10
 """The most landmarks on such a way. More than ten add a larger variance than an exploration accepts."""
 _MORE = 1.5
@@ -39,8 +39,8 @@ _BENDS = ((0.5, 0.5, 0.1), (2.0, 2.0, 0.5))
 first is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated drive). Larger
 values propose more loops, and a solve judges each."""
 _CUTS = 20
-"""The most keyframes that divide a path into a part before a missed loop and a part after it. A loop shows at most of the
-keyframes near it, so few are enough. A larger number takes longer."""
+"""The most keyframes that divide a path into a part before a missed loop and a part after it. Most keyframes near a loop
+show it, so few are enough. A larger number takes longer."""
 
 
 @dataclass
@@ -84,7 +84,8 @@ class Landmarks:
         )
 
     def renumbered(self, into: Ints, position: Floats) -> Self:
-        """Return M landmarks of which each takes the place of all landmarks j with its number in into[j] (N,). -1 drops j.
+        """Return M landmarks. Landmark i replaces all landmarks j with into[j] = i (N,). If into[j] is -1, landmark j is
+        dropped.
 
         position: (M, 3) m. The covariances are NaN.
         """

@@ -22,7 +22,8 @@ from objslam.graph.outlier_rejection import JointSolution
 _PARALLAX = (0.5, 2.0)
 """The multiples of joint.min_parallax_deg with which other graphs grow. In three of 48 random parts of real drives, seen by
 bearings only, the first graph led to landmarks that were 1 to 2 m off. All three were right with half of the parallax, and
-two with twice of it. Two of the three graphs may end in one wrong minimum, so both values count. More values take longer."""
+two with twice the parallax. Two of the three graphs may end in one wrong minimum, so both values count. More values take
+longer."""
 _FEW_RAYS = 1500
 """In logs with more rays, the first start that ends in a known minimum is the last one. In random parts of real drives whose
 second start ended in the minimum of the first, the third had a better one in 7 of 59 with fewer rays, and in 2 of 71 with
@@ -35,8 +36,8 @@ _MOST_RAYS = 6000
 and again, and no wrong minimum was found in them. A larger number makes long logs slower."""
 _GROWN = 0.05
 """A graph that has grown is in a known minimum if no landmark differs by more than this share of the size of the map. Then
-no solve follows. In 170 random parts of real drives, 85 graphs were, and none ended elsewhere. A larger share saves more
-solves."""
+no solve follows. In 170 random parts of real drives, 85 graphs were in a known minimum, and no solve from them ended
+elsewhere. A larger share saves more solves."""
 _CLEARLY = 3.0
 """Another start is better than the first one if its misfit is smaller by this number, as twice a logarithm of odds. A larger
 value changes the start more rarely."""

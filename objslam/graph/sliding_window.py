@@ -49,7 +49,8 @@ class SlidingWindow:
     def extend(self, end: int, rays: Ints, born: Ints, covariance: Floats) -> None:
         """Add the keyframes before `end`, rays (n,) and landmarks `born` (m,). Their poses and positions must be set before.
 
-        covariance: (m, 3, 3) m^2 of the landmarks. It is the prior of a landmark with rays from before the window.
+        covariance: (m, 3, 3) m^2 of the landmarks. If a landmark has rays from before the window, its covariance here is its
+        prior.
         """
         keyframe = self._measured.rays.keyframe
         for factor in self._measured.factors(self._owner, rays, born, self.positions, begin=self.end, end=end):

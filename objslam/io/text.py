@@ -168,7 +168,7 @@ def parse_numbers(fields: list[str]) -> list[float] | None:
 
 
 def require_order(forward: Bools, path: Path) -> None:
-    """Raise LogError if most rows of a file are not `in_order`. forward: (N,) the mask of the rows that are."""
+    """Raise LogError if most rows of a file are not `in_order`. forward: (N,) the mask of the rows that are in order."""
     if forward.mean() < _IN_ORDER:
         wrong = f"{int((~forward).sum())} of its {len(forward)} stamps repeat or go back"
         raise LogError(wrong, where=str(path), hint="sort the lines by their stamps")

@@ -1,5 +1,5 @@
-"""Slow work on a whole map of a running session, in rounds: a process beside the session works, then its answer corrects
-the map."""
+"""Slow work on the whole map of a running session. It is done in rounds: a process beside the session does the work, and
+then its answer corrects the map."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Rounds(ABC, Generic[Answer, Told]):
     proportional to the number of keyframes. The map is corrected when the number has grown by `delay` since the round began.
     Both wait for a keyframe without other tasks (`is_quiet`).
     If the process is done by then, the map does not depend on the machine's speed. If it is late, a `patient` session waits
-    for it, and any other session goes on. The journal receives each correction with its keyframe, so that a resumed session
-    makes it there.
+    for it, and any other session goes on. The journal receives each correction with its keyframe. So a resumed session
+    corrects its map at the same keyframe.
     """
 
     growth: float

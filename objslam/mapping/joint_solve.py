@@ -95,7 +95,7 @@ def _begun(state: JointState) -> JointState:
 
 
 def _with_gross_errors(begin: JointState, found: JointState) -> JointState | None:
-    """Return the begin of a solve that also estimates the held errors that the map of `found` shows, None if there are
+    """Return the start of a solve that also estimates those held errors that the map of `found` shows. None if it shows
     none."""
     if begin.errors is None or found.errors is None or found.association is None or found.estimate is None:
         return None
@@ -190,7 +190,7 @@ def _unclear(state: JointState) -> bool:
     """Return whether a map may be wrong, so that other starts are worth their time.
 
     Explorations go wrong by chance, each in another place. The false boxes of a detector agree with no object in the best of
-    maps, but they are single boxes. So the rays of tracks are asked, if there are any.
+    maps, but they are single boxes. So only the rays of tracks are judged, if there are any.
     """
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0

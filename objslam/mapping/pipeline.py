@@ -58,10 +58,10 @@ def run(
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
     With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
-    it has odometry too. So is a log with localised poses at which no object has a place.
-    known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
-    LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path.
-    SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
+    it has odometry too. A log with localised poses at which no object has a place is solved once more, too. known: the map
+    of another day. If the drive is found in it, the result is in its frame, and its objects count as priors. LogError if the
+    log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path. SolveError if no box
+    gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
     result, wrong, lasting = _run(log, settings, ledger, progress, known)
@@ -86,8 +86,9 @@ def _run(
     known: PriorMap | None,
     earlier: LastingNoise | None = None,
 ) -> tuple[RunResult, str, LastingNoise | None]:
-    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, else "", and their
-    errors that last, if these are a finding. earlier: such errors of an earlier map at the given poses."""
+    """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, "" if they do not.
+    The third value is the lasting errors of the poses, None if they are too small for a finding. earlier: the lasting errors
+    that an earlier map at the given poses found."""
     given = log = chosen_poses(log, settings)
     unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
@@ -105,7 +106,7 @@ def _run(
             if settings.mode == "fixed" or not diagnosis.refutable:
                 say(diagnosis, ledger)  # No solve will refute the findings, so a user need not wait for one.
         if diagnosis.certain and settings.mode == "joint":
-            ledger.warn("the poses stay as they are, because no solve corrects wrong input")
+            ledger.warn("the poses are not solved, because a solve cannot correct wrong input")
             diagnosis = diagnosis.proven()  # No joint solve will test the other findings.
             settings = settings.model_copy(update={"mode": "fixed"})
         log = taken_out(diagnosis.jumps, log)

@@ -95,8 +95,8 @@ class Solution:
     the box. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
     object in the box of each ray. bodies, body_share, to_centre and hidden are None if no bodies were solved. doubted: the
     labels that may name one object or several. unsettled: the objects that the last round changed, as in `objects_changed`,
-    although no further round was allowed. errors: the estimated errors, as a function of the measurements. They
-    are more than those that were given if a held error is gross. None if none were estimated.
+    although no further round was allowed. errors: the estimated errors, as a function of the measurements. None if none were
+    estimated. If a held error is gross, it is among them too.
     """
 
     keyframes: Keyframes

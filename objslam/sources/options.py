@@ -35,7 +35,7 @@ NAMES = Option(
     metavar="FILE|coco",
 )
 """The option with the names of numbered classes, of all recordings, adapters and detectors."""
-_KINDS = "Kind of the recording: log, ros, mrclam, tum, tum_numbered, journal. [default: found from its content]"
+_KINDS = "Kind of the recording, such as ros or mrclam. A wrong name lists all. [default: found from its content]"
 
 
 @dataclass(frozen=True)

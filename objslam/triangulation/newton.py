@@ -30,7 +30,8 @@ _TINY = 1e-30
 
 
 def approach(lines: LineBlock) -> tuple[Tensor, int]:
-    """Return points (3, B) near the optimum, exact to about 1e-6, and the number of steps, from the coordinate origin on."""
+    """Start at the coordinate origin. Return points (3, B) near the optimum, exact to about 1e-6, and the number of
+    steps."""
     xp = lines.xp
     rough = LineBlock(as_single(lines.foot), as_single(lines.direction), as_single(lines.weight), xp)
     point = xp.zeros_like(rough.foot[:, 0])

@@ -67,12 +67,12 @@ def triangulate(
 ) -> Triangulation:
     """Triangulate all objects of a batch by Eq. 1 on the rays that agree, with covariance and status.
 
-    An object is ok under three conditions. At least 2 rays agree more closely than by chance. Their parallax and the
-    relative precision meet the limits of the settings. The object lies ahead of most of them. A measured range replaces the
-    parallax. Without `settings.consensus`, all rays are used, and chance is not judged. Ranges are fused only for an object
-    whose rays fail these limits, or whose ranges, taken together, are more precise than its rays. Other objects keep the
-    position of Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result for an object
-    does not depend on other objects or on ray order.
+    An object is ok under three conditions. At least 2 rays agree more closely than by chance. The parallax of these rays and
+    the relative precision meet the limits of the settings. The object lies ahead of most of these rays. A measured range
+    replaces the parallax. Without `settings.consensus`, all rays are used, and chance is not judged. Ranges are fused only
+    for an object whose rays fail these limits, or whose ranges, taken together, are more precise than its rays. Other
+    objects keep the position of Eq. 1, because a range ends on the surface of an object and its rays meet inside. The result
+    for an object does not depend on other objects or on ray order.
 
     Args:
         origins, directions: (R, 3) m, and (R, 3) of any length above 0.

@@ -17,8 +17,8 @@ COUNTED = 10
 """The most boxes of a bundle that count as independent measurements of its growth, as in `existence`. A larger number trusts
 growing boxes more."""
 TIGHTNESS = 0.1
-"""The standard deviation by which ln size may change over a bundle beside the distance: a detector's boxes are less tight
-around small things. A larger value trusts growing boxes less."""
+"""The standard deviation by which ln size may change within a bundle although the distance is accounted for: a detector's
+boxes are less tight around small things. A larger value trusts growing boxes less."""
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,11 @@ slower."""
 _POINTS = 120
 """The most proposed points that are tried in pairs. A larger number is slower: all pairs of points are scored."""
 _RAYS = 300
-"""The most rays that score pairs of points, and that first compare the best pair with the two landmarks. All rays compare
-them only if the pair is then better. A larger number is slower."""
+"""The number of rays that score pairs of points. These rays also compare the best pair with the two landmarks. Only if the
+pair is better by them, all rays compare it too. A larger number is slower."""
 _LEAST_GAIN = 30.0
-"""The least decrease of -2 ln likelihood by which two new points must explain the rays of two landmarks better. Rays share
-errors, so that a small decrease is chance. With a larger value, fewer ghosts are replaced."""
+"""Two new points replace two landmarks if they lower -2 ln of the likelihood of the landmarks' rays by at least this. Rays
+share errors, so that a small decrease is chance. With a larger value, fewer ghosts are replaced."""
 _STEPS = 4
 """The rounds of assigning the rays to two points and refining the points. More rounds are more exact, and slower."""
 _GAUSSIAN = 2.0

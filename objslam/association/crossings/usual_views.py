@@ -15,14 +15,14 @@ _USUAL = 0.9
 """The share of the boxes of a landmark that are usually near. Further away, detections become rare. A larger share allows
 landmarks further away."""
 _LARGER = 1.4
-"""The factor on the distance of a box by which it may exceed the others. A thing that is larger than others of its class by
-half of `_CLASS_SIZE` is detected from further away by this factor. A larger factor allows landmarks further away."""
+"""A box may be this many times as far away as the other boxes of its class. A thing that is larger than others of its class
+by half of `_CLASS_SIZE` is detected from further away by this factor. A larger factor allows landmarks further away."""
 _BOXES = 50
-"""A class with fewer boxes of other landmarks takes the distances of all classes. With a larger number, rare classes do so
-more often."""
+"""A class with fewer boxes of other landmarks takes the distances of all classes. With a larger number, more classes take
+them."""
 _LANDMARKS = 3
-"""A class with fewer other landmarks takes the usual distance of all classes. With a larger number, rare classes do so more
-often. One of three landmarks may be wrong without effect on their median."""
+"""A class with fewer other landmarks takes the usual distance of all classes. With a larger number, more classes take it.
+One of three landmarks may be wrong without effect on their median."""
 _VIEW_SIZE, _THINGS = 0.25, 5.0
 """`_VIEW_SIZE` is the assumed standard deviation of ln size between two views of one thing, as in `gating`. With `_THINGS`
 landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, sizes tell less. With a
@@ -86,8 +86,8 @@ class UsualViews:
         return cls(state, _distances(state), _log_density(state), ln_size[:, side], size, view[side], mean, spread)
 
     def far_odds(self, distance: Floats, landmark: Ints) -> Floats:
-        """Return the log likelihood (G,), at most 0, that a bundle of rays comes from this far. It is relative to a usual
-        distance, and the boxes of the other landmarks of the class tell it.
+        """Return the log likelihood (G,) of the distances of bundles of rays, relative to a usual distance, at most 0. The
+        boxes of the other landmarks of the class show which distances are usual.
 
         distance: (G,) m. landmark: (G,) the landmark of each bundle. Its own boxes do not count.
         """

@@ -46,8 +46,8 @@ def place_errors(state: State) -> PlaceErrors:
     """Estimate the errors of all places from the rays that have a landmark.
 
     The landmarks and the places are the least-squares solution of the rays, with Cauchy weights, and with the noise of the
-    origins as the prior of the places. The sigma of a place allows for the landmarks that other places see, each with its
-    own error.
+    origins as the prior of the places. The sigma of a place allows for errors of the landmarks, because other places, with
+    errors of their own, see them too.
     """
     held, owner, count = state.assigned, state.owner, state.count
     obs, prior = state.obs.take(held), state.obs.position_sigma**2

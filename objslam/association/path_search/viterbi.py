@@ -34,7 +34,8 @@ class Motions:
 
     @classmethod
     def of(cls, keyframes: Keyframes, middle: Ints, base: Floats, grid: Grid) -> Self:
-        """Compare the path at keyframes `middle` (G,), base (G, 4, 4), with the odometry."""
+        """Compare the motions of the path with those of the odometry. middle: (G,) the keyframe at the middle of each
+        stretch. base: (G, 4, 4) the poses of the path at these keyframes."""
         assert keyframes.drift is not None
         assert keyframes.odom_T_base is not None
         odometry = keyframes.odom_T_base[middle]

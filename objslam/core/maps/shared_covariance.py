@@ -14,7 +14,7 @@ from objslam.core.rotation import skew
 NUMBERS = 7
 """The numbers of a shared error: a shift (3), a rotation vector (3), and the logarithm of a size."""
 SIZE = 6
-"""The place of the size in a shared error."""
+"""The index of the size among the numbers of a shared error."""
 _FEWEST = 3
 """The least number of objects with a shared error. Two objects do not determine a turn about their line."""
 _FLOOR = 1e-3

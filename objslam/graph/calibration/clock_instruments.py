@@ -79,7 +79,8 @@ class ClockInstruments:
             instruments[self.first : self.first + len(rows)] = -rows
 
     def products(self, residual: Floats, clock: int, velocity: Floats) -> Floats:
-        """Return the products (n,) of residuals (M,) with the columns that `put` writes, without these columns."""
+        """Return the products (n,) of residuals (M,) with the columns that `put` writes. The columns themselves are not
+        built."""
         own = self._own(clock, velocity)
         products = np.zeros(own.shape[2])
         if self.motions is not None:

@@ -28,9 +28,9 @@ class Motions:
     """The measured motions in the graph: s twists of base, with the rotation first.
 
     to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. to_rows: (s, 6, 6) back. weight: (s,) robust.
-    covariance: (s, 6, 6) of the twists, which neighbours predict. by_odometry: (s, 6) the share of the odometry in their
-    standard deviations. The rest comes from the interpolated path. seconds: (s,) durations. rows: of the motions in the
-    linear system. tied: as in `OdometryMotions`.
+    covariance: (s, 6, 6) of the twists, as the neighbours of each motion predict it. by_odometry: (s, 6) the share of the
+    odometry in their standard deviations. The rest comes from the interpolated path. seconds: (s,) durations. rows: of the
+    motions in the linear system. tied: as in `OdometryMotions`.
     """
 
     to_twist: Floats

@@ -22,8 +22,8 @@ def predict(errors: CalibratedMeasurements, association: Association, estimate: 
     """Return the shared errors after one Gauss-Newton step from a solution, with their covariance.
 
     A held error bends the path, so it correlates the residuals, and its effect on the odometry looks like noise. So the step
-    takes the residuals for white noise. If it did not, it would be a third as long. The covariance is also that of white
-    noise.
+    takes the residuals for white noise. Otherwise the step would be only a third as long. The covariance is also that of
+    white noise.
 
     errors: the estimated and the held errors of the same keyframes and rays, at the noise of the solution. theta: (P,) their
     values in the solution. SolveError if the linear system is not finite.

@@ -30,10 +30,10 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     robot and not from the measurement, so the sides have no noise.
 
     For motions below ties (`Instruments.tied`), the solved path is the instrument of clocks. An interpolated pose averages
-    the noise of two poses of the odometry. So a clock seems better if it moves the ends of ties away from these poses. For
-    motions between keyframes, this effect cancels, because keyframes lie anywhere in a step. All ties end at about the same
-    share of a step if the rates of images and odometry have a simple ratio. On simulated wheels that slip, with one pose in
-    a second, this moved a clock by 0.09 s.
+    the noise of two poses of the odometry, so it has less noise midway between them. A clock offset that moves the ends of
+    ties there therefore seems to fit better. For motions between keyframes, this effect cancels, because keyframes lie
+    anywhere in a step. All ties end at about the same share of a step if the rates of images and odometry have a simple
+    ratio. On simulated wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
     """
     names, clocks = errors.names, {} if system.clocks is None else system.clocks.moved
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}

@@ -25,8 +25,8 @@ _BOTH = ("heading", "place")
 _SIZES = (-1.5, 0.0, 1.0, 2.0, 3.0)
 """The factors on noise at which a search begins, as logarithms. More are slower."""
 _AROUND = (-0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8)
-"""The factors around the most likely one over which a lasting error is averaged, as logarithms. The posterior of a variance
-from few samples falls more slowly to larger values."""
+"""The variance of a lasting error is averaged over these factors around the most likely one, as logarithms. More of them are
+larger, because the posterior of a variance from few samples falls slowly to larger values."""
 _MOST_STRAYS = 0.1
 """At most this share of the poses are jumps. A larger share explains noise by jumps."""
 _LEAST_FACTOR, _MOST_FACTOR = np.log(0.05), np.log(MOST_POSE_NOISE)
@@ -75,10 +75,10 @@ class ComparedPoses:
     """n poses of the localisation against their prediction.
 
     off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction by its
-    noise. shared: (3 n, 3 n) the same by the shared errors, which are as large as their priors with any noise. times: (n,)
-    s. apart: s, the time between two poses that were measured independently, 0 if all were. nominal: of headings, rad, and
-    places, m. free: whether the size of the noise is unknown. prior: the weight of the noise of the prediction, as a number
-    of residuals.
+    noise. shared: (3 n, 3 n) of the prediction by the shared errors. It follows from their priors, so it does not grow with
+    the noise. times: (n,) s. apart: s, the time between two poses that were measured independently, 0 if all poses were.
+    nominal: of headings, rad, and places, m. free: whether the size of the noise is unknown. prior: the weight of the noise
+    of the prediction, as a number of residuals.
     """
 
     off: Floats
@@ -140,8 +140,9 @@ class ComparedPoses:
     def cost(self, model: PoseErrors) -> float:
         """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction.
 
-        Values are kept, because the searches come back to the same models. This takes a quarter less time. So are those of
-        places alone (`_Placed`), because a third of the models differ in headings only. This takes another third less.
+        Values are kept, because the searches come back to the same models. This takes a quarter less time. The values of
+        places alone (`_Placed`) are kept too, because a third of the models differ in headings only. This takes another
+        third less.
         """
         if model not in self._costs:
             self._costs[model] = self._cost(model)
@@ -188,7 +189,7 @@ class _Placed:
 
 
 def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
-    """Return the poses (m,) that agree with what all other poses predict, or all of them if too many do not."""
+    """Return the poses (m,) that agree with what all other poses predict, or all poses if too many disagree."""
     inner = np.linalg.inv(data.expected(model))
     n = len(data.times)
     at = np.arange(n)[:, None] + n * np.arange(3)

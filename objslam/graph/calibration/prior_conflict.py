@@ -14,8 +14,9 @@ from objslam.core.calibration import Calibration
 
 _CHANCE = 2.0
 """Up to this many standard deviations, the distance from a prior is chance. A larger number widens fewer priors. Beyond it,
-the widening is near that of a Student prior with 4 degrees of freedom: for a sum that is 3 and 4.5 standard deviations from
-0 for its two parts, the standard deviation of the shares grows by a factor of 1.8, and by 2 with the Student prior."""
+the widening is near that of a Student prior with 4 degrees of freedom. An example is a sum of two errors that is 3 prior
+standard deviations of the first error and 4.5 of the second. The standard deviation of each error grows by a factor of 1.5,
+and by 1.9 with the Student prior."""
 _TOLD = 0.9
 """A direction is determined by the log if its variance is at most this share of its prior variance. With a larger share,
 directions count that the log hardly tells."""
@@ -24,12 +25,12 @@ _LEAST = 1e-12
 
 
 def with_wider_priors(found: Calibration, mean: Floats, prior: Floats) -> Calibration:
-    """Return the calibration with a covariance that takes the priors for wider if the values are too far from them.
+    """Return the calibration with the covariance of wider priors if the values are too far from the priors.
 
     The values stay, and so does the information of the log itself. If the prior (P, P) and the covariance are right, the
     values minus the mean (P,) of their prior have the covariance `prior - covariance` (prior predictive check; Box 1980).
-    The check is done along each direction that the log determines. The part of a parameter in it tells how far its prior is
-    widened.
+    The check is done along each direction that the log determines. If it fails along a direction, the priors of the
+    parameters that have a part in this direction become wider. The larger its part, the wider a prior becomes.
     """
     if not len(mean):
         return found

@@ -29,9 +29,9 @@ _PROBES, _FEWEST_PROBES = 12, 4
 """The most and the fewest random probes. With n independent residuals, the relative error of the redundancy is
 sqrt(2 / (n * probes)). More probes are slower."""
 _PRODUCTS = 3000
-"""A sufficient product of two numbers: of independent residuals, and of probes. With it, the redundancy has a standard
-deviation of 3 %, and a factor has half of that. So a long log needs fewer probes than `_PROBES`. A larger number is more
-exact, and slower."""
+"""There are enough probes if their number times the number of independent residuals is this. The redundancy then has a
+standard deviation of 3 %, and a factor has half of that. So a long log needs fewer probes than `_PROBES`. A larger number is
+more exact, and slower."""
 _ITERATIONS = 20
 """The most iterations. Each takes a factorisation of the linear system, so more are slower. MRCLAM takes 5 to 12."""
 _CONVERGED = 0.01
@@ -199,10 +199,10 @@ def _left(jacobian: sparse.csr_matrix, normal: NormalEquations, sides: Floats, p
 
 @dataclass(frozen=True)
 class _Rescaling:
-    """The change of M rows that are whitened by the noise `begin` into rows whitened by another noise.
+    """A change of the noise that whitens M rows, from the noise `begin` to another noise.
 
-    system, rows: the rows. begin: the noise. colours: (s, 6, 6) undo the whitening of the motions. pattern: the columns of
-    all entries of the matrix (M, M), row by row, and the first entry of each row.
+    system, rows: the rows. begin: the noise. colours: (s, 6, 6) undo the whitening of the motions. pattern: the sparse
+    matrix (M, M) of the change: the columns of its entries, row by row, and the first entry of each row.
     """
 
     system: LinearSystem

@@ -86,8 +86,8 @@ def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: 
 def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> LocalizedMotions | None:
     """Return the motions that a localisation measures because its errors last. None if its errors are new in each pose.
 
-    A motion is known in the frame of the robot, whose heading errs. The error of the heading turns the motion to a side. The
-    error of the heading may last too. So it counts with the noise of the absolute heading.
+    A motion is known in the frame of the robot. An error of the robot's heading turns the motion to a side. This error may
+    last too, so here the heading has the noise of an absolute heading.
     """
     if not keyframes.localized_every or len(keyframes) < 2:
         return None
@@ -114,10 +114,11 @@ def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool |
 
 
 def _of_ground(keyframes: Keyframes, settings: Settings) -> tuple[tuple[Parts, Parts], tuple[Parts, Parts]]:
-    """Return, of tilt (rad) and height (m), the standard deviations (K,) of poses, and those (K-1,) of motions.
+    """Return the standard deviations of tilt (rad) and height (m): for each, (K,) of poses and (K-1,) of motions.
 
     Uneven ground moves a robot as a lasting error would. If `planar.seconds` is 0, motions tell nothing. Poses that share a
-    measurement share its information, and not that of the ground, so the standard deviations undo what it is divided by.
+    measurement share its information. The information of the ground is not shared, so the standard deviations undo the
+    division by `localized_every`.
     """
     of, root = settings.planar, np.sqrt(keyframes.localized_every)
     if not of.seconds:
@@ -135,7 +136,7 @@ def _in_camera(base_T_camera: Floats, variances: Floats) -> Floats:
 
 
 def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floats]]:
-    """Return, for headings (rad) and places (m), the standard deviations (K,) of poses and (K-1,) of motions."""
+    """Return the standard deviations of headings (rad) and places (m): for each, (K,) of poses and (K-1,) of motions."""
     gaps = np.maximum(np.diff(keyframes.stamps), 0.0) * max(keyframes.localized_every, 1.0)
     of = settings.localization
     columns = zip((of.yaw, of.xy), keyframes.pose_noise, keyframes.lasting, strict=True)

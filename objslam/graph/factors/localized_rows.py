@@ -20,7 +20,7 @@ class LocalizedRows:
 
     @property
     def rows_each(self) -> int:
-        """The rows of a motion."""
+        """The number of rows of one motion."""
         return 6
 
     @property

@@ -12,8 +12,8 @@ def whitening(covariance: Floats) -> Floats:
     They are inverse roots of the covariances. The inverse of a covariance itself loses twice the digits, and need not be
     positive definite if its largest variance is 1e11 times its smallest.
     """
-    # Upper, because the axes are in reverse order. Entry by entry of all matrices at once, because numpy takes 1 us for the
-    # inverse of one small matrix.
+    # The roots are upper triangular, because the axes are in reverse order. The loops fill one entry of all inverses at
+    # once, because numpy takes 1 us for the inverse of one small matrix.
     root = np.moveaxis(np.linalg.cholesky(covariance[:, ::-1, ::-1]), 0, 2).copy()
     inverse, product = np.zeros_like(root), np.empty(len(covariance))
     for j in range(len(root)):

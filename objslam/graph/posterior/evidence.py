@@ -53,8 +53,8 @@ def log_evidence(
 def _of_ranges(measured: Measurements, association: Association, used: Bools, distance: Floats) -> float:
     """Return the log density of all ranges, plus their cost in the graph. used, distance: as in `log_evidence`.
 
-    In the graph, each range has more noise instead of the bias that it shares with the other ranges of its landmark. So this
-    cost is taken out of the evidence, and the log density takes its place. A stray range has the distribution of all ranges
+    The ranges of a landmark share a bias. In the graph, each range has more noise instead. So the cost in the graph is taken
+    out of the evidence, and the log density with the bias takes its place. A stray range has the distribution of all ranges
     of the log.
     """
     rays, ranged = measured.rays, np.isfinite(measured.rays.range)

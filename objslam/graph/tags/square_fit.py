@@ -110,7 +110,7 @@ def _moved(squares: Squares, step: Floats) -> Squares:
 
 def _residuals(seen: Corners, corners: Floats) -> tuple[Floats, Floats, Bools]:
     """Return residuals (V, 4, 2) in units of `sigma`, their derivatives (V, 4, 2, 3) by the corners in map, and which (V, 4)
-    are ahead. The axes of the four corners of a view are parallel."""
+    are ahead. The two axes of a residual have nearly the same directions at all four corners of a view."""
     to = corners[seen.square] - seen.origin[:, None]
     along = np.einsum("vci,vci->vc", seen.direction, to)
     ahead = along > _BEHIND * np.linalg.norm(to, axis=2)

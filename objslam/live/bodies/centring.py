@@ -44,7 +44,8 @@ class CentringRequest:
     ids: Ints
 
     def solve(self) -> BodiesMessage:
-        """Return the bodies of these landmarks, for keyframe 0. A body that hardly turns a bearing is no body here."""
+        """Return the bodies of these landmarks. The caller puts in the keyframe, which is 0 here. A landmark has shape 0,
+        for no body, if its body would hardly turn its bearings."""
         found = self.boxes.fitted()
         n = len(self.ids)
         shape, half, yaw, covariance = np.zeros(n, dtype=np.int64), np.zeros((n, 3)), np.zeros(n), np.zeros((n, 4, 4))

@@ -111,7 +111,7 @@ class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
         return CalibrationRequest(errors, theta, found.association, found.map_T_camera, settings)
 
     def _correction(self, number: int, answer: Calibration | None) -> CalibrationMessage | None:
-        """Return a calibration that changes an error enough."""
+        """Return the calibration if it changes some error by enough to correct the map (`_CHANGED`), else None."""
         if answer is None:
             self._counters.accept("calibrations given up")
             return None

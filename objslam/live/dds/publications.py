@@ -48,7 +48,8 @@ class Publications:
         return iter(list(self._found.values()))
 
     def kind(self, handle: int) -> Kind | None:
-        """Return the kind of the publisher with a handle, also if it went lately, or None if it is not kept."""
+        """Return the kind of the publisher with a handle, also if the publisher has left recently. None if it is not
+        kept."""
         return self._found[handle].kind if handle in self._found else self._gone.get(handle)
 
     def remove(self, handle: int) -> Publication | None:

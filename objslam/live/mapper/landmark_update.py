@@ -16,11 +16,11 @@ from objslam.live.mapper.tracks import Track
 
 _JUMP = np.radians(2.0)  # The residual (rad) above which the graph relinearises soon. A larger one relinearises more rarely.
 _GROWN = 1.2
-"""The size of a landmark's boxes is measured again when its observations have grown by this factor. With a larger factor, it
-is older, and takes less time."""
+"""The size of a landmark's boxes is measured again when its observations have grown by this factor. With a larger factor,
+the size is older, and takes less time."""
 _MOVED = 0.05
-"""It is also measured again when the landmark has moved by this share of its distance from the camera, because a box on a
-farther landmark shows a larger thing. With a larger share, it is older."""
+"""The size is also measured again when the landmark has moved by this share of its distance from the camera, because a box
+on a farther landmark shows a larger thing. With a larger share, the size is older."""
 _BOXES = 20
 """The most boxes of a landmark for its size, spread evenly over its boxes. More boxes take longer."""
 _TRACKS = 4096  # The detector tracks whose landmark is stored. A larger number knows a track id after a longer absence.

@@ -13,7 +13,7 @@ from objslam.live.mapper.state import MapState
 
 _ASK = 10
 """Every 10th keyframe, the covariance of the pose is read from the graph, which is slow. In between, odometry noise is
-added, so the covariance is too large. With a larger number, it is larger still."""
+added, so the covariance is too large. With a larger number, the covariance is larger still."""
 
 
 @dataclass(frozen=True)

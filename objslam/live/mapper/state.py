@@ -100,8 +100,8 @@ class MapState:
     the course. rng: seeded by the settings.
 
     errors: the shared errors that are corrected in all measurements, by name. calibration: their last estimate, None without
-    one. given: the settings as given. settings: the same, with the odometry noise of the corrected distances. sent_cameras:
-    the cameras as received. cameras: the same, with the errors corrected.
+    one. given: the settings as given. settings: the same, with odometry noise that fits the corrected distances.
+    sent_cameras: the cameras as received. cameras: the same, with the errors corrected.
     """
 
     settings: Settings

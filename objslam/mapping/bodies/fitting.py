@@ -31,12 +31,12 @@ _CLEAR = 1.0
 Above it, the position is the centre of the body. The angle is 4 for a cabinet from close by. It is below 0.6 for things on a
 table that a noisy detector sees. With a larger value, more objects stay where their rays meet."""
 _HIDDEN = 0.1
-"""The share of an object's boxes of which something hides a part, above which the position is the centre of the body. The
-rays of these boxes miss the object, all to one side. A larger share trusts the place more where rays meet."""
+"""If something hides a part of more than this share of an object's boxes, the position is the centre of the body. The rays
+of these boxes miss the object, all to one side. With a larger share, more objects stay where their rays meet."""
 _UNLIKE = 0.02
-"""The least error of a centre that repeats from all sides, as a share of half the size, because no thing has exactly the
-shape of its body. The centres of simulated pots, cones, seats, monitors and people were off by 1 to 4 % of half the height
-(tools/bench_shapes.py). A larger share makes all centres less sure."""
+"""No thing has exactly the shape of its body, so its centre has an error that repeats from all sides. This is the least size
+of this error, as a share of half the size of the body. The centres of simulated pots, cones, seats, monitors and people were
+off by 1 to 4 % of half the height (tools/bench_shapes.py). A larger share makes all centres less sure."""
 
 
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
@@ -181,8 +181,9 @@ def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
     """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2.
 
-    At given poses, these are errors that were added to it. The rest of the covariance is no error of the body. The rays of a
-    large thing miss the point, which makes it wider. Eq. 1 also has a bias along the rays that edges of boxes do not have.
+    At given poses, this is `error_covariance`: the errors that were added to the covariance. The rest of the covariance is
+    no error of the body. It is wider because the rays of a large thing miss the point. It also contains a bias of Eq. 1
+    along the rays, which edges of boxes do not have.
     """
     estimate, rays, keyframes = solution.estimate, solution.rays, solution.keyframes
     if settings.mode != "joint":
@@ -203,8 +204,8 @@ def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Float
 
 
 def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
-    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the centre is the
-    position."""
+    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the object gets the centre
+    of the body as its position."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at] + found.unlike[at]
     covariance[:3, :3] += repeated_error(found.share[0], half) ** 2 * np.eye(3)

@@ -24,9 +24,9 @@ The surfaces of rendered rings, buttons and stands with open fronts were 0.3 beh
 spread of 0.3. For simulated boxes, cylinders and balls, the two surfaces agreed to 0.07. A larger number trusts bodies
 less."""
 _UNSEEN = 0.5
-"""The standard deviation of the distance from the surface to the centre of a body that was seen from one side, as a share of
-half the width. Such a body has only its prior. In simulated drives past things, it was 0.4 to 0.6. A larger number trusts
-the priors of bodies."""
+"""If a body was seen from one side only, the distance from its surface to its centre has this standard deviation, as a share
+of half the width. Such a body has only its prior. In simulated drives past things, the standard deviation was 0.4 to 0.6.
+With a larger number, bodies that were seen from few sides count more."""
 _OF_SURFACES = 0.4
 """Ranges may end at the centre of a body (share 0) or on its surface (share 1). A solve without bodies estimates this share.
 From this value on, ranges count as ending on surfaces. In simulated drives, the share was 0.47 to 1.0 with depths of

@@ -155,8 +155,8 @@ def agreements(
 
 
 def _built(log: Log, settings: Settings, before: tuple[Log, Keyframes, Rays] | None) -> tuple[Log, Keyframes, Rays] | None:
-    """Return a log with its keyframes and rays, None if no frame has a pose. before: the same of the log before, whose rays
-    are taken if only the cameras' poses on the robot differ."""
+    """Return a log with its keyframes and rays, None if no frame has a pose. before: what this function returned for the log
+    before. Its rays are taken if the two logs differ only in the cameras' poses on the robot."""
     if before is not None and _differ_in_mounts(before[0], log):
         return log, with_mounts(before[1], log), before[2]
     free = settings.model_copy(update={"mode": "fixed"})

@@ -23,7 +23,8 @@ _OUTSIDE = 0.1
 """If more than this share of the boxes has its centre outside the image, the boxes belong to a larger image. A larger share
 warns less often."""
 _LEAST_SPAN = 0.55
-"""The least share of the image's width and height that the boxes of a long log cover. A larger share warns more often."""
+"""The boxes of a long log should reach at least this share of the image's width or height. A larger share warns more
+often."""
 _LONG = 200
 """A log with at least this many boxes is long, so that its boxes should cover most of the image. A larger number judges
 fewer logs."""

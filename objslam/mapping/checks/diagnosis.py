@@ -43,7 +43,8 @@ _CROWD = 5.0
 """The boxes of a log with a larger crowd (`Part.crowd`) are not compared, because their rays meet anywhere and show nothing.
 With a larger value, more logs are compared, which takes longer."""
 _FEWEST = 60
-"""The fewest boxes of a log that are judged by their agreement. Fewer boxes agree by chance."""
+"""The boxes of a log, or of one of its halves, are judged by their agreement if there are at least this many. Fewer boxes
+agree by chance. A larger number judges fewer logs."""
 _CLOCKS = (-0.3, -0.15, 0.15, 0.3)
 """The clock offsets (s) that are tried besides 0. The search for small errors starts from the offset that fits best. More
 offsets take longer."""

@@ -37,7 +37,8 @@ _SCALE = "depth scale"
 _CLOSE = 0.25
 """A factor counts as a unit of `_UNITS` if the logarithm of their ratio is below this. A larger value names more units."""
 _UNIT = 0.7
-"""No calibration error explains a factor if its logarithm exceeds this. A larger value asks fewer factors for a unit."""
+"""Only a wrong unit explains a factor if its logarithm exceeds this, because no calibration error is that large. A larger
+value takes fewer factors for wrong units."""
 _GROUP = 8
 """The ranges of a label in a window show a factor if it has at least this number of boxes there. Fewer boxes show it
 poorly."""

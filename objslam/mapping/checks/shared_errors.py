@@ -13,10 +13,10 @@ MOST_SIGMAS = 3.0
 """A shared error of more than this many standard deviations of its prior causes a warning. A larger value warns less
 often."""
 _WIDENED, _PART = 1.5, 0.25
-"""Errors that the log tells only together cause a warning if the prior of one was taken to be wider by more than the factor
-`_WIDENED` (`Calibration.prior_factor`). The factor is 1.5 for a sum that is 2.3 standard deviations from its prior. An error
-is named if its variance was widened by at least the share `_PART` of that one's. Larger values warn less often, and name
-fewer errors."""
+"""Of some errors, the log shows only a sum. Each such error has a factor by which its prior was widened
+(`Calibration.prior_factor`). They cause a warning if the largest factor exceeds `_WIDENED`. The factor is 1.5 for a sum that
+is 2.3 standard deviations from its prior. The warning names an error if its variance grew by at least the share `_PART` of
+the largest growth. Larger values warn less often, and name fewer errors."""
 
 _CAUSES = {
     "clock": "do the stamps of the camera and of the poses use the same clock?",
@@ -72,7 +72,7 @@ def warn_of_large_errors(calibration: Calibration, ledger: Ledger) -> None:
 
 
 def _warn_of_sums(calibration: Calibration, ledger: Ledger) -> None:
-    """Warn of errors that the log tells only together, and that are too large together."""
+    """Warn of errors whose sum is too large, if the log shows only their sum."""
     if calibration.prior_factor is None:
         return
     left = (calibration.sigma > OBSERVABLE * calibration.prior) & [kind(name) in _CAUSES for name in calibration.names]

@@ -26,11 +26,11 @@ _USUAL = {"focal": 0.05, "translation": 0.1}
 larger error."""
 _KINDS = tuple(_HARMFUL)
 _LEAST_GAIN = 40.0
-"""The least decrease of the squared deviations by an error, in units of their variance. A larger value finds fewer
-errors."""
+"""An error counts if it lowers the sum of the squared deviations by at least this, in units of their variance. A larger
+value finds fewer errors."""
 _LEAST_SHARE = 0.04
-"""The least decrease by an error, as a share of all squared deviations. Rays of a real log are not independent, so the sum
-of many small deviations proves nothing. A larger value finds fewer errors."""
+"""An error counts if it lowers the sum of the squared deviations by at least this share. Rays of a real log are not
+independent, so the sum of many small deviations proves nothing. A larger value finds fewer errors."""
 _UNUSUAL = 4.0
 """An error is unusual if it exceeds this number of prior standard deviations. A larger number calls fewer errors unusual."""
 _ROUNDS = 6

@@ -21,8 +21,8 @@ _CRAWL = 0.01
 as fast. A larger value accuses more robots that hardly drive."""
 
 _FASTEST = 1e-4
-"""The least median time (s) between two poses, or between two frames of a camera. Stamps in s, divided as if they were in
-another unit, come closer together. A larger value finds fewer wrong units."""
+"""The least median time (s) between two poses, or between two frames of a camera, after a correction of the unit. If stamps
+are in s already, the correction brings them closer together than this. A larger value finds fewer wrong units."""
 
 
 def check_stamps(log: Log) -> Finding | None:

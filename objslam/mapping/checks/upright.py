@@ -5,8 +5,7 @@ from objslam.frontend.up import up_axis
 
 
 def lies_on_its_side(keyframes: Keyframes) -> str | None:
-    """Return a warning if the cameras' mean up vector is far from the map's z axis, as after visual SLAM. None if it is
-    not."""
+    """Return a warning if the cameras' mean up vector is far from the map's z axis, as after visual SLAM, else None."""
     up = up_axis(keyframes)
     if up == "z":
         return None

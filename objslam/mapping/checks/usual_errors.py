@@ -42,7 +42,7 @@ def without_usual_errors(
 
     start: the agreement of the part as it is. prior: returns the covariance (P, P) of the errors before the estimate.
     goes_on: whether the errors of a round are worth another round. known: errors from which the first round starts, so that
-    `start` is the agreement without them. The returned errors are None if there are none, and no round could estimate them.
+    `start` is the agreement without them. If no round could estimate the errors, the returned errors are `known`.
     """
     best, now = start, start
     for _ in range(_ROUNDS):

@@ -16,8 +16,8 @@ from objslam.mapping.doubts.evidence import Evidence
 _FEWEST = 5
 """The fewest boxes of a group. A larger number finds fewer groups."""
 _AROUND = 9.0
-"""The surroundings of an object end at this multiple of its gate, a squared deviation. They show how many boxes lie on it by
-chance. A larger multiple gives a surer estimate, of a larger area."""
+"""The surroundings of an object end at this multiple of its gate, a squared deviation. The boxes in the surroundings show
+how many boxes lie on the object by chance. A larger multiple gives a surer estimate, from a larger area."""
 _SAME = 0.5
 """The least intersection over union of two boxes in one frame that show one thing. With a larger overlap, fewer boxes lie on
 an object."""
@@ -26,8 +26,8 @@ an object."""
 def on_objects(evidence: Evidence, left: Ints) -> Iterator[tuple[int, Ints]]:
     """Yield landmarks and the rays without an object that lie on them. left: (M,) the rays without an object.
 
-    A ray does not lie on a landmark that has a box of its own elsewhere in the image: it shows a neighbour. If most rays of
-    a label at a landmark do so, the others show this neighbour too.
+    If a landmark has a box of its own elsewhere in the image, a ray at the landmark shows a neighbour, and does not lie on
+    the landmark. If most rays of a label at a landmark show a neighbour, the other rays of the label show it too.
     """
     state, gate = evidence.state, evidence.gate
     if not state.count or not len(left):

@@ -20,16 +20,17 @@ _FEWEST = 5
 """The fewest frames that show a thing. A cut off box has a wide cone, and few cones meet anywhere. A larger number names
 fewer things."""
 _SEEN = 0.5
-"""Of the frames that have the place in the image, at the distances of the boxes, at least this share must show the thing. A
-thing at rest is in most of them. The cones of a thing that moves meet anywhere. A larger share names fewer things."""
+"""A thing is named if at least this share of the frames that should show it have a box of it. Such a frame has the place of
+the thing in its image, and is about as far away as the frames with a box. A thing at rest is in most of them. The cones of a
+thing that moves meet anywhere. A larger share names fewer things."""
 _PAIRS = 1000
 """The number of pairs of boxes whose crossings are tried as the place of a thing. More pairs give a better place."""
 _PARALLAX = np.sin(np.radians(5.0)) ** 2
 """The least squared sine of the angle between two axes that are crossed. Axes of cut off boxes point beside their thing, so
 narrower crossings tell no distance. With a larger value, fewer places are tried."""
 _NEAR, _FAR = 0.2, 3.0
-"""The least distance of a place, m, and its greatest distance as a multiple of the greatest distance of an object from the
-path. Larger values suit larger places."""
+"""The least distance of a place from a camera, m, and its greatest distance, as a multiple of the greatest distance at which
+an object was seen. Larger values suit larger places."""
 _MOST = 5
 """The most things of one label. Nobody reads a list of more."""
 _SAMPLE = 2000

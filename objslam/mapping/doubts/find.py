@@ -59,9 +59,9 @@ def with_doubts(result: RunResult) -> RunResult:
 
     A map is not called good in six cases: some objects are more likely doubles than not, a place is in the map twice, the
     rays of an object do not agree on one thing, an object has many sizes, most objects have a wide sigma, or many boxes of a
-    label meet where the map has no object. A label without an object is named. So are a thing that has only cut off boxes,
-    and a thing that seems to move. They do not change the level of the assessment, because their boxes may be false, and
-    because no map contains things that move.
+    label meet where the map has no object. The assessment also names labels without an object, things that have only cut off
+    boxes, and things that seem to move. They do not change the level of the assessment, because their boxes may be false,
+    and because no map contains things that move.
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)

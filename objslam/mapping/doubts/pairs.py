@@ -30,8 +30,8 @@ _BESIDES = 0.2
 """The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
 number, few frames tell less."""
 _PAD = 1.0
-"""The margin (m) around the objects in which other objects of their label may lie. A larger margin makes close pairs
-rarer."""
+"""The margin (m) around the objects in which other objects of their label may lie. With a larger margin, fewer pairs are
+expected to be close by chance."""
 _SHARED = 0.35
 """Two objects fill one space if they are closer than this share of the smaller size, as in association. A larger share
 reports more pairs."""
@@ -68,7 +68,7 @@ def find_pairs(evidence: Evidence) -> Pairs:
     Two explanations are compared. If they are one object, the covariance of their offset is the sum of their covariances,
     and hardly any frame shows both (`TOGETHER`). If they are two objects, the second lies anywhere among the objects of its
     label, and each frame with both in view shows both. Objects that fill one space are candidates too, because two things
-    cannot do so.
+    cannot fill one space.
     """
     state, covariance = evidence.state, evidence.covariance
     position = state.landmarks.position

@@ -19,7 +19,8 @@ median deviation is 1.2 for rays that meet. With a larger number, fewer groups h
 _NEAR, _FAR = 0.2, 100.0
 """The least and the greatest distance (m) of the point where a fit starts. Larger values suit larger places."""
 _PAIRS = 64
-"""The number of pairs of rays in a group, whose crossings give the start of a fit. More pairs give a better start."""
+"""The number of pairs of rays that are tried in a group. The crossings of the pairs give the start of a fit. More pairs give
+a better start."""
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,11 @@ def mixed_sizes(result: RunResult) -> list[Doubt]:
     """Return a doubt for each object whose boxes show sizes that scatter much more than those of other objects.
 
     A box and the distance to its object tell the size of the thing in the box. The size of one thing stays the same. At
-    least its height does, in boxes that show the vertical in the same direction, as those of a level camera do. So only such
-    boxes count. The scatter of the widths and the scatter of the heights are computed, and the smaller one counts. It must
-    exceed the scatter of other objects, and the scatter that the noise of the boxes explains. Boxes of two things have two
-    sizes, also where their rays happen to meet. If a thing is put too far away, its boxes grow faster than its distance
-    falls.
+    least its height stays the same in boxes that show the vertical in the same direction, such as the boxes of a level
+    camera. So only such boxes count. The scatter of the widths and the scatter of the heights are computed, and the smaller
+    one counts. It must exceed the scatter of other objects, and the scatter that the noise of the boxes explains. Boxes of
+    two things have two sizes, also where their rays happen to meet. If a thing is put too far away, its boxes grow faster
+    than its distance falls.
     """
     if len(result.map) < _OTHERS:
         return []

@@ -19,10 +19,10 @@ fewer objects that are two."""
 _APART = (3.8, 85.0)
 """The least distance between the groups, in standard deviations within them: the first number, plus the second divided by
 the number of rays. Of objects whose rays scatter evenly, 1 in 10,000 has groups at this distance (simulated for 15 to 300
-rays). With Gaussian scatter, fewer objects have. Larger numbers find fewer objects that are two."""
+rays). With Gaussian scatter, fewer objects have groups this far apart. Larger numbers find fewer objects that are two."""
 _ABOVE_NOISE = 3.0
-"""The least distance between the groups, in standard deviations of a ray by the noise that the label's rays show in this
-log. A larger number finds fewer objects that are two."""
+"""The least distance between the groups, in standard deviations of a ray. This deviation is the one that all rays of the
+label show in this log. A larger number finds fewer objects that are two."""
 _WITHIN_SIZE = 0.35
 """The least distance between the groups, as a share of the object's size. Box centres wander within their object. A larger
 share finds fewer objects that are two."""

@@ -47,9 +47,9 @@ class Twice:
 def find_twice(objects: ObjectMap) -> Twice | None:
     """Return the place that a map holds twice, None if there is none.
 
-    A robot that loses its place sees all objects again as new ones. So there is a time at which nearly all known objects are
-    seen for the last time. All objects that are seen later are new. If the parts before and after it register to each other,
-    they are one place.
+    A robot that loses its place sees all objects again as new ones. So there is a time by which nearly all known objects
+    were seen for the last time. All objects that are seen later are new. If the objects before this time register to the
+    objects after it, both show one place.
     """
     usable = [i for i, o in enumerate(objects.objects) if o.status == "ok" and o.covariance is not None]
     first = np.array([objects.objects[i].first_seen for i in usable])

@@ -15,8 +15,8 @@ from objslam.mapping.doubts.groups import REASONS, described_group
 from objslam.mapping.doubts.words import in_place, why_no_object
 
 _FEWEST = 3
-"""The fewest frames with a label that is named. With a larger number, fewer labels of false boxes are named, but also fewer
-things that were seen only for a moment."""
+"""A label without an object is named if at least this number of frames show it. With a larger number, fewer labels of false
+boxes are named, but also fewer things that were seen only for a moment."""
 _NAMED = 3
 """The most labels that the assessment names. A larger number makes the assessment longer if a detector knows many labels."""
 

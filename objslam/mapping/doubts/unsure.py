@@ -10,7 +10,7 @@ from objslam.core.result import Doubt, RunResult
 _NAMED = 3
 """The most objects that the assessment names. A larger number makes the assessment longer."""
 _MOST = 0.5
-"""The largest share of unsure objects among those with a position in a map that is good. With a larger share, more maps are
+"""A map is good only if at most this share of its objects with a position is unsure. With a larger share, more maps are
 good."""
 
 

@@ -46,7 +46,8 @@ def why_unresolved(result: RunResult, j: int) -> str:
 
 
 def _noise_deg(result: RunResult, j: int) -> float:
-    """Return the median standard deviation of the rays of an object, with that of their poses, deg."""
+    """Return the median standard deviation of the rays of an object, deg. At given poses, it includes the noise of the
+    poses."""
     mine = np.flatnonzero(result.association.object == j)
     sigma, place = result.rays.sigma, 0.0
     if result.settings.mode == "fixed":

@@ -27,7 +27,7 @@ _MOST = 3000
 and would take longer."""
 _BLOCK = 50
 """If more rays are left, this number of consecutive keyframes is solved at a time, and the next ones are left out. A track
-ends where its block ends. With a larger number, fewer tracks are cut, and fewer parts of the drive are heard."""
+ends where its block ends. With a larger number, fewer tracks are cut, and fewer parts of the drive count."""
 
 
 def with_errors_of_tracks(state: JointState) -> tuple[JointState, Floats]:
@@ -71,8 +71,8 @@ def along(state: JointState, path: Floats) -> JointState:
 
 
 def _excerpt(state: JointState) -> JointState:
-    """Return an attempt with images that are some time apart, in parts of the log that have few rays together.
-    With ranges, its noise is held."""
+    """Return an attempt with images that are some time apart. If they have more than `_MOST` rays, only some blocks of
+    consecutive keyframes stay. With ranges, the noise of the attempt is held."""
     assert state.errors is not None
     keep = _apart(state.keyframes.stamps, state.keyframes.camera)
     every = -(-int(keep[state.rays.keyframe].sum()) // _MOST)

@@ -20,9 +20,9 @@ _NOISIER = 1.5
 """A looser odometry is tried as well if a solve finds more than this factor on the noise of rays or odometry. A larger
 factor explores fewer logs twice."""
 _CLEAR = 0.95
-"""If at least this share of the rays agrees, a log is not explored again because of its noise. The exception is a log that
-the filter for ranges is sure of. A larger share explores more logs twice. In simulation, maps that show objects twice
-explained at most 0.93 of the rays, but up to 0.96 with ranges. A good map can explain as few."""
+"""If at least this share of the rays agrees, much noise is no reason to explore a log again. The exception is a log that the
+filter for ranges is sure of. A larger share explores more logs twice. In simulation, maps that show objects twice explained
+at most 0.93 of the rays, but up to 0.96 with ranges. A good map can explain as few."""
 _SAME = 0.01
 """If a second exploration gives at most this share of the rays to other objects than the map does, it is not continued. Two
 explorations of one drive always assign a few rays between neighbours in different ways. With a larger share, more second

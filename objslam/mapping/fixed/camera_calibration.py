@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
 _NARROWER = (0.3, 0.0)
-"""Narrower first associations, which are tried on logs that fit poorly. Each allows for this share of the uncertainty of the
-shared errors. Each further share takes the time of one association."""
+"""If a log fits poorly, narrower first associations are tried. Each of these shares gives one, which allows for this share
+of the uncertainty of the shared errors. Each further share takes the time of one association."""
 _FITS = 2.0
-"""The mean squared miss of a ray, in variances of its noise, up to which the widest association is taken without trying
-others. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take the time
-for others, and rows of equal things are confused more often."""
+"""If the mean squared miss of a ray, in variances of its noise, is at most this, the widest association is taken, and no
+other is tried. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take
+the time for others, and rows of equal things are confused more often."""
 _CLEARLY = 1.75
 """A narrower association is taken if it lowers the mean over all rays of -2 ln of their probability by at least this. In
 simulated orchards and shelves, the right association lowers it by 2.1 to 6.1. If the poses are noisy, one thing may look
@@ -48,10 +48,11 @@ def calibrate_fixed(
 ) -> tuple[FixedPoses, Association, Estimate, tuple[dict[str, int], ...]]:
     """Estimate the shared errors of cameras at known poses, in turns with the association and the objects.
 
-    The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit,
-    and in rows of equal things only what moves rays off their objects. The covariance of the errors is added to the
-    covariance of the objects. Returns the input without the errors, the association, the estimate, and the number of objects
-    in each round. If the errors cannot be estimated, they stay as they were, and the ledger gets a warning.
+    The association allows for the present uncertainty of the errors: first their prior, then the covariance of the last fit.
+    In rows of equal things, it allows only for the part of the uncertainty that moves rays off their objects. The covariance
+    of the errors is added to the covariance of the objects. Returns the input without the errors, the association, the
+    estimate, and the number of objects in each round. If the errors cannot be estimated, they stay as they were, and the
+    ledger gets a warning.
     """
     from objslam.graph.calibration.fixed_pose_calibration import (
         calibrate_at_poses,

@@ -14,11 +14,11 @@ from objslam.core.arrays import Floats
 from objslam.mapping.solution import Solution
 
 _SIGMAS = 2.0
-"""The far end of the ellipsoid, in standard deviations of the inverse depth: the ellipsoid of 95 % of a normal distribution
-reaches as far along one axis. A larger number widens more."""
+"""The distance of the far end from the mean, in standard deviations of the inverse depth. 2 is the reach of 95 % of a normal
+distribution along one axis. A larger number widens more."""
 _MOST = 0.4
 """The largest standard deviation, as a share of the depth, at which the far end counts. From 0.5 on, the far end is at
-infinity. A larger share widens objects more that the rays hardly place."""
+infinity. With a larger share, objects whose place the rays hardly determine become wider."""
 
 
 def with_far_sides(solution: Solution) -> Solution:
@@ -26,8 +26,8 @@ def with_far_sides(solution: Solution) -> Solution:
 
     The standard deviation s along the mean ray of an object at the depth d is that of the inverse depth, s / d^2. The far
     end, at `_SIGMAS` of them, is at d / (1 - `_SIGMAS` s / d), so s becomes s / (1 - `_SIGMAS` s / d). Objects with a
-    measured range keep their covariance, because a range errs as much to both sides. So do, nearly, objects that were seen
-    from many sides: their s is a small share of d.
+    measured range keep their covariance, because a range errs as much to both sides. Objects that were seen from many sides
+    nearly keep it too, because their s is a small share of d.
     """
     rays, estimate = solution.rays, solution.estimate
     index, covariance = solution.association.object, estimate.covariance

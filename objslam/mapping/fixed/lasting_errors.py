@@ -40,8 +40,8 @@ _LARGE_WITH_ODOMETRY = 0.75
 """The same multiple if the odometry also says that the poses err for seconds. Two witnesses need less each: false objects
 take up a part of the errors, so the boxes show too small errors. A larger value warns less often."""
 _FEWEST = 3
-"""A run warns of such errors only if at least this number of objects show them. Boxes of one object lie beside it in the
-same way for seconds, so one object tells little of the poses. A larger number warns less often."""
+"""A run warns of lasting errors only if at least this number of objects show them. All boxes of one object may lie beside
+the object in the same way for seconds, so one object tells little of the poses. A larger number warns less often."""
 _SMALL = 0.2
 """The errors are estimated again with the boxes around the centres of bodies, if they are above this multiple of the noise
 `localization`. A larger value takes less time, and blames the poses for boxes of large things."""
@@ -124,8 +124,8 @@ def check_lasting_noise(noise: LastingNoise, settings: Settings, log: Log) -> Fi
 
 
 def _cells_of(solution: Solution, settings: Settings) -> list[Cells]:
-    """Return the cells of all objects with a covariance. The errors of one entry have one size and one correlation time.
-    Rejected rays, and ranges, do not count."""
+    """Return the cells of all objects with a covariance, in one entry or two. Within an entry, all errors have the same size
+    and the same correlation time. Rejected rays, and ranges, do not count."""
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
     placed = np.isfinite(estimate.covariance[:, 0, 0]) & np.isfinite(estimate.positions[:, 0])
     which = np.flatnonzero((estimate.weight > 0) & (association.object >= 0))

@@ -1,6 +1,6 @@
 """The size of errors of given poses that last for some seconds, from the rays of all objects together.
 
-An object that was seen for a few seconds only fits its place to the errors of these seconds, so its own rays miss it by
+If an object was seen only for a few seconds, its place is fitted to the errors of these seconds, so its own rays miss it by
 little. But the same errors turn the rays to every object of these seconds, and each object can absorb only what a shift of
 its own explains. So the objects count together.
 """
@@ -38,9 +38,9 @@ class Cells:
 
     owner: (C,) the object. times: (C,) s. mean: (C,) rad, the mean angle by which the rays pass the object to the left, or
     above it. white: (C,) rad, the standard deviation of the mean from noise that does not last. shift: (C, n) rad per m, the
-    derivative of the mean by n coordinates of the object. turn, move: (C, 3) rad, the error of the mean by one standard
-    deviation of a rotation of the poses about each axis, and of a shift along it. pull: (C, 3) m per rad, the shift of the
-    object by an error of the mean.
+    derivative of the mean by n coordinates of the object. turn: (C, 3) rad, the error of the mean if the poses are turned
+    about each axis by one standard deviation. move: (C, 3) rad, the same if the poses are shifted along each axis. pull: (C,
+    3) m per rad, the derivative of the object's position by the mean.
     """
 
     owner: Ints

@@ -19,7 +19,8 @@ from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import noise_of_poses
 
 _FEWEST = 4
-"""The fewest rays of an object that counts. Two of them determine its place. A larger number uses fewer objects."""
+"""An object is used if it has at least this number of rays. Two of them determine its place. A larger number uses fewer
+objects."""
 _MOST_POSES = 500
 """The most poses that count, spread evenly. They determine a factor to 3 %. More poses are more exact and slower."""
 _BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])

@@ -20,8 +20,8 @@ _OUTLIER = 3.0
 """The deviation from which a residual does not count, after the first round. With a smaller limit, the noise becomes too
 small. With a larger one, wrong depths count."""
 _LEFT = 0.5
-"""The error of a place that the objects seen from it leave, as a share of the noise of the places. It only widens the limit
-for outliers. On simulated streets it is .4 to .6."""
+"""The error that a place still has after the search corrected it by its objects, as a share of the noise of the places. It
+only widens the limit for outliers, so a larger share rejects fewer residuals. On simulated streets it is 0.4 to 0.6."""
 _ROUNDS = 3
 """How often the noise is estimated, because outliers depend on it. A larger number is more exact and slower."""
 _MOST = (MOST_POSE_NOISE, 20.0, 20.0)

@@ -2,8 +2,8 @@
 
 With the usual noise, the rays of such a log do not meet, and nothing is found whose residuals could show the noise. So the
 objects are searched with many noises. The noise with the most evidence counts: the odds of the objects over stray boxes, and
-how likely it is that they were detected and missed as they were. This is rough. So the noise is then taken from the
-residuals of the objects (`residual_noise`), from several starts.
+how likely their detections and misses are. This is rough. So the noise is then taken from the residuals of the objects
+(`residual_noise`), from several starts.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _LEAD = 15.0
 With cameras turned by 15 degrees and more, it is below 0, and mostly in rooms with turned cameras too. With a larger lead,
 fewer streets are mapped. With a smaller one, wrong mounts are taken for noise."""
 _SURE = 60.0
-"""The lead from which the boxes agree even if few points explain most of them: each thing has few boxes. With a larger lead,
-more right streets with few boxes are called wrong."""
+"""From this lead on, the boxes agree, even if they seem to disagree because each thing has only few boxes. With a larger
+lead, more right streets with few boxes are called wrong."""
 _BETTER = 40.0
 """The least lead, in log odds, of a usual mistake over the log as it is. A straight street looks alike in a mirror, so a
 corrected mistake leads by up to 25 by chance. With a larger lead, mistakes are sooner taken for noise."""
@@ -112,10 +112,11 @@ def with_sparse_noise(
 def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tuple[SparseNoise, ...], float]:
     """Return the noise of a log's places, depths and boxes with which its boxes show objects at the given poses.
 
-    Also return its lead, in log odds, over the log with turned cameras. The likeliest noise comes first, after one that is
-    about as likely and has the noisiest places. There is none if no noise explains most of the boxes, far better
-    than chance and than the noise in the settings. Only noise that the settings let a run estimate is changed. Without
-    depths, the noise in the settings is the only one: with noisy places, bearings meet anywhere.
+    Also return the lead, in log odds, of the log as it is over the log with turned cameras. The first noise has the noisiest
+    places of all that are about as likely as the likeliest one. After it come the others, from the likeliest on. There is
+    none if no noise explains most of the boxes, far better than chance and than the noise in the settings. Only noise that
+    the settings let a run estimate is changed. Without depths, the noise in the settings is the only one: with noisy places,
+    bearings meet anywhere.
     """
     part = middle(log)
     places, depths, boxes = _unknown(part, settings)

@@ -32,7 +32,7 @@ _BOUNDS = np.log([[0.3, 1e-4, 1e-4], [5.0, 0.35, 10.0]])
 """The logarithms of the least and largest factor on the noise of rays, tilt (rad) and height (m). Wider bounds allow rougher
 ground."""
 _TILTS, _HEIGHTS = (0.003, 0.01, 0.03, 0.1), (1e-4, 0.1)
-"""The tilts (rad) and heights (m) among which the search begins at the likeliest. More are slower."""
+"""The tilts (rad) and heights (m) at which the search may begin. It begins at the likeliest pair. More are slower."""
 _STRAY = 3.5
 """The deviation of a stray ray, in standard deviations of the noise that remains. A larger number lets false boxes raise the
 tilt."""
@@ -93,7 +93,7 @@ class _Poses:
 
     @cached_property
     def _told(self) -> Floats:
-        """(n, 1 + P, K) `pulled` and `crossed`, with the poses last."""
+        """(n, 1 + P, K) `pulled`, then `crossed`, as columns of one array with the poses last."""
         return np.ascontiguousarray(np.moveaxis(np.concatenate([self.pulled[:, :, None], self.crossed], axis=2), 0, -1))
 
     def solve(self, logarithms: Floats, alike: Floats | None = None) -> tuple[float, Floats, Floats]:

@@ -36,8 +36,9 @@ _GROSS = 3.0
 """A held error is gross beyond this many standard deviations of usual errors. With a smaller number, the path may bend to
 fit a small error that is not there: at 1.5, an image centre that was off by 20 px became a wrong place."""
 _SUSPECT = 0.6
-"""The least predicted error for which a solve estimates it, as a multiple of what counts as gross, or of a turn that counts.
-A step from a bent path predicts 65 to 90 % of an error. A smaller value does more solves for nothing."""
+"""A solve estimates an error if the predicted error exceeds this share of the limit: the limit of a gross error (`_GROSS`),
+or of a turned camera (`MOVED`). A step from a bent path predicts 65 to 90 % of an error. A smaller share does more solves
+for nothing."""
 _FEWEST = 60
 """The fewest boxes of each half of a drive that show whether a camera turned between them. Fewer boxes agree by chance."""
 
@@ -55,7 +56,7 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
     """Return the shared errors with held errors that are gross, to be estimated too, None if no held error is gross.
 
     errors: those of the solve, as measured. The settings of the returned errors have the prior of the new errors. A setting
-    that is not `auto` is kept, and so is an error of calibration.file, which the log is corrected by.
+    that is not `auto` is kept. An error of calibration.file is kept too, because the log is already corrected by it.
     """
     settings, of = errors.settings, errors.settings.calibration
     file = known_errors(settings)
@@ -140,13 +141,13 @@ def _solved(errors: SharedErrors, solved: Solved) -> Calibration:
 
 
 def _like(errors: SharedErrors, solved: Solved) -> SharedErrors:
-    """Return the errors at the noise of the solved."""
+    """Return the errors with the noise that the solve found."""
     noise = solved.estimate.noise
     return errors if noise is None else errors.with_noise(noise)
 
 
 def _values(errors: SharedErrors, solved: Solved) -> Floats:
-    """Return the values (P,) of the errors in the solved. A held error has its mean there."""
+    """Return the values (P,) of the errors after the solve. A held error has its mean."""
     found = solved.estimate.calibration
     known = {} if found is None else dict(zip(found.names, found.values.tolist(), strict=True))
     means = zip(errors.names, errors.mean.tolist(), strict=True)

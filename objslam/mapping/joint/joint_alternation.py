@@ -35,8 +35,8 @@ _STILL = 0.01
 """The rounds along the most likely path stop when at most this share of the rays changes its object. A larger share stops
 them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
 _RUINED = 200.0
-"""The log odds of the best round against the last above which the best one counts. A merge that is right may first cost 80,
-and ruined maps cost 500 to 5000. With a larger value, a worse map may stay."""
+"""If the log odds of the best round over the last round are at least this, the best round counts, not the last. A merge that
+is right may first cost 80, and ruined maps cost 500 to 5000. With a larger value, a worse map may stay."""
 _WORSE = 2
 """The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
 takes longer, but gets over more rounds in which close objects merge."""

@@ -38,8 +38,8 @@ _SHORT = 500
 its clock in one solve. A larger number is slower."""
 
 _LARGER = 1.5
-"""`warn_of_noise` names a noise if the factor on the noise of the settings exceeds this. A larger factor names less
-noise."""
+"""`warn_of_noise` names a kind of noise if the log shows more than this multiple of its noise in the settings. A larger
+multiple names fewer kinds."""
 
 
 def may_be_by_label(settings: Settings, rays: Rays) -> bool:

@@ -29,7 +29,8 @@ def with_missed_loops(state: JointState) -> JointState:
     together. The copies of the landmarks still have the relative positions of the first ones, which tell the loop.
 
     A closure joins landmarks and is solved at once, at held shared errors. The rounds of association follow after the last
-    closure, because before it they would give the rays of other visits away. state: without a localisation.
+    closure. Earlier rounds would give the rays of visits that are not closed yet to wrong landmarks. state: without a
+    localisation.
     """
     held = replace(state, hold=state.errors is not None)
     best = held

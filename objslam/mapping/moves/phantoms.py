@@ -24,17 +24,18 @@ _LARGE = 1.0
 From this value on, the errors that last are as large as all errors should be. With a larger value, fewer maps take the time
 of the search."""
 _APART = 2.0
-"""Two things of one label cannot be told apart if they are nearer than this multiple of the shift of a ray by the lasting
-errors, at the distance from which they are seen. A ray errs by more than 2 standard deviations in 5 % of the cases. A larger
-value warns of more maps."""
+"""The lasting errors shift a ray. Two things of one label cannot be told apart if they are nearer to each other than this
+multiple of the shift, at the distance from which they are seen. A ray errs by more than 2 standard deviations in 5 % of the
+cases. A larger value warns of more maps."""
 NEIGHBOURS = "equal things nearer than the poses err"
 """The name of the finding that the errors of poses are as large as the distances of equal things."""
 BENT = "a path that may be bent to false objects"
-"""The name of the finding that the odometry contradicts both the poses and the boxes, where labels have several objects."""
+"""The name of the finding that the odometry contradicts both the poses and the boxes. The path may then be bent, because
+some labels have several objects."""
 _BENT = 3.0
-"""If an earlier map at the given poses showed that they err, and the odometry then counts as this many times as noisy as the
-settings say, the path may be bent to false objects, which hide how far the poses err. Nine tenths of the variance are then
-not in the settings. A larger value warns of fewer maps."""
+"""The path may be bent to false objects, which hide how far the poses err, if two things come together. An earlier map at
+the given poses showed that they err, and the odometry now counts as at least this many times as noisy as the settings say.
+From this value on, nine tenths of the variance are not in the settings. A larger value warns of fewer maps."""
 _MOST = 60
 """The most objects that are tried as phantoms, those that are least likely to exist first. Each takes a search of the path
 and a solve. A larger number finds more phantoms in large maps, and takes longer."""
@@ -48,7 +49,8 @@ def has_lasting_errors(state: JointState) -> bool:
 
 
 def begins_with_lasting_errors(state: JointState) -> bool:
-    """Return whether the odometry alone says so, before any ray has an object. False objects hide errors from a solve."""
+    """Return whether the odometry alone says that the localisation errs for seconds, before any ray has an object. False
+    objects hide such errors from a solve."""
     return has_lasting_errors(state) and state.errors is not None and max(lasting_long(state.errors.noise)) >= _LARGE
 
 

@@ -17,8 +17,8 @@ GONE = 0.5
 FORGOTTEN = 0.01
 """The probability below which a site forgets an object that is gone. A larger value forgets sooner."""
 UNPROVEN = 0.9
-"""The largest probability that an object exists after one session found it. It is also the probability if the session has
-none for the object. A larger value trusts single sessions more."""
+"""After one session found an object, the probability that it exists is at most this. If the session gives no probability, it
+is this value. A larger value trusts single sessions more."""
 _DAY = 86_400.0  # The seconds of a day.
 _ALIKE = 2.0
 """The largest ratio of the sizes of an object before and after it moved. With a larger value, more pairs count as one

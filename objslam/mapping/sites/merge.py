@@ -221,8 +221,8 @@ def _follow(tracks: list[Track], begun: list[int], positions: Floats, came: Sequ
 
 
 def _later(young: Track, old: Track) -> bool:
-    """Return whether `young` was first seen after the last session that saw `old`, or within the first session after
-    `old`."""
+    """Return whether `young` was first seen in a later session than the last one that saw `old`. Within the first session,
+    return whether `young` was first seen after `old` was last seen."""
     return young.begun > old.met or (young.begun == old.met == 0 and young.since > old.item.last_seen)
 
 

@@ -22,8 +22,8 @@ _ONE_SIDE = np.radians(35.0)
 """A thing was seen from one side if no view is farther (rad) from the mean view. In simulations, cuboids seen over 60
 degrees and more had one clear heading. A larger angle searches at more things."""
 _RIVAL = 15.0
-"""The largest ln of the evidence by which a cuboid may be less probable than another shape, if its other headings are tried.
-Another heading has raised it by up to 11. A larger number searches at more things."""
+"""Other headings of a cuboid are tried unless another shape has more evidence by more than this (ln). Another heading has
+raised the evidence by up to 11. A larger number searches at more things."""
 _SAME = 0.005
 """Two cuboids are one if no centre and no half axis differs by more than this (m). A larger length merges more of them."""
 
@@ -38,7 +38,7 @@ class OtherCuboids:
 
     @property
     def axes(self) -> Floats:
-        """(M, N, 6) their centres and half axes, m."""
+        """(M, N, 6) the centres and half axes of the cuboids, m."""
         axes = [np.column_stack([one[:, :3], CUBOID.half_axes(one)]) for one in self.values]
         return np.stack(axes) if axes else np.zeros((*self.evidence.shape, 6))
 

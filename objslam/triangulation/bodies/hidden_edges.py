@@ -25,8 +25,8 @@ _OUTER = 0.05
 the outer body grows around the noise of more edges. With a larger share, hidden edges make the outer body too small."""
 _CLEAR = 2.0
 """An edge may be hidden if the body reaches beyond it by this number of standard deviations. The evidence decides whether it
-is. With a larger number, bodies still bend to some hidden edges. With a smaller number, noise makes more visible edges count
-as hidden."""
+is hidden. With a larger number, bodies still bend to some hidden edges. With a smaller number, noise makes more visible
+edges count as hidden."""
 _TURNS = 5
 """How often hidden edges and the body without them are found in turns. Two to four are usual. More are slower."""
 
@@ -56,7 +56,7 @@ class Noise:
 
 
 def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
-    """Return edges with those that are hidden (B, 4) as bounds."""
+    """Return the edges, of which those in the mask `hidden` (B, 4) are bounds too."""
     return replace(edges, bound=edges.bound | hidden)
 
 

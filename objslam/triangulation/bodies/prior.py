@@ -28,8 +28,8 @@ _LEAST = 0.1
 """The least standard deviation of the logarithm of a half axis, in the prior of a label. A smaller value trusts the label
 more."""
 _TIE = 1e-3
-"""The standard deviation, practically 0, of the logarithms by which the half axes of a sphere differ. A larger value allows
-flatter spheres."""
+"""The half axes of a sphere are equal. So the differences of their logarithms have this standard deviation, which is
+practically 0. A larger value allows flatter spheres."""
 
 
 def weak_prior(points: Floats, half: Floats) -> Prior:

@@ -27,10 +27,9 @@ WITHIN = 0.7
 """The correlation between the errors of two boxes from one side, whose directions differ by 10 degrees on average. So the
 mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
 UNLIKE = 0.04
-"""The least standard deviation of the errors that boxes of one side share because no thing has exactly the shape of its
-body, as a share of half the size. The outline of a hexagonal prism differs by 4 % from that of the best cylinder. Things
-that were seen from one side do not show this error, because their bodies bend to it. A larger share makes their depths less
-sure."""
+"""No thing has exactly the shape of its body, so the boxes of one side share an error. This is its least standard deviation,
+as a share of half the size. The outline of a hexagonal prism differs by 4 % from that of the best cylinder. Things that were
+seen from one side do not show this error, because their bodies bend to it. A larger share makes their depths less sure."""
 _ALONG = 1.0
 """The error of a side changes with the distance. This is the standard deviation of the change from a distance to e times
 this distance, in standard deviations of the error. With a larger change, the growth of boxes tells less about the
@@ -216,8 +215,8 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
 def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> tuple[Floats, Floats]:
     """Return `covariance_of`, and what is added to it because no thing has exactly the shape of its body (`UNLIKE`).
 
-    The error of a side also changes with the distance. If it did not, the growth of boxes on the way to a thing would tell
-    its distance exactly, however wrong its outline is.
+    The error of a side also changes with the distance. Otherwise the growth of boxes on the way to a thing would tell its
+    distance exactly, however wrong its outline is.
     """
     count = len(fit.values)
     loose = np.zeros((len(edges), ROWS))

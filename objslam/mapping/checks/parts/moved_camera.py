@@ -37,8 +37,8 @@ MOVED = 0.05
 """If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
 less often."""
 SIGMAS = 5.0
-"""The least difference of a camera's rotation between the halves, in standard deviations, both of the estimate and of the
-jackknife. A larger number warns less often."""
+"""A camera was moved only if its rotation differs between the halves by more than this number of standard deviations. Both
+the standard deviation of the estimate and that of the jackknife count. A larger number warns less often."""
 _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
 """The least difference for which another round of the estimation follows: as a multiple of `MOVED`, and in standard
 deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer

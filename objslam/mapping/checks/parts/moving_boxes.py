@@ -13,9 +13,9 @@ _NEAR_SHARE = 0.1
 _LATER = 2.0
 """The time (s) after which a box shows whether it moved. A longer time shows slower motions, and needs longer stops."""
 _STAYS = 0.25
-"""A box stays if a box of its label is at its place in this share of the frames that show its label and are `_LATER` away.
-Detectors miss a thing in some frames, and moving boxes come back to one place in few. With a larger share, a thing that is
-often missed beside others of its label does not stay."""
+"""Of the other frames with a box of this label, those at least `_LATER` away are compared. A box stays if more than this
+share of them has a box of its label at its place. Detectors miss a thing in some frames, and moving boxes come back to one
+place in few. With a larger share, a thing that is often missed beside others of its label does not stay."""
 _STEP = 0.25
 """The farthest way of a box from one frame to the next, as a share of the image's width. A robot that turns by a radian a
 second moves a box by this much at 4 frames a second. A larger share takes more false boxes for things that move."""
