@@ -10,16 +10,14 @@ from hashlib import sha256
 from objslam.errors import ConfigError, LogError
 from objslam.fleet.stores.open_store import open_source
 from objslam.fleet.stores.store import FileState
+from objslam.sources import SOURCES
 
 DEFAULT_LAYOUT = "{site}/{log}"
 """The default of --layout: the folder that holds a log is its site."""
 NO_SITE = "all"
 """The name of the only site with --by none. With --by folder, it is the site of a log that lies in no folder."""
-_LOG_MARKS = {
-    *("camera.yaml", "cameras", "odometry.txt", "localization.txt", "journal.objslam"),  # Log folders and journals.
-    *("Barcodes.dat", "groundtruth.txt", "groundtruth.txt.gz", "truth_cam_poses.txt"),  # MRCLAM and TUM RGB-D.
-}
-"""Names that make a folder a log. Each kind of recording in `objslam.sources` that is a folder has one of them."""
+_LOG_MARKS = {mark for source in SOURCES for mark in source.marks}
+"""Names that make a folder a log."""
 _BAGS = (".bag", ".mcap", ".db3")
 """The endings of ROS bags. Each may be followed by .zstd or .zst."""
 _BAG_FOLDER = "metadata.yaml"

@@ -36,6 +36,8 @@ class Source:
     detector: "module:function" that takes a path and returns whether the path is of this kind.
     reader: "module:function" that takes (path, ledger), and also the options if the kind has any.
     options: the class of the kind's options, a base class of `SourceOptions`. None if the kind has no options.
+    marks: names of files and folders. A fleet takes a folder with any of them for a recording of this kind. A kind that is
+    a single file has none.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Source:
     detector: str
     reader: str
     options: type[Any] | None = None
+    marks: tuple[str, ...] = ()
 
     def detects(self, path: Path) -> bool:
         """Return whether a path is a recording of this kind."""
@@ -60,6 +63,7 @@ SOURCES = (
         "camera.yaml or cameras/ with odometry.txt or localization.txt",
         "sources.log_folder:is_log_folder",
         "sources.log_folder:read_log_folder",
+        marks=("camera.yaml", "cameras", "odometry.txt", "localization.txt"),
     ),
     Source(
         "mrclam",
@@ -67,6 +71,7 @@ SOURCES = (
         "sources.mrclam.reader:is_mrclam",
         "sources.mrclam.reader:read_mrclam",
         MrclamOptions,
+        marks=("Barcodes.dat",),
     ),
     Source(
         "tum_numbered",
@@ -74,6 +79,7 @@ SOURCES = (
         "sources.tum_rgbd.reader:is_numbered",
         "sources.tum_rgbd.reader:read_numbered",
         TumOptions,
+        marks=("truth_cam_poses.txt",),
     ),
     Source(
         "tum",
@@ -81,12 +87,14 @@ SOURCES = (
         "sources.tum_rgbd.reader:is_stamped",
         "sources.tum_rgbd.reader:read_stamped",
         TumOptions,
+        marks=("groundtruth.txt", "groundtruth.txt.gz"),
     ),
     Source(
         "journal",
         "journal.objslam, the journal of a live session",
         "sources.journal.segments:is_journal",
         "sources.journal.log:read_journal",
+        marks=("journal.objslam",),
     ),
     Source(
         "ros",

@@ -5,6 +5,7 @@ from fleet import fleet_logs  # noqa: F401 - It registers the store that throws.
 
 from objslam.errors import ConfigError, LogError
 from objslam.fleet.logs import Layout, find_logs
+from objslam.sources import SOURCES
 
 
 def touch(folder, *names):
@@ -24,6 +25,12 @@ def test_folders_are_searched_for_logs_of_every_kind(tmp_path):
     assert paths == ["a/drive.mcap", "a/log", "b/bag", "b/ds6", "b/old.bag"]
     assert [one.site for one in found(tmp_path)] == ["a", "a", "b", "b", "b"]
     assert [one.path for one in found(tmp_path / "*", tmp_path / "a")] == [one.path for one in found(tmp_path)]
+
+
+@pytest.mark.parametrize("mark", [mark for source in SOURCES for mark in source.marks])
+def test_a_mark_of_any_source_makes_a_folder_a_log(tmp_path, mark):
+    touch(tmp_path, f"a/drive/{mark}", "a/drive/more/notes.txt", "b/notes.txt")
+    assert [one.path.removeprefix(f"{tmp_path}/") for one in found(tmp_path)] == ["a/drive"]
 
 
 def test_a_path_without_a_log_that_is_named_counts_as_one(tmp_path):
