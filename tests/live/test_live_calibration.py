@@ -13,7 +13,7 @@ from test_session import make_log
 from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.geometry import lift_se2, make_pose
-from objslam.core.rotation import rotation_from_vector
+from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.corrected_log import OdometryCorrection
 from objslam.frontend.shared_errors import SharedErrors
@@ -99,6 +99,8 @@ def test_errors_are_found_while_the_robot_drives_and_the_map_is_better_for_it(lo
     result = without.stop()
     assert result.calibration is not None  # the end estimates them in any case
     assert set(result.summary["calibration"]["parameters"]) >= set(ERRORS)
+    turned = result.cameras[0].base_T_camera[:3, :3] @ log.cameras[0].camera.base_T_camera[:3, :3].T
+    np.testing.assert_allclose(rotation_vector(turned)[2], ERRORS["front.yaw"], atol=0.01)  # It is corrected.
 
 
 @pytest.fixture(scope="module")

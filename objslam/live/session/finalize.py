@@ -163,7 +163,7 @@ def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Soluti
     def solved(into: Ledger, start: Floats | None) -> Solution:
         estimate = batch_solver.solve_joint(keyframes, rays, association, settings, into, start=start, errors=errors)
         measured = (keyframes, rays) if errors is None else without_errors(errors, estimate)
-        return Solution(*measured, association, estimate, ())
+        return Solution(*measured, association, estimate, (), errors=errors)
 
     def cost(solution: Solution) -> float:
         """The cost with the noise of the settings, because each solve may have found another noise."""
