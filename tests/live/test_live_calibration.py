@@ -199,6 +199,13 @@ def test_ranges_and_focal_lengths_are_corrected_in_rays_that_came_before(log):
         np.testing.assert_allclose(m.rays.direction, longer / np.linalg.norm(longer, axis=1, keepdims=True), atol=1e-9)
 
 
+def test_the_sigmas_at_the_end_contain_a_focal_length_that_is_held(log):
+    exact, usual = (drive(log, settings_of(*more)).stop().map.resolved() for more in (("calibration.focal=0",), ()))
+    assert [one.label for one in exact] == [one.label for one in usual]
+    grown = [np.trace(two.covariance) / np.trace(one.covariance) for one, two in zip(exact, usual, strict=True)]
+    assert np.median(grown) > 1.02
+
+
 def test_what_a_session_cannot_observe_stays_as_it_is():
     """Against conditioning by information: a Gauss function at a fixed value of the second parameter."""
     root = np.random.default_rng(1).normal(size=(3, 3)) * [0.3, 2.0, 0.3]
