@@ -60,7 +60,7 @@ def moved_by_held(
     along *= np.sqrt(np.diagonal(errors.prior) + step**2)[held]
     moved = np.zeros((association.count, 3, along.shape[1]))
     by_landmark = reduced.sensitivity[: 3 * len(state.landmarks)] @ along
-    moved[state.landmarks] = by_landmark.reshape(len(state.landmarks), 3, -1)
+    moved[state.landmarks] = by_landmark.reshape(len(state.landmarks), 3, along.shape[1])
     return moved
 
 
