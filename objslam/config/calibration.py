@@ -55,7 +55,8 @@ class CalibrationSettings(Section):
     and the detector of the corners each add to it. It is estimated in joint mode only."""
     focal: Literal["auto"] | NotNegative = "auto"
     """share by which the focal length of each camera is too long or too short. auto: 0.02 in fixed mode and with a
-    localisation, 0 in joint mode with odometry alone, unless its map shows a gross error."""
+    localisation. In joint mode with odometry alone, it is estimated only if the map shows a gross error. Otherwise the
+    covariances contain 0.02. 0: it is exact."""
     centre: NotNegative = 0.02
     """share of the focal length by which the image centre of each camera is off, along each axis. The
     default is usual for a centre that is assumed in the middle of the image. A calibrated centre errs by less."""

@@ -38,7 +38,7 @@ from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasti
 from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
-from objslam.mapping.joint.held_errors import check_turned_camera
+from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.progress import Progress
@@ -143,6 +143,8 @@ def _run(
         diagnosis = diagnosis.with_findings(check_turned_camera(errors, solution))
     say(diagnosis, ledger)
     if errors is not None:
+        if settings.mode == "joint":
+            solution = with_held_errors(errors, solution)
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(c.camera for c in log.cameras)
         if settings.checks.use:

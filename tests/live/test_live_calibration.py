@@ -13,7 +13,7 @@ from test_session import make_log
 from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.geometry import lift_se2, make_pose
-from objslam.core.rotation import rotation_from_vector
+from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.corrected_log import OdometryCorrection
 from objslam.frontend.shared_errors import SharedErrors
@@ -99,6 +99,8 @@ def test_errors_are_found_while_the_robot_drives_and_the_map_is_better_for_it(lo
     result = without.stop()
     assert result.calibration is not None  # the end estimates them in any case
     assert set(result.summary["calibration"]["parameters"]) >= set(ERRORS)
+    turned = result.cameras[0].base_T_camera[:3, :3] @ log.cameras[0].camera.base_T_camera[:3, :3].T
+    np.testing.assert_allclose(rotation_vector(turned)[2], ERRORS["front.yaw"], atol=0.01)  # It is corrected.
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +197,13 @@ def test_ranges_and_focal_lengths_are_corrected_in_rays_that_came_before(log):
         np.testing.assert_allclose(m.rays.range, before * (1 + values[0]), rtol=1e-9)
         longer = direction * [1, 1, 1 + values[1]]
         np.testing.assert_allclose(m.rays.direction, longer / np.linalg.norm(longer, axis=1, keepdims=True), atol=1e-9)
+
+
+def test_the_sigmas_at_the_end_contain_a_focal_length_that_is_held(log):
+    exact, usual = (drive(log, settings_of(*more)).stop().map.resolved() for more in (("calibration.focal=0",), ()))
+    assert [one.label for one in exact] == [one.label for one in usual]
+    grown = [np.trace(two.covariance) / np.trace(one.covariance) for one, two in zip(exact, usual, strict=True)]
+    assert np.median(grown) > 1.02
 
 
 def test_what_a_session_cannot_observe_stays_as_it_is():

@@ -67,19 +67,80 @@ def test_usual_errors_stay_held(errors):
     assert not any("moved the camera" in warning for warning in ledger.warnings)
 
 
-def test_a_setting_of_the_user_is_kept():
-    log = add_shared_errors(drive(0), {"front.y": -0.2})
-    settings = load_settings(None, (*SETTINGS, "calibration.translation=0"))
+@pytest.mark.parametrize("value", [-0.055, 0.055])
+def test_the_sigmas_contain_a_focal_length_that_stays_held(value):
+    """It is 2.7 usual standard deviations off, so it is not gross. A user may say that the lens is exact."""
+    log, over = add_shared_errors(drive(2), {"front.focal": value}), []
+    for more in ((), ("calibration.focal=0",)):
+        result, _ = run(log, *more)
+        assert "front.focal" not in result.calibration.names
+        matches = evaluate(result.map, log.truth, align="se2", radius=1.0).objects.matches
+        assert len(matches) == 10
+        over.append(sum(match.squared_3d > 13.9 for match in matches))
+    assert over[0] == 0
+    assert over[1] > 0
+
+
+def test_the_sigmas_of_a_right_camera_hardly_grow():
+    sigma = []
+    for more in ((), ("calibration.focal=0",)):
+        objects = run(drive(0), *more)[0].map.resolved()
+        sigma.append(np.median([np.sqrt(np.linalg.eigvalsh(one.covariance)[-1]) for one in objects]))
+    assert 1.0 < sigma[0] / sigma[1] < 1.2
+
+
+def test_a_held_focal_length_moves_the_map_as_solves_with_other_ones_do(monkeypatch):
+    """The solves converge, and their estimated errors follow the focal length."""
+    from objslam.graph.batch_solver import solve_joint
+    from objslam.graph.calibration import self_calibration
+    from objslam.graph.calibration.next_step import moved_by_held, predict
+
+    monkeypatch.setattr(self_calibration, "_CONVERGED", 1e-3)
+    monkeypatch.setattr(self_calibration, "_ROUNDS", 30)
+
+    wrong, positions = 0.005, []
+    solution, settings = solved(drive(0), "noise.rays=false", "noise.odometry=false")
+    for value in (wrong, -wrong):
+        log = add_shared_errors(drive(0), {"front.focal": value})
+        frames = build_keyframes(log, settings, Ledger())
+        measured = seen_something(frames, build_rays(log, frames, settings, Ledger()))
+        errors = shared_errors(log, *measured, settings)
+        start = solution.estimate.map_T_base @ solution.keyframes.base_T_camera
+        given = *measured, solution.association, settings, Ledger()
+        held = solve_joint(*given, start=start, errors=errors, theta=solution.estimate.calibration.values)
+        positions.append(held.positions)
+    expected = (positions[0] - positions[1]) / (2 * wrong)
+
+    of = settings.calibration.model_copy(update={"focal": 0.02})
+    wider = solution.errors.settings.model_copy(update={"calibration": of})
+    errors = shared_errors(solution.errors.log, solution.errors.keyframes, solution.errors.rays, wider)
+    at = np.array([name == "front.focal" for name in errors.names])
+    theta = np.zeros(len(at))
+    theta[~at] = solution.estimate.calibration.values
+    given = errors, solution.association, solution.estimate, theta
+    usual = np.hypot(0.02, predict(*given).values[at])
+    moved = moved_by_held(*given, at)[:, :, 0] / usual
+    assert np.linalg.norm(expected) > 1.0  # Metres for each unit of the error.
+    assert np.linalg.norm(moved + expected) < 0.18 * np.linalg.norm(expected)  # 0.23 if they did not follow.
+
+
+def solved(log: Log, *more: str):
+    """The solution and the settings of a drive."""
+    settings = load_settings(None, (*SETTINGS, *more))
     frames = build_keyframes(log, settings, Ledger())
     rays = build_rays(log, frames, settings, Ledger())
     errors = shared_errors(log, *seen_something(frames, rays), settings)
     cameras = tuple(one.camera for one in log.cameras)
-    solution = solve(frames, rays, cameras, settings, Ledger(), lambda *_: None, errors=errors)
-    assert solution.errors.names == errors.names
-    solved = Solved(solution.association, solution.estimate, solution.keyframes)
-    assert with_gross_errors(errors, solved) is None
+    return solve(frames, rays, cameras, settings, Ledger(), lambda *_: None, errors=errors), settings
+
+
+def test_a_setting_of_the_user_is_kept():
+    solution, settings = solved(add_shared_errors(drive(0), {"front.y": -0.2}), "calibration.translation=0")
+    errors = solution.errors
+    found = Solved(solution.association, solution.estimate, solution.keyframes)
+    assert with_gross_errors(errors, found) is None
     other = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"translation": "auto"})})
-    wider = with_gross_errors(replace(errors, settings=other), solved)
+    wider = with_gross_errors(replace(errors, settings=other), found)
     assert set(wider.names) - set(errors.names) == {"front.x", "front.y", "front.z"}
 
 
@@ -129,13 +190,8 @@ def test_an_odometry_that_turns_in_the_middle_is_no_turned_camera():
 def test_a_step_from_an_optimum_stays_there():
     from objslam.graph.calibration.next_step import predict
 
-    log = add_shared_errors(drive(0), {"front.yaw": 0.03, "front.clock": 0.1})
-    settings = load_settings(None, SETTINGS)
-    frames = build_keyframes(log, settings, Ledger())
-    rays = build_rays(log, frames, settings, Ledger())
-    errors = shared_errors(log, *seen_something(frames, rays), settings)
-    cameras = tuple(one.camera for one in log.cameras)
-    solution = solve(frames, rays, cameras, settings, Ledger(), lambda *_: None, errors=errors)
+    solution, _ = solved(add_shared_errors(drive(0), {"front.yaw": 0.03, "front.clock": 0.1}))
+    errors = solution.errors
     found = solution.estimate.calibration
     again = predict(errors.with_noise(solution.estimate.noise), solution.association, solution.estimate, found.values)
     assert np.abs((again.values - found.values) / found.sigma).max() < 0.25

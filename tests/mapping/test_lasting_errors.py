@@ -14,8 +14,9 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log
+from objslam.errors import SolveError
 from objslam.mapping import pipeline
-from objslam.mapping.fixed.lasting_noise import _FACTORS, _KINDS, _LOOSE, TIMES, Cells, lasting_variances
+from objslam.mapping.fixed.lasting_noise import _FACTORS, _KINDS, _LOOSE, TIMES, Cells, _misfits, lasting_variances
 from objslam.simulation import PoseNoise, preset, simulate
 
 
@@ -112,6 +113,26 @@ def test_the_likelihood_is_that_of_the_normal_distribution(objects):
     weight = np.exp(posterior - posterior.max()) * np.gradient(_FACTORS)
     expected = np.einsum("mtf,f,mk->kt", weight / weight.sum(), _FACTORS**2, _KINDS)
     np.testing.assert_allclose(lasting_variances(cells), expected, rtol=1e-8)
+
+
+@pytest.mark.parametrize("column", ["mean", "white", "turn"])
+def test_misses_that_are_not_finite_are_an_error(column):
+    rng = np.random.default_rng(0)
+    cells = drawn(rng.uniform(0, 60, 40), np.repeat(np.arange(4), 10), (1.0, 1.0), 4.0, rng)
+    values = getattr(cells, column).copy()
+    values[3] = np.nan
+    with pytest.raises(SolveError, match="not finite"):
+        lasting_variances(replace(cells, **{column: values}))
+
+
+def test_a_negative_eigenvalue_by_rounding_counts_as_0():
+    rotation = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    size, mean, factors = np.array([-0.3, 0.0, 2.0]), np.array([1.0, -2.0, 0.5]), np.array([0.5, 5.0])
+    found = _misfits(np.asfortranarray(rotation * size @ rotation.T), mean, factors)
+    for factor, misfit in zip(factors, found, strict=True):
+        covariance = np.eye(3) + factor * rotation * np.maximum(size, 0.0) @ rotation.T
+        expected = mean @ np.linalg.solve(covariance, mean) + np.linalg.slogdet(covariance)[1]
+        assert misfit == pytest.approx(expected)
 
 
 def test_objects_that_were_seen_once_show_the_errors_that_they_share():

@@ -13,6 +13,7 @@ from objslam.core.ground.flattening import flattened_lines, flattened_points, ra
 from objslam.core.ground.rise import rise_of
 from objslam.core.result import RunResult
 from objslam.core.types import Log
+from objslam.errors import SolveError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.agreement import agreement, bounded_part
 from objslam.mapping.ground.common_tilt import _PLACE, _Poses
@@ -142,3 +143,13 @@ def test_the_likelihood_is_that_of_the_normal_distribution(kinds, lasts):
     assert cost == pytest.approx(fit, rel=1e-7)
     np.testing.assert_allclose(found, effects.T @ pull, rtol=1e-6)
     np.testing.assert_allclose(errors, sigma * np.einsum("rki,r->ki", shared, pull), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("lasts", [False, True])
+def test_rays_that_are_not_finite_are_an_error(lasts):
+    rng, poses = np.random.default_rng(0), 8
+    pose = np.repeat(np.arange(poses), 4)
+    miss, by_pose, effects = rng.standard_normal(32), rng.standard_normal((32, 3)), rng.standard_normal((32, 4))
+    by_pose[5, 0] = np.nan
+    with pytest.raises(SolveError, match="not finite"):
+        _Poses.of(miss, by_pose, effects, pose, 20.0).solve(np.zeros(3), np.eye(poses) if lasts else None)

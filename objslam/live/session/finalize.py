@@ -26,6 +26,7 @@ from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.joint.doubted_labels import doubted_names
+from objslam.mapping.joint.held_errors import with_held_errors
 from objslam.mapping.joint.labels import labels_tell
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.solution import Solution, without_errors
@@ -57,7 +58,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     solution = _solved(found, m.by_label, cameras, settings, ledger)
     if solution.errors is not None:
         errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
-        solution, log = corrected(solution, errors, ledger)
+        solution, log = corrected(with_held_errors(errors, solution), errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
     solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)
@@ -163,7 +164,7 @@ def _solve_joint(found: Collected, settings: Settings, ledger: Ledger) -> Soluti
     def solved(into: Ledger, start: Floats | None) -> Solution:
         estimate = batch_solver.solve_joint(keyframes, rays, association, settings, into, start=start, errors=errors)
         measured = (keyframes, rays) if errors is None else without_errors(errors, estimate)
-        return Solution(*measured, association, estimate, ())
+        return Solution(*measured, association, estimate, (), errors=errors)
 
     def cost(solution: Solution) -> float:
         """The cost with the noise of the settings, because each solve may have found another noise."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.errors import SolveError
 
 TIMES = (1.0, 4.0, 16.0, 64.0)
 """The correlation times (s) of errors, after which the correlation is 1/e. The shortest fits a jump of a scan matcher, the
@@ -104,14 +105,14 @@ def lasting_variances(cells: Cells) -> Floats:
 
     The factor has a half-normal prior of 1. Its likelihood is restricted (Patterson and Thompson 1971): the errors of the
     positions of all objects are integrated out. The mixture, the factor and the correlation time are averaged over their
-    posterior.
+    posterior. SolveError if the likelihood is not finite.
     """
     cells = cells.take(_counted(cells.times))
     from scipy.linalg.lapack import dpotrf, dsygst, dtrtrs  # Here, so that `load_libraries` comes first.
 
     same = cells.owner[:, None] == cells.owner
     known = np.diag(cells.white**2) + _LOOSE**2 * np.where(same, cells.shift @ cells.shift.T, 0.0)
-    root, _ = dpotrf(np.asfortranarray(known), lower=1, overwrite_a=1)
+    root, failed = dpotrf(np.asfortranarray(known), lower=1, overwrite_a=1)
     mean, squared = dtrtrs(root, cells.mean, lower=1)[0], _FACTORS**2
     likelihood = np.tile(-0.5 * squared, (len(_KINDS), len(TIMES), 1))
     kinds = [cells._errors(one) for one in np.eye(2)]
@@ -121,6 +122,8 @@ def lasting_variances(cells: Cells) -> Floats:
         turned, moved = (dsygst((errors * alike).T, root, itype=1, lower=1, overwrite_a=1)[0] for errors in kinds)
         for row, (turns, moves) in zip(likelihood[:, column], _KINDS.tolist(), strict=True):
             row -= 0.5 * _misfits(turns * turned + moves * moved, mean, squared)
+    if failed or not np.isfinite(likelihood).all():  # LAPACK does not report a NaN.
+        raise SolveError("the errors of the poses that last cannot be estimated, because the misses are not finite")
     weight = np.exp(likelihood - likelihood.max()) * np.gradient(_FACTORS)
     return np.asarray(np.einsum("mtf,f,mk->kt", weight, squared, _KINDS) / weight.sum())
 
@@ -132,6 +135,7 @@ def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
     covariance: (C, C) symmetric. Only its lower triangle counts, and it is overwritten. It is made tridiagonal once, and all
     factors together are one tridiagonal system. This takes a third of the time of eigenvalues with their vectors.
     """
+    from scipy.linalg import eigh_tridiagonal
     from scipy.linalg.lapack import dormqr, dptsv, dsytrd, dsytrd_lwork  # Here, so that `load_libraries` comes first.
 
     diagonal, beside, count = np.diagonal(covariance), np.zeros(0), len(mean)
@@ -142,7 +146,11 @@ def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
         mean = np.append(mean[0], turned)
     right = np.tile(mean, len(factors))
     of_all = (1 + np.outer(factors, diagonal)).ravel(), np.outer(factors, np.append(beside, 0.0)).ravel()[:-1]
-    pivots, _, solved, _ = dptsv(*of_all, right)
+    pivots, _, solved, failed = dptsv(*of_all, right)
+    if failed:  # Rounding made an eigenvalue so negative that the sum is not positive definite.
+        size, vectors = eigh_tridiagonal(diagonal, beside)
+        variance = 1 + factors[:, None] * np.maximum(size, 0.0)
+        return np.asarray(((vectors.T @ mean) ** 2 / variance + np.log(variance)).sum(axis=1))
     return np.asarray((right * solved + np.log(pivots)).reshape(len(factors), count).sum(axis=1))
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from objslam.association.observations import MIN_DEPTH
 from objslam.core.arrays import Floats, Ints
 from objslam.core.types import Keyframes, Rays
+from objslam.errors import SolveError
 from objslam.mapping.fixed.pose_noise import least_cost
 
 _MOST_POSES = 300
@@ -100,7 +101,7 @@ class _Poses:
         """Return -2 ln of the restricted likelihood, the effects (P,), and the errors of the poses (K, n).
 
         logarithms: (3,) of the factor on the noise of rays, of the tilt, rad, and of the height, m. alike: (K, K) the
-        correlation of the errors of two poses, None if they are independent.
+        correlation of the errors of two poses, None if they are independent. SolveError if the system is not finite.
         """
         factor, tilt, height = np.exp(logarithms)
         sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[: self.pulled.shape[1]] / factor
@@ -205,7 +206,7 @@ def _of_each(inner: Floats, told: Floats) -> _Solved:
     for i in range(n - 1):
         share = rows[i + 1 :, i] / rows[i, i]
         rows[i + 1 :, i + 1 :] -= share[:, None] * rows[i, i + 1 :]
-    pivots = rows[np.arange(n), np.arange(n)]
+    pivots = _positive(rows[np.arange(n), np.arange(n)])
     rows /= np.sqrt(pivots)[:, None]
 
     def back(white: Floats) -> Floats:
@@ -222,12 +223,21 @@ def _of_all(inner: Floats, told: Floats) -> _Solved:
     from scipy.linalg.lapack import dpotrf, dtrtrs  # Here, so that `load_libraries` comes first.
 
     root, _ = dpotrf((inner + np.eye(len(inner))).T, lower=1, clean=0, overwrite_a=1)
+    pivots = _positive(np.diagonal(root))  # They are not, or not finite, if LAPACK failed.
     white, _ = dtrtrs(root, told, lower=1)
     return (
         white,
-        float(2 * np.log(np.diagonal(root)).sum()),
+        float(2 * np.log(pivots).sum()),
         lambda right: np.asarray(dtrtrs(root, right, lower=1, trans=1)[0]),
     )
+
+
+def _positive(pivots: Floats) -> Floats:
+    """Return the pivots of a factorisation. SolveError if one is not a positive number, because 1 + A is positive definite
+    for all finite rays."""
+    if not (np.isfinite(pivots) & (pivots > 0)).all():
+        raise SolveError("the errors that the rays of a pose share are not finite")
+    return pivots
 
 
 def common_tilt(keyframes: Keyframes, rays: Rays, point: Ints, points: Floats, prior: float) -> CommonTilt | None:
