@@ -44,8 +44,8 @@ and a solve. A larger number finds more phantoms in large maps, and takes longer
 
 
 def has_lasting_errors(state: JointState) -> bool:
-    """Return whether the noise of the state says that the localisation errs for seconds, and odometry tells the motions."""
-    if state.errors is None or not state.keyframes.localized_every or state.keyframes.odom_T_base is None:
+    """Return whether the noise of the state says that the localisation errs for seconds."""
+    if state.errors is None or not state.keyframes.localized_every:
         return False
     return bool(max(state.errors.noise.lasting_factors) >= _LARGE)
 
