@@ -58,15 +58,18 @@ def run(
 ) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode. So
-    is a log with odometry, and with localised poses at which no object has a place.
+    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode,
+    if it has odometry too, or if its noise is not told. So is a log with odometry, and with localised poses at which no
+    object has a place.
     known: the map of another day. If the drive is found in it, the result is in its frame, and its objects count as priors.
     LogError if the log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path.
     SolveError if no box gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
     result, wrong, lasting = _run(log, settings, ledger, progress, known)
-    if settings.mode != "auto" or not wrong or (lasting is None and chosen_poses(log, settings).odometry is None):
+    # Without odometry, the second solve takes the noise of the localisation from the rays, unless the settings tell it.
+    untold = lasting is not None and settings.localization == Settings().localization
+    if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
         return result
     at_poses = ledger.copy()
     ledger.restore(before)  # What a run drops counts once.
