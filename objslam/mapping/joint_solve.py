@@ -130,7 +130,9 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         found = _improved(_from_start(state, start), JointState.relocalized)
         state = _or_as_in_fixed_mode(state, found) if start is None else found
         if doubtful or has_lasting_errors(state):
-            state = without_phantoms(_anew(state.split()))
+            state = _anew(state.split())
+            if state.keyframes.odom_T_base is not None:  # It tells the motions of the path through a map without phantoms.
+                state = without_phantoms(state)
     else:
         begin, path = with_errors_of_tracks(state)
         start, sure = explored(begin)

@@ -25,6 +25,7 @@ from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
 from objslam.mapping.checks.depth_axis import check_depth_axis
 from objslam.mapping.checks.diagnosis import Diagnosis, diagnose
+from objslam.mapping.checks.finding import JUMPS
 from objslam.mapping.checks.jumps import taken_out
 from objslam.mapping.checks.misfits import find_misfits, with_misfits
 from objslam.mapping.checks.residuals import check_pose_noise, check_residuals
@@ -57,15 +58,18 @@ def run(
 ) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
-    it has odometry too. A log with localised poses at which no object has a place is solved once more, too. known: the map
-    of another day. If the drive is found in it, the result is in its frame, and its objects count as priors. LogError if the
-    log lacks the chosen poses, if its stamps have different units, or if no frame lies on the path. SolveError if no box
-    gives a usable ray. ConfigError if calibration.file is wrong or does not fit the log.
+    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode,
+    if it has odometry too, or if the settings do not tell the noise of the localisation. A log that has odometry, and
+    localised poses at which no object has a place, is solved once more, too. known: the map of another day. If the drive is
+    found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if
+    its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
+    calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
     result, wrong, lasting = _run(log, settings, ledger, progress, known)
-    if settings.mode != "auto" or not wrong or chosen_poses(log, settings).odometry is None:
+    # Without odometry, the second solve takes the noise of the localisation from the rays, unless the settings tell it.
+    untold = lasting is not None and settings.localization == Settings().localization
+    if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
         return result
     at_poses = ledger.copy()
     ledger.restore(before)  # What a run drops counts once.
@@ -164,7 +168,8 @@ def _run(
     keyframes, estimate = solution.keyframes, solution.estimate
     trusted = not diagnosis.spoilt
     objects, residual = describe(solution, cameras, settings, trusted=trusted)
-    if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings:
+    explained = any(one.spoils or one.name != JUMPS for one in diagnosis.findings)
+    if settings.checks.use and settings.mode == "fixed" and keyframes.localized_every and not explained:
         calibrated, held = estimate.calibration is not None, (keyframes, solution.rays, solution.association)
         noisy = check_pose_noise(objects, *held, settings, calibrated=calibrated)
         missing = noisy or check_residuals(objects, *held, residual, settings, calibrated=calibrated)

@@ -86,7 +86,7 @@ def test_a_path_that_may_be_bent_to_false_objects_is_named(turning, labels, told
     """Only if a map at the given poses showed that they err. Things 4 m apart are not exchanged by errors of 0.2 degrees."""
     poses = np.broadcast_to(np.eye(4), (2, 4, 4))
     solution = SimpleNamespace(
-        keyframes=SimpleNamespace(localized_every=1.0),
+        keyframes=SimpleNamespace(localized_every=1.0, odom_T_base=poses),
         rays=SimpleNamespace(keyframe=np.array([0, 1])),
         association=SimpleNamespace(object=np.array([0, 1]), label=np.array(labels), count=2),
         estimate=SimpleNamespace(

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+JUMPS = "localisation jumps"
+"""The name of the finding that a localisation jumps. If it does so often, it errs for seconds."""
 NOISIER = "noise"
 """The name of the finding that a log is far noisier than the settings say. It is no error of the input."""
 

@@ -8,7 +8,7 @@ from objslam.config import Settings
 from objslam.core.types import Log
 from objslam.frontend.localization_jumps import Jumps, find_jumps
 from objslam.mapping.checks.agreement import agreements, bounded_part
-from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.finding import JUMPS, Finding
 
 _LOSS = 0.02
 """The loss of score (`Agreement.score`) that shows that the jumps are right. A localisation that drifts for a while and then
@@ -37,7 +37,7 @@ def corrected_jumps(jumps: Jumps) -> Finding:
     """Return the finding about jumps that a run takes out."""
     way, angle = np.linalg.norm(jumps.moves[0]), np.degrees(np.linalg.norm(jumps.turns[0]))
     return Finding(
-        "localisation jumps",
+        JUMPS,
         f"the localisation jumps {len(jumps)} time{'' if len(jumps) == 1 else 's'} (first by {way:.2f} m and "
         f"{angle:.0f} deg at stamp {jumps.stamps[0]:.3f}): the run moves the poses on both sides together. It does not know "
         f"which side was right, so the whole map may be off by {jumps.sigma:.2f} m, and its sigmas contain this",

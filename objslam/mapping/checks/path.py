@@ -12,7 +12,7 @@ from objslam.core.rotation import rotation_vector
 from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.odometry_restarts import counts_from_zero
-from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.finding import JUMPS, Finding
 from objslam.mapping.checks.parts.moving_boxes import boxes_move
 
 FASTEST = 40.0
@@ -123,7 +123,7 @@ def _compare_steps(localization: Trajectory, odometry: Trajectory, max_gap: floa
     if jumps.any():
         first = int(np.argmax(jumps))
         yield Finding(
-            "localisation jumps",
+            JUMPS,
             f"the localisation moves by {way[first]:.2f} m and {np.degrees(angle[first]):.0f} deg in one step which the "
             f"odometry does not show, at stamp {localization.stamps[pair[first] + 1]:.3f}"
             f"{_and_more(int(jumps.sum()) - 1)}: poses before and after a jump do not belong together",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import grouped_median
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.joint.relocalization import relocalize
@@ -36,14 +37,16 @@ _BENT = 3.0
 """The path may be bent to false objects, which hide how far the poses err, if two things come together. An earlier map at
 the given poses showed that they err, and the odometry now counts as at least this many times as noisy as the settings say.
 From this value on, nine tenths of the variance are not in the settings. A larger value warns of fewer maps."""
+UNTOLD = "errors of poses that the solve does not show"
+"""The name of the finding that a map at the given poses shows large errors of the poses, and the solved map shows none."""
 _MOST = 60
 """The most objects that are tried as phantoms, those that are least likely to exist first. Each takes a search of the path
 and a solve. A larger number finds more phantoms in large maps, and takes longer."""
 
 
 def has_lasting_errors(state: JointState) -> bool:
-    """Return whether the noise of the state says that the localisation errs for seconds, and odometry tells the motions."""
-    if state.errors is None or not state.keyframes.localized_every or state.keyframes.odom_T_base is None:
+    """Return whether the noise of the state says that the localisation errs for seconds."""
+    if state.errors is None or not state.keyframes.localized_every:
         return False
     return bool(max(state.errors.noise.lasting_factors) >= _LARGE)
 
@@ -61,14 +64,14 @@ def check_neighbours(
 
     All rays of these seconds pass their things on the same side, so a ray to one thing may point at its neighbour. The solve
     bends the path until such rays fit, so the residuals do not show it. The odometry may show it, or an earlier map at the
-    given poses.
+    given poses. If only this map shows errors, false objects may hide them from the solve.
     errors: of all frames, before the solve. earlier: the errors of headings, rad, and of places, m, that an earlier map at
     the given poses showed.
     """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
-    noise = estimate.noise
+    noise = estimate.noise or NoiseFactors()
     number = np.bincount(association.label[np.isfinite(estimate.covariance[:, 0, 0])])
-    if noise is None or not keyframes.localized_every or number.max(initial=0) < 2:
+    if not keyframes.localized_every or number.max(initial=0) < 2:
         return None
     said = np.array([settings.localization.yaw, settings.localization.xy])
     size = np.maximum(noise.lasting_factors, lasting_by_odometry(errors)) * said
@@ -93,6 +96,14 @@ def check_neighbours(
             "path may be bent to objects that are false"
         )
         return Finding(BENT, message, spoils=False)
+    alone, seen = keyframes.odom_T_base is None, max(noise.heading, noise.place)
+    if not near.any() and earlier is not None and alone and seen < np.hypot(1.0, _LARGE):
+        message = (
+            f"at the given poses, the boxes show that the localisation errs by {np.degrees(earlier[0]):.2g} deg and "
+            f"{100 * earlier[1]:.2g} cm for seconds, but the solved map shows smaller errors. "
+            f"{int(equal.any(axis=1).sum())} of {len(placed)} objects share their label with others, and may be false"
+        )
+        return Finding(UNTOLD, message, spoils=False)
     if not near.any():
         return None
     many = int(near.any(axis=1).sum())

@@ -1,0 +1,100 @@
+"""Mode auto at a localisation without odometry: if it errs for seconds, the rays alone tell the poses."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_lasting_errors import with_lasting
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.noise import NoiseFactors
+from objslam.core.types import Log
+from objslam.mapping import joint_solve, pipeline
+from objslam.mapping.moves.phantoms import UNTOLD, check_neighbours
+from objslam.simulation import PoseNoise, preset, simulate
+
+QUIET = ("bodies.use=false", "output.recording=false")
+
+
+def drive(jumps: bool) -> Log:
+    """Three and a half minutes among twelve things of three labels. The localisation errs for four seconds at a time, or
+    steps to a new error every four seconds, as a particle filter does that follows wheels and then corrects itself."""
+    log = simulate(
+        preset(
+            "demo",
+            odometry=None,
+            objects=12,
+            classes=3,
+            frames=200,
+            false=0.0,
+            pixel_sigma=1.0,
+            localization=PoseNoise(xy=0.005, yaw=0.001),
+        ),
+        3,
+    )
+    if not jumps:
+        return with_lasting(log, 5.0, 4.0, 3)
+    path, rng = log.localization, np.random.default_rng(3)
+    part = (path.stamps // 4).astype(np.int64)
+    off = rng.normal(0, 0.15, (part.max() + 1, 2))[part]
+    poses = path.poses.copy()
+    poses[:, :2, 3] += off
+    return replace(log, localization=replace(path, poses=poses))
+
+
+def mapped(log: Log, *overrides: str) -> tuple[str, tuple[int, int, int]]:
+    """The mode of a run, which chooses it by default, and the numbers of right, false and missed things. A right object is
+    within 0.2 m, and within its sigmas: the squared Mahalanobis distance is below 16.3, the quantile of 99.9 %."""
+    result = pipeline.run(log, load_settings(None, (*QUIET, *overrides)), Ledger())
+    free, right = list(log.truth.objects), 0
+    for item in result.map.resolved():
+        off = {t.id: item.position - t.position for t in free if t.label == item.label}
+        near = min(off, key=lambda i: np.linalg.norm(off[i]), default=None)
+        if near is None or np.linalg.norm(off[near]) > 0.2:
+            continue
+        if off[near] @ np.linalg.solve(item.covariance, off[near]) < 16.3:
+            right, free = right + 1, [t for t in free if t.id != near]
+    return result.summary["mode"], (right, len(result.map.resolved()) - right, len(free))
+
+
+@pytest.mark.parametrize("jumps", [False, True])
+def test_poses_that_err_for_seconds_are_solved_without_odometry(jumps):
+    """A log whose localisation steps often has the finding that it jumps. The steps are errors that last for seconds."""
+    mode, numbers = mapped(drive(jumps))
+    assert mode == "joint"
+    assert numbers == (12, 0, 0)  # In fixed mode (6, 6, 6) and (7, 4, 5).
+
+
+def test_the_association_begins_anew_at_the_solved_poses(monkeypatch):
+    """The first association was at poses that err. The search for phantoms needs the motions that odometry measures."""
+    calls, anew = [], joint_solve._anew
+    monkeypatch.setattr(joint_solve, "_anew", lambda state: calls.append(state) or anew(state))
+    monkeypatch.setattr(joint_solve, "without_phantoms", lambda state: pytest.fail("phantoms were searched"))
+    mode, numbers = mapped(drive(jumps=False), "mode=joint", "checks.use=false")
+    assert mode == "joint"
+    assert numbers == (12, 0, 0)
+    (state,) = calls
+    assert max(state.errors.noise.lasting_factors) > 1
+
+
+@pytest.mark.parametrize(("heading", "labels", "told"), [(1.0, [0, 0], True), (3.0, [0, 0], False), (1.0, [0, 1], False)])
+def test_errors_that_only_the_given_poses_show_are_named(heading, labels, told):
+    """Two objects of one label may be one thing, and hide the errors. Two labels hide nothing."""
+    solution = SimpleNamespace(
+        keyframes=SimpleNamespace(localized_every=1.0, odom_T_base=None),
+        rays=SimpleNamespace(keyframe=np.array([0, 1])),
+        association=SimpleNamespace(object=np.array([0, 1]), label=np.array(labels), count=2),
+        estimate=SimpleNamespace(
+            noise=NoiseFactors(heading=heading),
+            weight=np.ones(2),
+            map_T_base=np.broadcast_to(np.eye(4), (2, 4, 4)),
+            positions=np.array([[2.0, 2.0, 0.0], [2.0, -2.0, 0.0]]),
+            covariance=np.broadcast_to(1e-4 * np.eye(3), (2, 3, 3)),
+        ),
+    )
+    settings, earlier = load_settings(None, ()), (0.008, 0.02)
+    found = check_neighbours(solution, None, settings, earlier)
+    assert (found is not None and found.name == UNTOLD) == told
+    assert check_neighbours(solution, None, settings) is None
