@@ -1,8 +1,8 @@
-"""Chains of boxes that show one thing in images that follow each other, from odometry alone."""
+"""Chains of boxes that show one thing in images that follow each other."""
 
 import numpy as np
 
-from objslam.core.arrays import Ints
+from objslam.core.arrays import Floats, Ints
 from objslam.core.types import Association, Keyframes, Rays
 
 _LONGEST = 1.0
@@ -18,7 +18,7 @@ With 1 s, those with 2 images a second had larger errors, because neighbours wer
 _IMAGES = 3
 """The number of images before a ray in which its track may have its last ray. With 1, each missed box ends a track: of boxes
 that are missed in one of five images, tracks then have 5 rays on average. A larger number joins neighbours more often."""
-_FEWEST = 3
+FEWEST = 3
 """The fewest rays of a track. Two rays nearly always meet. With a larger number, fewer tracks tell anything."""
 
 
@@ -30,8 +30,9 @@ def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
 
     keyframes: with odometry, which tells where each ray is expected in the next image.
     """
-    _, track, length = np.unique(_tracks(keyframes, rays), return_inverse=True, return_counts=True)
-    long = length >= _FEWEST
+    assert keyframes.odom_T_base is not None
+    track, length = tracks_of_rays(keyframes, rays, keyframes.odom_T_base @ keyframes.base_T_camera)
+    long = length >= FEWEST
     number = np.where(long, np.cumsum(long) - 1, -1)
     label = np.zeros(int(long.sum()), dtype=rays.label.dtype)
     owner = number[track]
@@ -39,11 +40,13 @@ def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
     return Association(owner, label)
 
 
-def _tracks(keyframes: Keyframes, rays: Rays) -> Ints:
-    """Return the track (R,) of each ray: the index of its first ray."""
-    assert keyframes.odom_T_base is not None
-    odom_R_camera = (keyframes.odom_T_base @ keyframes.base_T_camera)[:, :3, :3]
-    direction = np.einsum("rij,rj->ri", odom_R_camera[rays.keyframe], rays.direction)
+def tracks_of_rays(keyframes: Keyframes, rays: Rays, path_T_camera: Floats) -> tuple[Ints, Ints]:
+    """Return the number (R,) of the track of each ray, and the number of rays of each track.
+
+    A ray that continues no track, and that no ray continues, is a track of its own. path_T_camera: (K, 4, 4) the poses of
+    the cameras in any frame, by odometry or solved.
+    """
+    direction = np.einsum("rij,rj->ri", path_T_camera[rays.keyframe, :3, :3], rays.direction)
     root = np.arange(len(rays))
     last, first = np.ones((2, len(rays)), dtype=bool)  # Whether a ray is the last of its track so far, and the first.
     for gap in range(1, _IMAGES + 1):
@@ -59,7 +62,8 @@ def _tracks(keyframes: Keyframes, rays: Rays) -> Ints:
         last[one[linked]], first[two[linked]] = False, False
     while (root[root] != root).any():
         root = root[root]
-    return root
+    _, track, length = np.unique(root, return_inverse=True, return_counts=True)
+    return track.ravel(), length
 
 
 def _neighbours(keyframes: Keyframes, rays: Rays, gap: int) -> tuple[Ints, Ints]:

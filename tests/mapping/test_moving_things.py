@@ -1,0 +1,123 @@
+"""Things that drive around in a room, mapped from odometry alone: they become no objects, and things at rest stay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from objslam.config import load_settings
+from objslam.core.camera import project
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate, inverse
+from objslam.core.types import Log
+from objslam.frontend.bearings import build_rays
+from objslam.frontend.keyframes import build_keyframes
+from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.moves.moving_things import without_moving_things
+from objslam.mapping.solution import seen_something
+from objslam.simulation import preset, simulate
+
+_RING = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+_CART = np.array([[0.2 * np.cos(a), 0.2 * np.sin(a), z] for a in _RING for z in (0.3, 1.0)])
+"""Points on the surface of a cart, 0.4 m wide and 0.7 m high, around its place on the floor."""
+
+
+def with_carts(log: Log, number: int, seed: int) -> Log:
+    """The log with the boxes of carts, which drive straight from one random place to the next at 0.5 to 1.2 m/s."""
+    rng = np.random.default_rng(seed)
+    camera, found = log.cameras[0].camera, log.cameras[0].detections
+    assert found is not None
+    assert log.truth is not None
+    assert log.truth.trajectory is not None
+    path = log.truth.trajectory
+    poses = interpolate(path.stamps, path.poses, found.frame_stamps, 0.2)[0]
+    seconds = np.diff(found.frame_stamps, prepend=found.frame_stamps[0])
+    middle, reach = poses[:, :2, 3].mean(axis=0), 0.7 * np.ptp(poses[:, :2, 3], axis=0)
+    boxes, frames = [], []
+    for _ in range(number):
+        goals = list(middle + rng.uniform(-0.5, 0.5, (200, 2)) * reach)
+        at = goals.pop()
+        for frame, pose in enumerate(poses):
+            step, away = rng.uniform(0.5, 1.2) * seconds[frame], goals[-1] - at
+            if (way := float(np.hypot(*away))) < step:
+                goals.pop()
+            else:
+                at = at + away / way * step
+            camera_T_map = inverse(pose @ camera.base_T_camera)
+            seen = (_CART + np.append(at, 0.0)) @ camera_T_map[:3, :3].T + camera_T_map[:3, 3]
+            if seen[:, 2].min() < 0.5:
+                continue
+            pixels = project(camera, seen)
+            low, high = pixels.min(axis=0), pixels.max(axis=0)
+            if (low > 1).all() and (high < [camera.width - 2, camera.height - 2]).all() and rng.random() > 0.1:
+                boxes.append(np.concatenate([low, high]) + rng.normal(0, 1.5, 4))
+                frames.append(frame)
+    order = np.argsort(np.concatenate([found.frame, frames]), kind="stable")
+    cart = len(found.label_names)
+
+    def joined(one: np.ndarray, more: object) -> np.ndarray:
+        return np.concatenate([one, np.broadcast_to(more, (len(boxes), *one.shape[1:]))])[order]
+
+    both = replace(
+        found,
+        frame=joined(found.frame, frames),
+        boxes=joined(found.boxes, boxes),
+        label=joined(found.label, cart),
+        scores=joined(found.scores, 0.9),
+        depths=joined(found.depths, np.nan),
+        track_ids=joined(found.track_ids, -1),
+        label_names=(*found.label_names, "cart"),
+    )
+    return replace(log, cameras=(replace(log.cameras[0], detections=both),))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_objects_of_things_that_move_are_dropped(seed: int) -> None:
+    log = simulate(preset("rooms", missed=0.1, false=0.0), seed)
+    before = solved(with_carts(log, 10, seed))
+    after = without_moving_things(before)
+    assert len(carts(before)) > 4
+    assert len(carts(after)) == 0
+    # Their boxes are of no object, and a doubt can say so. All things at rest stay where they are.
+    assert before.association is not None
+    assert after.association is not None
+    gone = (before.association.object >= 0) & (after.association.object < 0)
+    assert after.association.refuted is not None
+    assert after.association.refuted[gone].all()
+    assert (after.rays.label[gone] == after.rays.label_names.index("cart")).mean() > 0.9
+    at_rest = places(before)
+    assert len(at_rest) == 15
+    np.testing.assert_allclose(places(after), at_rest, atol=0.03)
+
+
+def test_a_map_of_things_at_rest_stays_the_same() -> None:
+    """Equal things stand close together here, so that a track may pass from one to the next."""
+    row = tuple(("cup", (-1.5 + 0.3 * number, 1.0, 0.5)) for number in range(10))
+    state = solved(simulate(preset("rooms", placed=row, objects=6, classes=3, missed=0.3, false=0.1), 3))
+    assert without_moving_things(state) is state
+
+
+def solved(log: Log) -> JointState:
+    """The state after rounds of association and solve that begin at the true poses."""
+    settings, ledger = load_settings(None, ("mode=joint", "calibration.use=false")), Ledger()
+    frames = build_keyframes(log, settings, ledger)
+    rays = build_rays(log, frames, settings, ledger)
+    used = seen_something(frames, rays)
+    cameras = tuple(one.camera for one in log.cameras)
+    state = JointState(frames, rays, *used, cameras, settings, ledger, lambda *_: None, None, None)
+    return state.alternated(used[0].map_T_base, None)
+
+
+def carts(state: JointState) -> np.ndarray:
+    """The objects of carts that have rays that agree."""
+    assert state.association is not None
+    assert state.estimate is not None
+    used = np.unique(state.association.object[state.estimate.weight > 0])
+    return np.intersect1d(used, np.flatnonzero(state.association.label == state.rays.label_names.index("cart")))
+
+
+def places(state: JointState) -> np.ndarray:
+    """The positions of all other objects, in order."""
+    assert state.association is not None
+    assert state.estimate is not None
+    return state.estimate.positions[state.association.label != state.rays.label_names.index("cart")]
