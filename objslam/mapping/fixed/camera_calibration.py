@@ -83,9 +83,7 @@ def calibrate_fixed(
             trace.take(trial.trace)
         if found is None:
             ledger.warn(f"the shared errors could not be estimated, and stay as they were: {trial.failure}")
-            every_object = now.add_few(association, estimate, told)
-            if every_object.count > association.count:
-                association, estimate = every_object, now.solve(every_object, trace, _parameters(calibration))
+            association, estimate = now.completed(association, estimate, trace, _parameters(calibration), told)
             return now, association, replace(estimate, calibration=calibration, uncalibrated=True), rounds
         earlier.append((calibration.values, np.hypot(_own(now), told)))
         calibration, now = found.calibration, trial.corrected
@@ -111,10 +109,9 @@ def calibrate_fixed(
         found, calibration, rounds = centred, centred.calibration, (*rounds, {"objects": association.count})
         now = at.without(errors, calibration.values)
         estimate = now.solve(association, trace, _parameters(calibration))
-    every_object = now.add_few(association, estimate, told)
-    if every_object.count > association.count:
-        association = every_object
-        estimate = now.solve(association, trace, _parameters(calibration))
+    calibrated = association
+    association, estimate = now.completed(calibrated, estimate, trace, _parameters(calibration), told)
+    if association is not calibrated:
         noise = largest_noise(now.seen, now.settings)
         sensitivity = calibrate_at_poses(
             errors, association, placed_objects(estimate), calibration.values, noise

@@ -17,6 +17,7 @@ from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.fixed.pose_noise import noise_in_frames
+from objslam.mapping.moves.moving_things import things_at_rest
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import seen_something
 
@@ -88,14 +89,28 @@ class FixedPoses:
             return associate_by_label(self.rays_seen)
         return associate_globally(self._posed(more), self.settings, seed=self.settings.seed)
 
-    def add_few(self, association: Association, estimate: Estimate | None, more: Floats | float = 0.0) -> Association:
-        """Add the objects that can be found from few rays.
+    def completed(
+        self,
+        association: Association,
+        estimate: Estimate,
+        trace: Trace | None,
+        parameters: Parameters | None = None,
+        more: Floats | float = 0.0,
+    ) -> tuple[Association, Estimate]:
+        """Return the association and the estimate with the objects that can be found from few rays, and without those of
+        things that move. Both stay the same if nothing changes.
 
-        estimate: the estimate of the objects, None if there are none. more: as in `associate`."""
+        more: as in `associate`. parameters: as in `solve`."""
         from objslam.association.few_rays.additional_objects import add_few_ray_objects
 
-        placed = np.zeros((0, 3)) if estimate is None else placed_objects(estimate)
-        return add_few_ray_objects(self._posed(more), self.settings, association, placed, seed=self.settings.seed)
+        placed = placed_objects(estimate)
+        found = add_few_ray_objects(self._posed(more), self.settings, association, placed, seed=self.settings.seed)
+        if found.count > association.count:
+            association, estimate = found, self.solve(found, trace, parameters)
+        if self.settings.association.method == "by_label":
+            return association, estimate
+        left = things_at_rest(self.seen, self.rays_seen, association, estimate, self.seen.map_T_camera)
+        return (association, estimate) if left is association else (left, self.solve(left, trace, parameters))
 
     def _posed(self, more: Floats | float) -> PosedRays:
         """Return all rays at the given poses. more: as in `associate`."""
@@ -150,9 +165,7 @@ def associate_fixed(
         if any(_same_noise(found, before) for before in earlier):
             break
         at = at.with_noise_of_poses(found)
-    every_object = at.add_few(association, estimate)
-    if every_object.count > association.count:
-        association, estimate = every_object, at.solve(every_object, trace)
+    association, estimate = at.completed(association, estimate, trace)
     return at, association, with_noise_of(estimate, at), rounds if len(rounds) > 1 else ()
 
 

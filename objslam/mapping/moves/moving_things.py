@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from objslam.core.geometry import angles_off
+from objslam.core.types import Association
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Bools, Floats
+    from objslam.core.estimate import Estimate
+    from objslam.core.types import Keyframes, Rays
     from objslam.mapping.joint.joint_alternation import JointState
 
 _PURE = 0.95
@@ -32,38 +34,44 @@ _USUAL = 3
 
 
 def without_moving_things(state: JointState) -> JointState:
-    """Return the state without objects of things that move, else the state itself.
-
-    The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
-    association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
-    passes through the object, and the rays before and after belong to no object or to another one.
-    """
+    """Return the state without objects of things that move (`things_at_rest`), else the state itself."""
     assert state.association is not None
-    moving = _moving(state)
-    if not moving.any():
+    assert state.estimate is not None
+    left = things_at_rest(state.keyframes, state.rays, state.association, state.estimate, state.solved_poses)
+    if left is state.association:
         return state
-    number = np.append(np.where(moving, -1, np.cumsum(~moving) - 1), -1)
-    before = state.association
-    refuted = moving[before.object] & (before.object >= 0)
-    left = replace(
-        before,
-        object=number[before.object],
-        label=before.label[~moving],
-        label_weights=None if before.label_weights is None else before.label_weights[~moving],
-        existence=None if before.existence is None else before.existence[~moving],
-        few_rays=None if before.few_rays is None else before.few_rays[~moving],
-        refuted=refuted if before.refuted is None else refuted | before.refuted,
-    )
     return state.counted(left).solve("association", left, state.solved_poses)
 
 
-def _moving(state: JointState) -> Bools:
-    """Return which objects (N,) of a solved state are of things that move."""
-    association, estimate, rays = state.association, state.estimate, state.rays
-    assert association is not None
-    assert estimate is not None
+def things_at_rest(
+    keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats
+) -> Association:
+    """Return the association without objects of things that move, else the association itself.
+
+    The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
+    association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
+    passes through the object, and the rays before and after belong to no object or to another one. estimate: of the
+    association. map_T_camera: (K, 4, 4) its poses.
+    """
+    moving = _moving(keyframes, rays, association, estimate, map_T_camera)
+    if not moving.any():
+        return association
+    number = np.append(np.where(moving, -1, np.cumsum(~moving) - 1), -1)
+    refuted = moving[association.object] & (association.object >= 0)
+    return Association(
+        number[association.object],
+        association.label[~moving],
+        label_weights=None if association.label_weights is None else association.label_weights[~moving],
+        existence=None if association.existence is None else association.existence[~moving],
+        refuted=refuted if association.refuted is None else refuted | association.refuted,
+        few_rays=None if association.few_rays is None else association.few_rays[~moving],
+    )
+
+
+def _moving(keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats) -> Bools:
+    """Return which objects (N,) are of things that move. The parameters are those of `things_at_rest`."""
     owner = np.where(estimate.weight > 0, association.object, -1)
-    track, length = tracks_of_rays(state.keyframes, rays, state.solved_poses)
+    track, length = tracks_of_rays(keyframes, rays, map_T_camera)
     told = np.flatnonzero((owner >= 0) & (length[track] >= FEWEST))
     if not len(told):
         return np.zeros(association.count, dtype=bool)
@@ -72,7 +80,7 @@ def _moving(state: JointState) -> Bools:
     many = np.bincount(owner[told], minlength=association.count)
     pure = np.bincount(owner[told], share, association.count) / np.maximum(many, 1)
     held = np.flatnonzero(owner >= 0)
-    origins, directions = rays.in_map(state.solved_poses)
+    origins, directions = rays.in_map(map_T_camera)
     off = angles_off(origins[held], directions[held], estimate.positions[owner[held]]) / rays.sigma[held]
     number = np.bincount(owner[held], minlength=association.count).astype(np.float64)
     squares = np.bincount(owner[held], np.nan_to_num(off) ** 2, association.count).astype(np.float64)
