@@ -25,12 +25,12 @@ _PASSED = 0.85
 around had 0.2 to 0.75 in simulations. A larger share drops more objects."""
 _SCATTER = 1.5
 """The things of a label move only if the root mean square of its rays is more than this multiple of the usual one. Tracks
-also pass from one thing to the next where equal things stand close together, but their rays fit. Real landmarks in groups
-had 1.1, people 3 and more, and carts 1.9 to 2.4. A larger multiple drops fewer objects."""
-_ALONE = 2.0
-"""The same for a single object whose label has things at rest too. Single real landmarks in groups had up to 1.6."""
+also pass from one thing to the next where equal things stand close together, but their rays fit. Single real landmarks in
+groups had 0.8 to 2.0. All objects of people together had 3 and more, and those of carts 1.9 to 2.4. A larger multiple drops
+fewer objects."""
 _USUAL = 3
-"""The fewest objects with pure tracks that tell the usual scatter. With a larger number, fewer maps are asked."""
+"""The fewest objects that tell the usual scatter: those whose tracks have hardly any other rays, and whose label does not
+seem to move. With a larger number, fewer maps are asked."""
 
 
 def without_moving_things(state: JointState) -> JointState:
@@ -50,8 +50,9 @@ def things_at_rest(
 
     The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
     association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
-    passes through the object, and the rays before and after belong to no object or to another one. estimate: of the
-    association. map_T_camera: (K, 4, 4) its poses.
+    passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
+    because tracks of a few things at rest also pass on to equal things beside them. If all things have one label, nothing
+    tells the usual scatter, and all objects stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
     """
     moving = _moving(keyframes, rays, association, estimate, map_T_camera)
     if not moving.any():
@@ -84,18 +85,14 @@ def _moving(keyframes: Keyframes, rays: Rays, association: Association, estimate
     off = angles_off(origins[held], directions[held], estimate.positions[owner[held]]) / rays.sigma[held]
     number = np.bincount(owner[held], minlength=association.count).astype(np.float64)
     squares = np.bincount(owner[held], np.nan_to_num(off) ** 2, association.count).astype(np.float64)
-    rest = (many > 0) & (pure >= _PURE)
-    if rest.sum() < _USUAL:
-        return np.zeros(association.count, dtype=bool)
-    usual = np.median(squares[rest] / number[rest])
-
-    def scatters(squares: Floats, number: Floats, least: float) -> Bools:
-        return np.asarray(squares > least**2 * usual * number)
-
     label = association.label
     sums = np.zeros((4, label.max() + 1))
     np.add.at(sums.T, label, np.stack([many, many * pure, squares, number], axis=1))
     all_told, all_pure, all_squares, all_rays = sums
-    moves = (all_pure < _PASSED * all_told) & scatters(all_squares, all_rays, _SCATTER)
-    alone = (pure < _PASSED) & scatters(squares, number, _ALONE)
-    return np.asarray((many > 0) & (alone | (moves[label] & (pure < _PURE))))
+    passed = all_pure < _PASSED * all_told
+    rest = (many > 0) & (pure >= _PURE) & ~passed[label]
+    if rest.sum() < _USUAL:
+        return np.zeros(association.count, dtype=bool)
+    usual = np.median(squares[rest] / number[rest])
+    moves = passed & (all_squares > _SCATTER**2 * usual * all_rays)
+    return np.asarray((many > 0) & (pure < _PURE) & moves[label])
