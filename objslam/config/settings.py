@@ -50,6 +50,13 @@ class Settings(Section):
     reconstruction: mapping.Reconstruction = mapping.Reconstruction()
     output: mapping.Output = mapping.Output()
 
+    @property
+    def finds_localization_noise(self) -> bool:
+        """Whether the size of the noise of localised poses is estimated. With `noise.localization=auto`, it is estimated if
+        `localization` has its default values."""
+        use, usual = self.noise.localization, self.localization == mapping.Localization()
+        return usual if use == "auto" else use
+
 
 def load_settings(file: Path | None = None, overrides: tuple[str, ...] = ()) -> Settings:
     """Load settings from a YAML file and from overrides. An override `key=value` has a dotted key and a YAML value, and

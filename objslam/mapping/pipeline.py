@@ -67,8 +67,8 @@ def run(
     """
     before = ledger.copy()
     result, wrong, lasting = _run(log, settings, ledger, progress, known)
-    # Without odometry, the second solve takes the noise of the localisation from the rays, unless the settings tell it.
-    untold = lasting is not None and settings.localization == Settings().localization
+    # Without odometry, the second solve takes the noise of the localisation from the rays.
+    untold = lasting is not None and settings.finds_localization_noise
     if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
         return result
     at_poses = ledger.copy()
@@ -148,7 +148,7 @@ def _run(
     say(diagnosis, ledger)
     if errors is not None:
         if settings.mode == "joint":
-            solution = with_held_errors(errors, solution)
+            solution = with_held_errors(errors, solution, ledger)
         solution, log = corrected(solution, errors, ledger)
         cameras = tuple(c.camera for c in log.cameras)
         if settings.checks.use:

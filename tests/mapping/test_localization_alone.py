@@ -1,11 +1,11 @@
 """Mode auto at a localisation without odometry: if it errs for seconds, the rays alone tell the poses."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from test_lasting_errors import with_lasting
+from test_phantoms import two_objects
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -67,6 +67,11 @@ def test_poses_that_err_for_seconds_are_solved_without_odometry(jumps):
     assert numbers == (12, 0, 0)  # In fixed mode (6, 6, 6) and (7, 4, 5).
 
 
+def test_given_poses_stay_if_no_solve_may_find_their_noise():
+    """The findings are the same, but the sizes of the errors are not estimated."""
+    assert mapped(drive(jumps=False), "noise.localization=false")[0] == "fixed"
+
+
 def test_the_association_begins_anew_at_the_solved_poses(monkeypatch):
     """The first association was at poses that err. The search for phantoms needs the motions that odometry measures."""
     calls, anew = [], joint_solve._anew
@@ -82,18 +87,7 @@ def test_the_association_begins_anew_at_the_solved_poses(monkeypatch):
 @pytest.mark.parametrize(("heading", "labels", "told"), [(1.0, [0, 0], True), (3.0, [0, 0], False), (1.0, [0, 1], False)])
 def test_errors_that_only_the_given_poses_show_are_named(heading, labels, told):
     """Two objects of one label may be one thing, and hide the errors. Two labels hide nothing."""
-    solution = SimpleNamespace(
-        keyframes=SimpleNamespace(localized_every=1.0, odom_T_base=None),
-        rays=SimpleNamespace(keyframe=np.array([0, 1])),
-        association=SimpleNamespace(object=np.array([0, 1]), label=np.array(labels), count=2),
-        estimate=SimpleNamespace(
-            noise=NoiseFactors(heading=heading),
-            weight=np.ones(2),
-            map_T_base=np.broadcast_to(np.eye(4), (2, 4, 4)),
-            positions=np.array([[2.0, 2.0, 0.0], [2.0, -2.0, 0.0]]),
-            covariance=np.broadcast_to(1e-4 * np.eye(3), (2, 3, 3)),
-        ),
-    )
+    solution = two_objects(labels, NoiseFactors(heading=heading), odometry=False)
     settings, earlier = load_settings(None, ()), (0.008, 0.02)
     found = check_neighbours(solution, None, settings, earlier)
     assert (found is not None and found.name == UNTOLD) == told

@@ -61,6 +61,23 @@ def mapped(log: Log, *overrides: str) -> tuple[tuple[int, int, int], list[str]]:
     return (told["matched"], told["false"], told["missed"]), [one["name"] for one in result.summary["wrong_input"]]
 
 
+def two_objects(labels: list[int], noise: NoiseFactors, *, odometry: bool) -> SimpleNamespace:
+    """What `check_neighbours` reads of a solution with two objects 4 m apart, at a localisation."""
+    poses = np.broadcast_to(np.eye(4), (2, 4, 4))
+    return SimpleNamespace(
+        keyframes=SimpleNamespace(localized_every=1.0, odom_T_base=poses if odometry else None),
+        rays=SimpleNamespace(keyframe=np.array([0, 1])),
+        association=SimpleNamespace(object=np.array([0, 1]), label=np.array(labels), count=2),
+        estimate=SimpleNamespace(
+            noise=noise,
+            weight=np.ones(2),
+            map_T_base=poses,
+            positions=np.array([[2.0, 2.0, 0.0], [2.0, -2.0, 0.0]]),
+            covariance=np.broadcast_to(1e-4 * np.eye(3), (2, 3, 3)),
+        ),
+    )
+
+
 def test_no_objects_are_left_where_rays_of_several_things_meet(monkeypatch):
     """Without the search for phantoms, the map of this drive has them, although each ray fits its object. Things that are
     nearer than the poses err are named."""
@@ -84,19 +101,7 @@ def test_a_good_localisation_takes_no_time_for_phantoms(monkeypatch):
 @pytest.mark.parametrize(("turning", "labels", "told"), [(3.5, [0, 0], True), (1.5, [0, 0], False), (3.5, [0, 1], False)])
 def test_a_path_that_may_be_bent_to_false_objects_is_named(turning, labels, told):
     """Only if a map at the given poses showed that they err. Things 4 m apart are not exchanged by errors of 0.2 degrees."""
-    poses = np.broadcast_to(np.eye(4), (2, 4, 4))
-    solution = SimpleNamespace(
-        keyframes=SimpleNamespace(localized_every=1.0, odom_T_base=poses),
-        rays=SimpleNamespace(keyframe=np.array([0, 1])),
-        association=SimpleNamespace(object=np.array([0, 1]), label=np.array(labels), count=2),
-        estimate=SimpleNamespace(
-            noise=NoiseFactors(turning=turning),
-            weight=np.ones(2),
-            map_T_base=poses,
-            positions=np.array([[2.0, 2.0, 0.0], [2.0, -2.0, 0.0]]),
-            covariance=np.broadcast_to(1e-4 * np.eye(3), (2, 3, 3)),
-        ),
-    )
+    solution = two_objects(labels, NoiseFactors(turning=turning), odometry=True)
     settings, earlier = load_settings(None, ()), (0.004, 0.017)
     found = check_neighbours(solution, None, settings, earlier)
     assert (found is not None and found.name == BENT) == told

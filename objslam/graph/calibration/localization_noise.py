@@ -81,8 +81,6 @@ def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> 
         by_error = solved.T @ (system.jacobian.T @ system.sides)
         shared = by_error @ told @ by_error.T
     stamps, every = keyframes.stamps, keyframes.localized_every
-    usual = errors.settings.model_copy(update={"localization": type(nominal)()}).localization
-    use = errors.settings.noise.localization
     return ComparedPoses(
         off=off,
         covariance=(covariance + covariance.T) / 2,
@@ -90,7 +88,7 @@ def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> 
         times=stamps[poses],
         apart=every * float(np.median(np.diff(stamps))) if every > 1 else 0.0,
         nominal=(nominal.yaw, nominal.xy),
-        free=nominal == usual if use == "auto" else use,
+        free=errors.settings.finds_localization_noise,
         prior=errors.settings.noise.prior,
     )
 

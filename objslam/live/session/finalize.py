@@ -58,7 +58,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     solution = _solved(found, m.by_label, cameras, settings, ledger)
     if solution.errors is not None:
         errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
-        solution, log = corrected(with_held_errors(errors, solution), errors, ledger)
+        solution, log = corrected(with_held_errors(errors, solution, ledger), errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
     solution = with_bodies(solution, cameras, settings)
     solution = with_box_offsets(solution, cameras, settings)

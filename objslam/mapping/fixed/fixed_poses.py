@@ -68,8 +68,7 @@ class FixedPoses:
     def noise_unknown(self) -> bool:
         """Whether the noise of the poses is estimated. The poses must be localised, and `noise.localization` must ask for
         it."""
-        use, usual = self.settings.noise.localization, self.settings.localization == Settings().localization
-        return bool(self.frames.localized_every and (usual if use == "auto" else use))
+        return bool(self.frames.localized_every and self.settings.finds_localization_noise)
 
     def noise_of_poses(self, association: Association, positions: Floats, weight: Floats) -> tuple[float, float]:
         """Return the factors on `localization.yaw` and `localization.xy` that the rays show, 1 if they are not estimated.

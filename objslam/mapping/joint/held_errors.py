@@ -81,10 +81,10 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
     return _freed(errors, there) if there else None
 
 
-def with_held_errors(errors: SharedErrors, solution: Solution) -> Solution:
+def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -> Solution:
     """Return the solution with covariances that contain the usual errors of focal lengths that it held.
 
-    errors: those of the solve, as measured.
+    errors: those of the solve, as measured. The ledger gets a warning if these errors cannot be computed.
     """
     if errors.keyframes.localized_every or _BENDS not in _held(errors) or not _can_tell(errors):
         return solution
@@ -98,7 +98,8 @@ def with_held_errors(errors: SharedErrors, solution: Solution) -> Solution:
     estimate = solution.estimate
     try:
         moved = moved_by_held(_like(wider, solved), solution.association, estimate, _values(wider, solved), held)
-    except (SolveError, np.linalg.LinAlgError):
+    except (SolveError, np.linalg.LinAlgError) as error:
+        ledger.warn(f"the sigmas lack the usual error of a focal length, which could not be computed: {error}")
         return solution
     estimate = estimate.with_errors(moved @ np.swapaxes(moved, 1, 2))
     factor = moved if estimate.correlated is None else np.concatenate([estimate.correlated, moved], axis=2)
