@@ -16,6 +16,7 @@ from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Log, Trajectory
+from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
@@ -87,6 +88,18 @@ def test_the_sigmas_of_a_right_camera_hardly_grow():
         objects = run(drive(0), *more)[0].map.resolved()
         sigma.append(np.median([np.sqrt(np.linalg.eigvalsh(one.covariance)[-1]) for one in objects]))
     assert 1.0 < sigma[0] / sigma[1] < 1.2
+
+
+def test_sigmas_without_the_held_focal_length_are_named(monkeypatch):
+    from objslam.graph.calibration import next_step
+
+    def fails(*_):
+        raise SolveError("not finite")
+
+    monkeypatch.setattr(next_step, "moved_by_held", fails)
+    result, ledger = run(drive(0))
+    assert len(result.map.resolved()) == 10
+    assert [one for one in ledger.warnings if "sigmas lack the usual error of a focal length" in one] != []
 
 
 def test_a_held_focal_length_moves_the_map_as_solves_with_other_ones_do(monkeypatch):
