@@ -33,9 +33,10 @@ def doctor(
 ) -> None:
     """Look for wrong input: units, axes, stamps, boxes, calibration. Nothing is changed and nothing is written.
 
-    The exit code is 1 if something is wrong that spoils the map.
+    The exit code is 1 if the input has an error that makes the positions of a map unreliable.
     """
     from objslam.core.diagnostics import Ledger
+    from objslam.frontend.boxes.robot_parts import without_robot_parts
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.diagnosis import diagnose
     from objslam.mapping.fixed.sparse_noise import with_sparse_noise
@@ -47,7 +48,7 @@ def doctor(
     ledger = Ledger()
     with progress_bar() as show:
         given = read(log, ledger, options)
-        chosen = chosen_poses(given, settings)
+        chosen = without_robot_parts(chosen_poses(given, settings), settings, ledger)
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
         settings = with_uneven_ground(said, settings, ledger, show)
@@ -87,7 +88,7 @@ def _solved(log: Log, settings: Settings, show: Progress) -> list[dict[str, Any]
 
 
 def _show_trials(found: Diagnosis) -> None:
-    """Print how well the boxes fit with the log as it is, and with the corrections (hypotheses) that make them fit best.
+    """Print how well the boxes fit: with the log as it is, and with the corrections (hypotheses) that make them fit best.
 
     If nothing is wrong, one line is enough.
     """

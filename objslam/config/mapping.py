@@ -42,6 +42,8 @@ class RayNoise(Section):
     border_share: NotNegative = 0.07
     """Distance from the image edge within which a box also counts as cut off, as a share of the box width or height.
     Detectors often end a cut box short of the edge."""
+    robot_parts: bool = True
+    """Drop boxes that stay at one place of the image while the camera turns, such as those of a part of the robot."""
 
 
 class Depth(Section):

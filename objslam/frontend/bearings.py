@@ -10,7 +10,7 @@ from objslam.core.camera import Camera, spoken_name, undistort
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import range_noise
 from objslam.core.types import Detections, Keyframes, Log, Rays, label_table
-from objslam.frontend.parts import PARTS, parts_of_boxes
+from objslam.frontend.boxes.nested_boxes import PARTS, parts_of_boxes
 from objslam.frontend.surface_ranges import half_widths, to_centres
 
 CUT_OFF = "boxes cut off by the image's edge (rays.border, rays.border_share)"

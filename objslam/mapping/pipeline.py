@@ -16,6 +16,7 @@ from objslam.core.trajectory import correct_path
 from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
+from objslam.frontend.boxes.robot_parts import without_robot_parts
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import shared_errors, take_out_expected, take_out_known
 from objslam.graph.least_squares.libraries import load_libraries
@@ -93,7 +94,8 @@ def _run(
     """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, "" if they do not.
     The third value is the lasting errors of the poses, None if they are too small for a finding. earlier: the lasting errors
     that an earlier map at the given poses found."""
-    given = log = chosen_poses(log, settings)
+    recorded = [c.detections for c in log.cameras if c.detections is not None]
+    given = log = without_robot_parts(chosen_poses(log, settings), settings, ledger)
     unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
@@ -212,12 +214,11 @@ def _run(
             surface = reconstruct(log, path_after, settings, ledger, progress)
             if settings.reconstruction.before:
                 surface_before = reconstruct(log, path, settings, Ledger(), progress)  # The first call counted the drops.
-    found = [c.detections for c in log.cameras if c.detections is not None]
     counts = {
         "images": sum(len(c.rgb.paths) for c in log.cameras if c.rgb is not None),
-        "detection_frames": sum(len(detections.frame_stamps) for detections in found),
+        "detection_frames": sum(len(detections.frame_stamps) for detections in recorded),
         "frames_on_path": len(frames),
-        "detections": sum(len(detections) for detections in found),
+        "detections": sum(len(detections) for detections in recorded),
     }
     result = make_result(
         replace(solution, keyframes=with_given_stamps(keyframes, given)),

@@ -9,8 +9,8 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.frontend.bearings import build_rays
+from objslam.frontend.boxes.nested_boxes import PARTS, parts_of_boxes
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.parts import PARTS, parts_of_boxes
 from objslam.simulation import preset, simulate
 
 ZERO = np.zeros(2, dtype=np.int64)

@@ -17,7 +17,7 @@ from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.errors import LogError, SolveError
-from objslam.frontend.parts import PARTS
+from objslam.frontend.boxes.nested_boxes import PARTS
 from objslam.mapping import pipeline
 from objslam.simulation import DepthNoise, make_camera, pair, preset, simulate
 from objslam.simulation.trajectory import START

@@ -1,0 +1,130 @@
+"""Find boxes that stay at one place of the image while the camera turns, such as those of a part of the robot.
+
+No thing at rest stays there, unless the robot drives around it. Then its rays meet in front of the camera.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.association.observations import overlap
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.camera import Camera, spoken_name, undistort
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import interpolate
+from objslam.core.types import CameraLog, Detections, Log, Trajectory
+
+ROBOT_PARTS = "boxes that stay at one place of the image while the camera turns (a part of the robot; rays.robot_parts)"
+"""The reason to drop such boxes."""
+_FEWEST = 20
+"""The fewest boxes at one place of the image that may show a part of the robot. A larger number drops fewer boxes."""
+_SAME_BOX, _LIKE_BOX = 0.7, 0.3
+"""Boxes are at one place of the image if their intersection over union with one box is above the first value. Boxes above
+the second value are near that place. With a larger first value, only steadier boxes are found."""
+_STEADY = 0.5
+"""At least this share of the boxes near a place must be at the place. Random boxes have 0.03 to 0.1 there (the share
+((1 - 0.7) / (1 - 0.3))^4 of boxes in four coordinates, and more if the boxes have similar sizes), and a part of the robot
+has 0.9 and more. A larger share drops fewer boxes."""
+_TENTHS = 6
+"""The boxes must be in at least this number of the tenths of the frames. A robot that waits, and a robot that follows
+somebody for a while, see boxes at one place in fewer. A larger number drops fewer boxes."""
+_OFTEN = 0.1
+"""A tenth counts if at least this share of its frames has the box. A detector may miss a part of the robot in most images. A
+larger share drops fewer boxes."""
+_TRIED = 64
+"""The most boxes of a label and camera around which boxes are counted. A larger number finds rarer boxes."""
+_TURN = np.radians(30.0)
+"""The angle (rad) by which the camera turns in a window. Odometry is good over such a turn, and a thing at rest moves by
+much of the image. A larger angle needs more turning."""
+_MISSED = np.radians(5.0)
+"""A window shows that boxes are of no thing at rest if their rays miss the nearest point by more than this (rad, root mean
+square). Poses err by less over such a turn. Rays of boxes that stay in the image miss it by about 8.7 degrees if the camera
+turns in its place (30 degrees / sqrt(12)). A larger angle drops fewer boxes."""
+_BEHIND = 0.2
+"""A window also shows this if the nearest point is behind the camera for more than this share of its rays. A larger share
+drops fewer boxes."""
+_WINDOWS, _AGREE = 3, 0.8
+"""At least so many windows must show it, and at least this share of all windows. Larger values drop fewer boxes."""
+
+
+def without_robot_parts(log: Log, settings: Settings, ledger: Ledger) -> Log:
+    """Return the log without boxes of parts of the robot. The ledger counts them.
+
+    A camera that moves on the robot keeps all boxes.
+    """
+    path = log.odometry or log.localization  # Odometry does not jump.
+    if path is None or not settings.rays.robot_parts:
+        return log
+    return replace(log, cameras=tuple(_cleaned(one, path, settings, ledger) for one in log.cameras))
+
+
+def _cleaned(one: CameraLog, path: Trajectory, settings: Settings, ledger: Ledger) -> CameraLog:
+    found = one.detections
+    if found is None or one.mount is not None or len(found) < _FEWEST:
+        return one
+    poses, known = interpolate(path.stamps, path.poses, found.frame_stamps, settings.poses.max_gap)
+    part = np.zeros(len(found), dtype=bool)
+    for group in _steady(found, known[found.frame] & (found.scores >= settings.rays.min_score)):
+        part[group] = _never_rests(found, group, poses @ one.camera.base_T_camera, one.camera)
+    if not part.any():
+        return one
+    where = f"{spoken_name(one.camera.name)}, stamp {found.stamps[np.argmax(part)]:.3f}"
+    ledger.drop(ROBOT_PARTS, int(part.sum()), where, of=len(found))
+    return replace(one, detections=found.take(np.flatnonzero(~part)))
+
+
+def _steady(found: Detections, usable: Bools) -> Iterator[Ints]:
+    """Yield groups of boxes of one label that stay at one place of the image during most of the log."""
+    frames = len(found.frame_stamps)
+    tenth = np.arange(frames) * 10 // frames
+    often = _OFTEN * np.bincount(tenth, minlength=10)
+    for label in np.unique(found.label[usable]).tolist():
+        mine = np.flatnonzero(usable & (found.label == label))
+        while len(mine) >= _FEWEST:
+            some = mine[np.linspace(0, len(mine) - 1, min(_TRIED, len(mine))).astype(np.int64)]
+            there = overlap(found.boxes[some][:, None], found.boxes[mine][None]) >= _SAME_BOX
+            best = there[there.sum(axis=1).argmax()]
+            alike = overlap(np.median(found.boxes[mine[best]], axis=0), found.boxes[mine])
+            group = mine[alike >= _SAME_BOX]
+            seen = np.bincount(tenth[np.unique(found.frame[group])], minlength=10)
+            if len(group) < _FEWEST or (seen >= often).sum() < _TENTHS:
+                break
+            if len(group) >= _STEADY * (alike >= _LIKE_BOX).sum():
+                yield group
+            mine = mine[(alike < _SAME_BOX) & ~best]
+
+
+def _never_rests(found: Detections, group: Ints, map_T_camera: Floats, camera: Camera) -> bool:
+    """Return whether no thing at rest explains boxes (M,) at one place of the image. map_T_camera: (F, 4, 4) of frames."""
+    middle = (found.boxes[group, :2] + found.boxes[group, 2:]) / 2
+    direction, valid = undistort(camera, middle)
+    poses = map_T_camera[found.frame[group[valid]]]
+    direction, origin = np.einsum("mij,mj->mi", poses[:, :3, :3], direction[valid]), poses[:, :3, 3]
+    missed = [_misses(origin[window], direction[window]) for window in _windows(poses[:, :3, 2])]
+    return sum(missed) >= max(_WINDOWS, _AGREE * len(missed))
+
+
+def _windows(ahead: Floats) -> Iterator[slice]:
+    """Yield windows of boxes, in each of which the camera turns by `_TURN`. ahead: (M, 3) its direction at each box."""
+    first = 0
+    while first < len(ahead):
+        turned = np.flatnonzero(ahead[first:] @ ahead[first] < np.cos(_TURN))
+        if not len(turned):
+            return
+        last = first + int(turned[0])
+        if last - first >= 2:
+            yield slice(first, last + 1)
+        first = last
+
+
+def _misses(origin: Floats, direction: Floats) -> bool:
+    """Return whether no point explains rays (M, 3)."""
+    across = np.eye(3) - direction[:, :, None] * direction[:, None]
+    point = np.linalg.lstsq(across.sum(axis=0), np.einsum("mij,mj->i", across, origin), rcond=None)[0]
+    way = point - origin
+    along = np.einsum("mi,mi->m", way, direction)
+    aside = np.linalg.norm(np.cross(way, direction), axis=1)
+    off = np.arctan2(aside, np.abs(along))
+    return bool((along < 0).mean() > _BEHIND or np.sqrt((off**2).mean()) > _MISSED)
