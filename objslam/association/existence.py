@@ -23,7 +23,7 @@ of the class: about a half, as for a thing that is hidden on one visit of two. T
 larger mean, misses drop more objects."""
 _SHARED_RAYS = 0.5
 """A landmark may be detected more rarely than its class only if at most this share of its rays also passes another landmark
-of their label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
+of the label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
 _CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
 _POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
@@ -45,7 +45,8 @@ _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test
 @dataclass(frozen=True)
 class Rates:
     """Beta distributions of the detection rates in each class. mean: (L,) of each class. concentration: the sum of the two
-    parameters of a distribution, the same for all classes. With several of them (C, 1), results get a first axis (C,)."""
+    parameters of a distribution, the same for all classes. With several concentrations (C, 1), results get a first axis
+    (C,)."""
 
     mean: Floats
     concentration: float | Floats

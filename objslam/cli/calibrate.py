@@ -25,7 +25,7 @@ def calibrate(
     out: Annotated[Path, typer.Option("-o", "--out", help="The calibration file to write.")] = Path("calibration.yaml"),
     mode: Annotated[
         Literal["fixed", "joint"] | None,
-        typer.Option("--mode", help="joint (the default): odometry and cameras. fixed: cameras against the localisation."),
+        typer.Option("--mode", help="joint (the default): odometry and cameras. fixed: cameras against a localisation."),
     ] = None,
     config: Config = None,
     set_: Set = None,

@@ -155,7 +155,7 @@ def warn_of_neighbours(out: Path) -> None:
 
     if found := foreign_files(out):
         shown = ", ".join([*found[:_NEIGHBOURS], *(["..."] if len(found) > _NEIGHBOURS else [])])
-        what = f"{out} holds other files ({shown}), and the files of the result go among them"
+        what = f"{out} holds other files ({shown}), and the files of the result would be among them"
         say(f"warning: {what} (-o names a folder of its own)", stderr=True)
 
 

@@ -138,7 +138,7 @@ def diff_results(
 
 
 def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
-    """Return a warning for each map that does not say what was in view: what the comparison then cannot tell, and why."""
+    """Return a warning for each map that does not say what was in view: what the comparison then cannot show, and why."""
     from objslam.io.results.files import VIEWS
     from objslam.sources.journal.segments import NAME
 

@@ -28,7 +28,7 @@ _NOT_SHARED = {"mahalanobis_median": "squared Mahalanobis in x, y, median (hones
 out such errors, and the covariances still contain them."""
 _BODY_ROWS = (
     ("bodies", "bodies compared", ""),
-    ("size_error_median", "error of length, width and height, share, median", ""),
+    ("size_error_median", "error of length, width and height as a share, median", ""),
     ("yaw_error_deg_median", "error of the yaw, median", " deg"),
     ("iou_median", "3D overlap (IoU) of the bodies, median", ""),
 )
@@ -61,7 +61,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     from rich.table import Table
 
     data = evaluation.to_dict()
-    title = f"align {evaluation.align} ({evaluation.why}), radius {evaluation.radius:g} m"
+    title = f"alignment {evaluation.align} ({evaluation.why}), radius {evaluation.radius:g} m"
     scores = Table()
     scores.add_column("against the ground truth" if evaluation.truth is None else f"against {evaluation.truth}")
     scores.add_column("value", justify="right")

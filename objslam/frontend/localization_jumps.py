@@ -176,7 +176,7 @@ def _usual_corrections(off: Floats, usual: Floats) -> Floats:
     """Return the distance, m, and the turn, rad, up to which corrections of a localisation are usual.
 
     A particle filter follows the odometry, and corrects itself every few seconds. Most steps are then no corrections, so
-    their oddness does not tell how large corrections are. The largest of many corrections are not wrong, and without them
+    their oddness does not show how large corrections are. The largest of many corrections are not wrong, and without them
     the path drifts as the odometry does. So a jump has to stand out from the corrections, too. A few corrections may all be
     jumps.
 

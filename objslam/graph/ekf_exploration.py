@@ -1,10 +1,10 @@
 """Find poses, landmarks, and the landmark of each ray by an extended Kalman filter, from odometry and rays.
 
-The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. Their covariance tells where
-in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose shifts all of
-them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old landmark look new.
-So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time for a frame grows
-with the number of landmarks, hardly with the number of frames.
+The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. Their covariance predicts
+where in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose shifts all
+of them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old landmark look
+new. So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time for a frame
+grows with the number of landmarks, hardly with the number of frames.
 """
 
 from collections.abc import Callable

@@ -24,9 +24,10 @@ more than a Gaussian allows. Larger factors find loops after a slip, and more wr
 _BESIDE = 0.03
 """If the heading is known around one landmark, it has this standard deviation (rad) around another landmark that some frame
 showed beside the first. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after
-longer ways through the map, of which parts may be bent."""
+longer ways through the map, though parts of the map may be bent."""
 _STEPS = 10
-"""The most landmarks on such a way. More than ten add a larger variance than an exploration accepts."""
+"""The most landmarks on a way through the map from a known landmark to another. More than ten add a larger variance than an
+exploration accepts."""
 _MORE = 1.5
 """Landmarks are compared again when the recent landmark of a pair has this multiple of the rays that it had before. A larger
 number is faster, and finds loops later. With 1, two landmarks that never match would be compared at each step."""
@@ -120,7 +121,7 @@ class Landmarks:
         """Return the variance (N,), rad^2, of the heading at keyframe `now` in the part of the map around each landmark.
 
         The heading drifts since the last observation of a landmark. If a frame showed another landmark beside it, the other
-        one tells where it is. So if the other one was observed later, the heading drifts only since then.
+        one shows where it is. So if the other one was observed later, the heading drifts only since then.
 
         heading: (K,) the variance of the odometry's heading.
         """
@@ -259,7 +260,8 @@ def closed_path(closure: Closure, landmarks: Landmarks, map_T_camera: Floats, dr
 def heading_variance(drift: Floats) -> Floats:
     """Return the variance (K,), rad^2, of the heading at each keyframe, by the drift (K, 6, 6) of the odometry.
 
-    It never falls, so that it can tell how far the heading drifted between two keyframes."""
+    It never falls, so its increase shows how far the heading drifted between two keyframes.
+    """
     return np.maximum.accumulate(np.linalg.eigvalsh(drift[:, :3, :3])[:, -1])
 
 

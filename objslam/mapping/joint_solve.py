@@ -91,7 +91,7 @@ def _associated_again(begin: JointState, state: JointState, start: InitialEstima
 
 
 def _begun(state: JointState) -> JointState:
-    """Return the state with what a log tells before its first solve: clocks, and the noise of localised poses."""
+    """Return the state with what a log shows before its first solve: clocks, and the noise of localised poses."""
     return _with_noise_of_poses(_with_clocks(state))
 
 
@@ -180,8 +180,8 @@ def _from_tracks(begin: JointState) -> JointState:
 
 
 def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
-    """Return the state, or one from another start, if this explains the log better. A start from which nothing can be
-    solved changes nothing."""
+    """Return the state from another start if it explains the log better, else the given state. A start from which nothing
+    can be solved changes nothing."""
     try:
         attempt = _searched(start())
     except SolveError:  # The map of the state is there, whatever is wrong with the other start.
@@ -283,7 +283,8 @@ def _anew(state: JointState) -> JointState:
 
 
 def _improved(state: JointState, step: Callable[[JointState], JointState]) -> JointState:
-    """Return the state after steps, until the rays are no better explained. step: it then returns the state itself."""
+    """Repeat a step until it no longer explains the rays better, and return the state. step: returns the state itself if it
+    finds nothing better."""
     for _ in range(state.settings.joint.max_rounds):
         found = step(state)
         if found is state:

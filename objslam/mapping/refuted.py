@@ -39,7 +39,7 @@ _MORE = 0.05
 """A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
 more findings."""
 _QUIETER = 0.5
-"""A solve may explain the boxes only with noise. Then a finding stands if its corrected log needs at most this share of the
+"""A solve may explain the boxes only with noise. A finding then stands if its corrected log needs at most this share of the
 noise. A larger share refutes fewer findings. Examples from a clean MRCLAM robot: it needs 0.17 of the noise that its log
 with mirrored images needs, because there the path must turn the other way. It needs 0.15 of the noise that its log with the
 identity for base_T_camera needs, but 2.9 times the noise in the settings."""

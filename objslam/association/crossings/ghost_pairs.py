@@ -3,7 +3,7 @@
 Seen from two stretches of the path, two things of one label have four points where rays meet: the things, and two ghosts.
 The rays of each ghost come from both things. Both ghosts together have as many rays as the things, and the rays of a short
 look fit them. So no ray fits the other landmark better, and a search that takes the points one by one may find the ghosts
-first. Only rays from a third side tell: both ghosts fit them worse than other landmarks fit their rays.
+first. Only rays from a third side reveal the ghosts: both ghosts fit them worse than other landmarks fit their rays.
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ def few_ray_evidence(
 
 
 def _few(of: PosedRays, settings: config.Settings, association: Association, positions: Floats) -> tuple["_Few", Ints]:
-    """Return the search of `add_few_ray_objects`, and the index (P,) of the ray of each observation."""
+    """Return the search of `add_few_ray_objects`, and for each observation the index (P,) of its ray."""
     rays = of.rays
     obs, ray, keyframe = observe(of)
     positions = flattened_points(positions, obs.scale)

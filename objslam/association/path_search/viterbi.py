@@ -107,7 +107,7 @@ def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
     """Return for each state the least sum (Y, X, X) of two costs: of a state before, and of the motion from there.
 
     A sum is at most `_SLIP`. Only states below `_SLIP` can lead to a smaller sum, so only the part of the grid that contains
-    them is searched. This part is small where the rays tell well where the robot is.
+    them is searched. This part is small where the rays show well where the robot is.
 
     Args:
         total: (Y, X, X) the costs of the states before.

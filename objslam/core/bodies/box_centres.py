@@ -14,8 +14,8 @@ _RIMS = np.array([[np.cos(a), np.sin(a), z] for a in np.arange(16) * np.pi / 8 f
 _OUTLINES = {SHAPES.index("cuboid"): _CORNERS, SHAPES.index("cylinder"): _RIMS}
 """The points that the box of a shape goes around. The other shapes are ellipsoids, whose boxes have a closed form."""
 _NEAREST = 0.1
-"""The least depth of the nearest part of a body, as a share of the depth of its centre. A larger share gives fewer bodies
-that nearly touch the camera a box."""
+"""The least depth of the nearest part of a body, as a share of the depth of its centre. With a larger share, fewer bodies
+near the camera get a box."""
 
 
 def beside_centres(

@@ -98,7 +98,7 @@ def _white(keyframes: Keyframes) -> Keyframes:
 
 
 def _without_places(settings: Settings) -> Settings:
-    """Return settings in which the localisation hardly tells anything."""
+    """Return settings in which the localisation has hardly any weight."""
     of = settings.localization
     return settings.model_copy(update={"localization": of.model_copy(update={"xy": of.xy * _LOOSE, "yaw": of.yaw * _LOOSE})})
 

@@ -1,4 +1,4 @@
-"""What a joint solution that held some shared errors tells about them, and what they do to it.
+"""What a joint solution shows about the shared errors that it held, and what these errors do to it.
 
 One outer step of `self_calibration` is enough to see whether a held error is large. It takes a tenth of the time of a solve.
 """

@@ -187,7 +187,7 @@ class _Outer:
 
     @property
     def left(self) -> float:
-        """The decrease of the cost that the step promises."""
+        """The decrease of the cost that the linear system predicts for the step."""
         return float(self.step @ self.curvature @ self.step) / 2
 
     def converged(self, step: Floats, share: float) -> bool:

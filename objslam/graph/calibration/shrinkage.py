@@ -51,7 +51,7 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
 def _of_tags(of: Linearised) -> float:
     """Return the information that the known sizes of fiducials give about the logarithm of the size of the map.
 
-    A view tells the distance to a fiducial by the directions of four corners, each half a diagonal from the centre.
+    A view gives the distance to a fiducial by the directions of four corners, each half a diagonal from the centre.
     """
     tags = of.measured.tags
     if tags is None:

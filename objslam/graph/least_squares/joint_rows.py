@@ -42,7 +42,9 @@ class JointRows:
     def jacobian(self) -> sparse.csr_matrix:
         """(M, D) by the landmarks, three columns each, then by the poses, six columns each.
 
-        The rows after the last step of a solve, or after a step that is not taken, need no derivatives."""
+        It is computed at its first use: the rows after the last step of a solve, or after a step that is not taken, do not
+        need it.
+        """
         return self.derive()
 
 

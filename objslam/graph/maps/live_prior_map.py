@@ -1,6 +1,6 @@
 """Tie a growing graph to an older map: the frame F of the graph in the map, and the objects that both have.
 
-The variables and factors are those of `prior_map`. The graph keeps its own frame. F tells where it is in the map.
+The variables and factors are those of `prior_map`. The graph keeps its own frame. F is its pose in the map.
 """
 
 import gtsam

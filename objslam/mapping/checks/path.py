@@ -205,7 +205,7 @@ def _oddness(path: Trajectory) -> Floats:
 def _pulses(path: Trajectory, odd: Floats, moving: Bools) -> Bools:
     """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
 
-    odd: (N-1,) as from `_oddness`. moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose
+    odd: (N-1,) as from `_oddness`. moving: (N-1,) the steps that show what is usual. Some localisations repeat each pose
     until the next one is known.
     """
     seconds = np.diff(path.stamps)

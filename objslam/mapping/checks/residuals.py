@@ -116,6 +116,6 @@ def check_residuals(
     return Finding(
         "rays miss",
         f"the rays miss their objects by {np.degrees(np.median(residual[held])):.2f} deg, {times:.1f} times what "
-        f"rays.pixel_sigma, rays.box_sigma and localization.* promise: {worse} worse than that; try {remedy}",
+        f"rays.pixel_sigma, rays.box_sigma and localization.* say: {worse} worse than the settings; try {remedy}",
         spoils=False,
     )

@@ -84,7 +84,7 @@ def _warn_of_sums(calibration: Calibration, ledger: Ledger) -> None:
     said = ", ".join(f"{name} {calibration.values[i]:+.2g}" for i, name in zip(some, names, strict=True))
     causes = ", or: ".join(dict.fromkeys(_CAUSES[kind(name)] for name in names))
     ledger.warn(
-        f"some shared errors are larger than usual, and the log does not tell which ({said}), so their sigmas grow: {causes}"
+        f"some shared errors are larger than usual, and the log does not show which ({said}), so their sigmas grow: {causes}"
     )
 
 

@@ -27,7 +27,7 @@ _PAIRS = 1000
 """The number of pairs of boxes whose crossings are tried as the place of a thing. More pairs give a better place."""
 _PARALLAX = np.sin(np.radians(5.0)) ** 2
 """The least squared sine of the angle between two axes that are crossed. Axes of cut off boxes point beside their thing, so
-narrower crossings tell no distance. With a larger value, fewer places are tried."""
+narrower crossings give no distance. With a larger value, fewer places are tried."""
 _NEAR, _FAR = 0.2, 3.0
 """The least distance of a place from a camera, m, and its greatest distance, as a multiple of the greatest distance at which
 an object was seen. Larger values suit larger places."""

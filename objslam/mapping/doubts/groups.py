@@ -45,8 +45,8 @@ _RANGE_SIGMAS = 3.0
 """The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger
 number, fewer groups have this reason."""
 _FITTED = 6
-"""A point that moves has six parameters: its place and its velocity. It explains as many of the measured coordinates, two
-for each ray, in any case. With a larger number, fewer groups of few rays are said to move."""
+"""A point that moves has six parameters: its place and its velocity. It explains six measured coordinates in any case. Each
+ray has two. With a larger number, fewer groups of few rays are said to move."""
 _MOVES = np.log(20.0)
 """The least log odds of a motion over rest for a group that is said to move. Boxes of a thing at rest, seen
 under little parallax, reach 2.5 if they share an error. With larger odds, fewer groups are said to move."""

@@ -21,9 +21,9 @@ _ROUNDS = 2
 the first round corrected. More rounds change the errors by less than their sigmas."""
 _APART = 0.15
 """In each span of this time (s), one image of each camera is solved. A track needs no more images to be linked, and more of
-them tell little more. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
+them would add little. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
 _MOST = 3000
-"""About the largest number of rays that are solved. The errors of more rays would be known better than an exploration needs,
+"""About the largest number of rays that are solved. More rays would give the errors more exactly than an exploration needs,
 and would take longer."""
 _BLOCK = 50
 """If more rays are left, this number of consecutive keyframes is solved at a time, and the next ones are left out. A track

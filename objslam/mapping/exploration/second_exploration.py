@@ -38,8 +38,8 @@ factor suits worse odometry, and loses more objects of good odometry."""
 def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = False) -> JointState | None:
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
-    There is no attempt, but None, in three cases. The noise and the shared errors are about as the first exploration assumed
-    them. The settings fix the noise. Nearly all rays agree.
+    The result is None in three cases. The noise and the shared errors are about as the first exploration assumed them. The
+    settings fix the noise. Nearly all rays agree.
 
     Noise and shared errors are known only after a solve, but an exploration needs them before. A wrong map can hide the
     noise of the odometry in the noise of the rays.

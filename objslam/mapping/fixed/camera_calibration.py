@@ -223,11 +223,12 @@ def _first_trial(
 ) -> tuple[_Trial, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
-    An association that allows for the uncertainty of ray directions because of the errors is right if things are far apart.
-    In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong distance. Then a
-    narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the associations are compared
-    by how likely the rays are after a calibration. A narrower one has to be clearly better than the widest. The widest
-    association with an object is taken at once if it fits. Also return whether a narrower one is taken.
+    The widest association allows for all the uncertainty that the errors give to ray directions. It is right if things are
+    far apart. In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong
+    distance. Then a narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the
+    associations are compared by how likely the rays are after a calibration. A narrower one has to be clearly better than
+    the widest. The widest association with an object is taken at once if it fits. Also return whether a narrower one is
+    taken.
 
     at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
     of the errors.
@@ -253,7 +254,7 @@ def _first_trial(
 
 
 def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:
-    """Return the squared miss, in variances, and -2 ln of the probability, up to a constant, of a mean ray.
+    """Return two means over the rays: the squared miss, in variances, and -2 ln of the probability, up to a constant.
 
     More noise than the settings say counts as a miss, as in the normal distribution. If there are more objects of a label,
     its rays can belong to more of them, and each is less likely. An object costs as in the Bayesian information criterion

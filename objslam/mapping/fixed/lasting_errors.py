@@ -37,11 +37,11 @@ _LARGE = 1.0
 `localization`. At 1, the lasting errors alone are as large as all errors together should be. A larger value warns less
 often."""
 _LARGE_WITH_ODOMETRY = 0.75
-"""The same multiple if the odometry also says that the poses err for seconds. Two witnesses need less each: false objects
-take up a part of the errors, so the boxes show too small errors. A larger value warns less often."""
+"""The multiple `_LARGE` if the odometry also says that the poses err for seconds. With two witnesses, each needs to show
+less: false objects take up a part of the errors, so the boxes show too small errors. A larger value warns less often."""
 _FEWEST = 3
 """A run warns of lasting errors only if at least this number of objects show them. All boxes of one object may lie beside
-the object in the same way for seconds, so one object tells little of the poses. A larger number warns less often."""
+the object in the same way for seconds, so one object says little about the poses. A larger number warns less often."""
 _SMALL = 0.2
 """The errors are estimated again with the boxes around the centres of bodies, if they are above this multiple of the noise
 `localization`. A larger value takes less time, and blames the poses for boxes of large things."""
@@ -66,8 +66,8 @@ def with_lasting_errors(
     and Thompson 1971), and averaged over their posterior.
 
     The centre of the box of a large thing nearby lies beside the image of its centre, for as long as the robot drives by.
-    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was needed, the
-    returned solution has them.
+    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was called, the
+    returned solution has the bodies.
     """
     if not solution.keyframes.localized_every:
         return solution, None

@@ -32,13 +32,14 @@ _PLACES = (1.0, 2.0, 6.0, 20.0, 60.0, 200.0)
 _RANGES = (1.0, 3.0, 8.0)
 """The factors on the noise of depths that are tried first."""
 _RAYS = (1.0, 4.0)
-"""The factors on the noise of rays that are tried first. A street hardly tells this noise from that of the places."""
+"""The factors on the noise of rays that are tried first. On a street, this noise can hardly be told apart from that of the
+places."""
 _TURN = 15
 """The steps (degrees) of the tried turns of all cameras about the vertical axis. A larger step misses more wrong mounts."""
 _LEAD = 15.0
 """The least lead, in log odds, of the log as it is over the log with turned cameras. On streets the lead is 18 and more.
-With cameras turned by 15 degrees and more, it is below 0, and mostly in rooms with turned cameras too. With a larger lead,
-fewer streets are mapped. With a smaller one, wrong mounts are taken for noise."""
+With cameras turned by 15 degrees and more, it is below 0 on streets, and mostly in rooms too. With a larger lead, fewer
+streets are mapped. With a smaller one, wrong mounts are taken for noise."""
 _SURE = 60.0
 """From this lead on, the boxes agree, even if they seem to disagree because each thing has only few boxes. With a larger
 lead, more right streets with few boxes are called wrong."""

@@ -2,7 +2,7 @@
 
 If the robot pitches, all rays of its pose go up or down. If it rolls, the rays on one side go up, and the rays on the other
 side go down. If it stands higher than its pose says, near rays go down more than far ones. The noise of boxes does not move
-rays together. So poses that show several things tell how uneven the ground is.
+rays together. So poses that show several things reveal how uneven the ground is.
 """
 
 from collections.abc import Callable
@@ -38,8 +38,8 @@ _STRAY = 3.5
 """The deviation of a stray ray, in standard deviations of the noise that remains. A larger number lets false boxes raise the
 tilt."""
 _MOST_LASTING, _RUN = 150, 10
-"""The most poses that tell how long the tilt lasts, and how many of them follow each other. More poses are more exact, and
-the time grows with their cube. Longer runs see shorter times less often."""
+"""The most poses from which it is estimated how long the tilt lasts, and how many of them follow each other. More poses are
+more exact, and the time grows with their cube. Longer runs see shorter times less often."""
 _TIMES = tuple(0.25 * 2.0**k for k in range(9))
 """The tried times (s) for which tilt lasts. The shortest fits a bump, the longest a slope. More are finer and slower."""
 _LARGER = (1.0, 1.5, 2.25)
@@ -138,8 +138,8 @@ class Uneven:
     """How uneven the ground is.
 
     tilt: rad, the standard deviation of roll and of pitch. height: m, that of the height. seconds: s, the time after which
-    the correlation of both is 1/e, 0 if both are new in each pose. share: the noise of a usual ray by tilt and height, as a
-    multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
+    the correlation of both is 1/e, 0 if both are new in each pose. share: the noise that tilt and height add to a usual ray,
+    as a multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
     """
 
     tilt: float

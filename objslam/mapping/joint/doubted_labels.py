@@ -1,8 +1,8 @@
 """Doubt whether each label names a single object, and compare with a map that has several objects for a label.
 
 A map with one object for two things bends the path, so that both things lie in one place. A solve that estimates the noise
-explains the bend by noise of the odometry, and then all rays agree. So the rays do not tell that the label has two objects.
-Only a comparison of the evidence for both maps, at the same noise, tells it.
+explains the bend by noise of the odometry, and then all rays agree. So the rays do not show that the label has two objects.
+Only a comparison of the evidence for both maps, at the same noise, shows it.
 """
 
 from __future__ import annotations

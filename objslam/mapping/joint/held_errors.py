@@ -2,8 +2,8 @@
 
 With odometry alone, the place and the focal length of a camera are held, because a path that is free to bend fits usual
 errors of them too. A gross error bends the path, and the objects move by many of their sigmas. So it is estimated after all.
-A usual error of a focal length stays, and the sigmas contain what it does.
-A camera that somebody turned during the drive cannot be corrected, because no box tells when that was.
+A usual error of a focal length stays, and the sigmas contain what it does. A camera that somebody turned during the drive
+cannot be corrected, because no box shows when that was.
 """
 
 from dataclasses import dataclass, replace
@@ -107,7 +107,7 @@ def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -
 
 
 def _held(errors: SharedErrors) -> list[str]:
-    """Return the settings of the errors that a solve held because the log may hardly tell them."""
+    """Return the settings of the errors that a solve held because the log may hardly determine them."""
     of, file = errors.settings.calibration, known_errors(errors.settings)
     told = set(errors.names) if file is None else {*errors.names, *file.names}
     known = {_SETTING.get(kind(name)) for name in told}
@@ -115,7 +115,7 @@ def _held(errors: SharedErrors) -> list[str]:
 
 
 def _freed(errors: SharedErrors, names: list[str]) -> SharedErrors:
-    """Return the errors with those of these settings, to be estimated too."""
+    """Return the errors, with the held errors of these settings added. They are estimated too."""
     more = errors.settings.calibration.model_copy(update={name: _USUAL[name] for name in names})
     settings = errors.settings.model_copy(update={"calibration": more})
     other = shared_errors(errors.log, errors.keyframes, errors.rays, settings)

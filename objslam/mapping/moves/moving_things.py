@@ -29,8 +29,8 @@ also pass from one thing to the next where equal things stand close together, bu
 groups had 0.8 to 2.0. All objects of people together had 3 and more, and those of carts 1.9 to 2.4. A larger multiple drops
 fewer objects."""
 _USUAL = 3
-"""The fewest objects that tell the usual scatter: those whose tracks have hardly any other rays, and whose label does not
-seem to move. With a larger number, fewer maps are asked."""
+"""The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
+label does not seem to move. With a larger number, fewer maps are asked."""
 
 
 def without_moving_things(state: JointState) -> JointState:
@@ -51,8 +51,8 @@ def things_at_rest(
     The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
     association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
     passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
-    because tracks of a few things at rest also pass on to equal things beside them. If all things have one label, nothing
-    tells the usual scatter, and all objects stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
+    because tracks of a few things at rest also pass on to equal things beside them. If all things have one label, the usual
+    scatter is unknown, and all objects stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
     """
     moving = _moving(keyframes, rays, association, estimate, map_T_camera)
     if not moving.any():

@@ -118,8 +118,8 @@ def _pairs(ours: list[MapObject], theirs: list[MapObject], a_T_b: Floats) -> lis
 
 
 def _with_labels_of(ours: MapObject, theirs: MapObject, often: Sequence[int]) -> MapObject:
-    """Return `ours` with the mean label shares of both, and the label that these shares tell. often: how many sessions saw
-    each."""
+    """Return `ours` with the mean label shares of both, and the label that follows from these shares. often: how many
+    sessions saw each."""
     shares = mean_labels([ours, theirs], often)
     return ours if shares is None else replace(ours, labels=shares, label=next(iter(shares)))
 

@@ -22,8 +22,8 @@ _ONE_SIDE = np.radians(35.0)
 """A thing was seen from one side if no view is farther (rad) from the mean view. In simulations, cuboids seen over 60
 degrees and more had one clear heading. A larger angle searches at more things."""
 _RIVAL = 15.0
-"""Other headings of a cuboid are tried unless another shape has more evidence by more than this (ln). Another heading has
-raised the evidence by up to 11. A larger number searches at more things."""
+"""Other headings of a cuboid are tried, unless the evidence (ln) of another shape is higher by more than this. Another
+heading has raised the evidence by up to 11. A larger number searches at more things."""
 _SAME = 0.005
 """Two cuboids are one if no centre and no half axis differs by more than this (m). A larger length merges more of them."""
 

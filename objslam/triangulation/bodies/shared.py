@@ -32,7 +32,7 @@ as a share of half the size. The outline of a hexagonal prism differs by 4 % fro
 seen from one side do not show this error, because their bodies bend to it. A larger share makes their depths less sure."""
 _ALONG = 1.0
 """The error of a side changes with the distance. This is the standard deviation of the change from a distance to e times
-this distance, in standard deviations of the error. With a larger change, the growth of boxes tells less about the
+this distance, in standard deviations of the error. With a larger change, the growth of boxes says less about the
 distance."""
 _BEYOND = 0.5
 """The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. It is that of
@@ -215,7 +215,7 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
 def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> tuple[Floats, Floats]:
     """Return `covariance_of`, and what is added to it because no thing has exactly the shape of its body (`UNLIKE`).
 
-    The error of a side also changes with the distance. Otherwise the growth of boxes on the way to a thing would tell its
+    The error of a side also changes with the distance. Otherwise the growth of boxes on the way to a thing would give its
     distance exactly, however wrong its outline is.
     """
     count = len(fit.values)

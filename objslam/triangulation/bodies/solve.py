@@ -279,7 +279,7 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bo
 
 
 def _axes_of_shapes(now: _State) -> Floats:
-    """Return centres and half axes (5, N, 6), m, of the bodies of each shape. A point tells no half axes."""
+    """Return centres and half axes (5, N, 6), m, of the bodies of each shape. A point has no half axes."""
     axes = np.stack(
         [np.column_stack([v[:, :3], kind.half_axes(v)]) for v, kind in zip(now.fitted, KINDS, strict=True)],
     )

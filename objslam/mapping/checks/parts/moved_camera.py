@@ -6,7 +6,7 @@ while the robot turns left, and to the other side while it turns right.
 
 The errors of poses last for seconds, and many boxes share them. The covariance of an estimate takes each box as new, so it
 is too small at the poses of a particle filter. So the estimate is repeated without each eighth of the boxes. How much it
-changes tells its real error (jackknife with blocks, Kuensch 1989). A turn must be far larger than this error.
+changes shows its real error (jackknife with blocks, Kuensch 1989). A turn must be far larger than this error.
 """
 
 from collections.abc import Mapping, Sequence
