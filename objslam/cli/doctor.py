@@ -33,7 +33,7 @@ def doctor(
 ) -> None:
     """Look for wrong input: units, axes, stamps, boxes, calibration. Nothing is changed and nothing is written.
 
-    The exit code is 1 if something is wrong that spoils the map.
+    The exit code is 1 if the input has an error that makes the positions of a map unreliable.
     """
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.known_errors import take_out_expected
@@ -87,7 +87,7 @@ def _solved(log: Log, settings: Settings, show: Progress) -> list[dict[str, Any]
 
 
 def _show_trials(found: Diagnosis) -> None:
-    """Print how well the boxes fit with the log as it is, and with the corrections (hypotheses) that make them fit best.
+    """Print how well the boxes fit: with the log as it is, and with the corrections (hypotheses) that make them fit best.
 
     If nothing is wrong, one line is enough.
     """

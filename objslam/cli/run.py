@@ -63,7 +63,7 @@ _NOISE: Final = {
     "heading": "heading of the poses",
     "place": "place of the poses",
 }
-"""The words for the factors of the noise. A factor of 1 is not shown: the log does not determine it, or confirms the
+"""The names of the noise factors in the output. A factor of 1 is not shown: the log does not determine it, or confirms the
 settings."""
 NOT_LOCALISED = 3
 """The exit code of a run that wrote its result, but was not found in the map that --map names."""

@@ -24,8 +24,8 @@ _OBJECT_ROWS = (
     ("inside_95_3d", "share of truths inside the 95 % ellipsoid", ""),
 )
 _NOT_SHARED = {"mahalanobis_median": "squared Mahalanobis in x, y, median (honest: 1.39 or less)"}
-"""The names of rows after an alignment, if the map does not say which errors its objects share. The alignment may have taken
-out such errors, and the covariances still contain them."""
+"""The names of rows that differ after an alignment, if the map does not say which errors its objects share. An alignment may
+remove such errors, but the covariances still contain them."""
 _BODY_ROWS = (
     ("bodies", "bodies compared", ""),
     ("size_error_median", "error of length, width and height as a share, median", ""),

@@ -1,8 +1,5 @@
 """Errors that the boxes of an object share. The centre of a box is off the centre of the object. From one side, all boxes
-have about the same offset.
-
-Many rays from one side do not average this offset out, so they count as few (Kish 1965).
-"""
+have about the same offset. Many rays from one side do not average it out, so they count as few rays (Kish 1965)."""
 
 from dataclasses import dataclass, replace
 from typing import Self

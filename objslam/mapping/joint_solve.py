@@ -254,13 +254,13 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
 
 
 def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
-    """Return the state, or one from the association of the fixed mode if this explains the log better.
+    """Return the better of two states: the given one, and one that begins with the association of the fixed mode.
 
     The first association at localised poses allows for the noise of the localisation, but not for the errors of cameras. Its
-    gates may be too wide for rows of equal things, and too narrow for a camera that is mounted askew, or for a localisation
-    that errs for seconds. Then an object has rays of two things. The later rounds keep these rays, because the poses were
-    bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in the boxes of each frame.
-    begin: before the first association. state: after the rounds that began there.
+    gates may be too wide for rows of equal things. They may be too narrow for a camera that is mounted askew, or for a
+    localisation that errs for seconds. Then an object has rays of two things. The later rounds keep these rays, because the
+    poses were bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in the boxes of each
+    frame. begin: before the first association. state: after the rounds that began there.
     """
     if begin.errors is None:
         return state

@@ -55,8 +55,7 @@ class RenderSettings(CourseSettings):
     camera: InstanceOf[Camera] = make_camera(focal=400.0, position=(0.1, 0.0, 1.0), pitch=-0.25)
     labels: tuple[str, ...] = LABELS  # The labels of the objects in the room. A label may be repeated.
     min_views: Annotated[int, Field(ge=0)] = 18
-    """The least number of images with a good box of each object. A good box is within `limits`, and not cut off by the
-    edge."""
+    """The least number of images in which each object has a good box: within `limits`, and not cut off by the edge."""
     min_parallax_deg: NotNegative = 33.0  # The least parallax of each object over these images, degrees.
     limits: BoxLimits = BoxLimits()
     sensor: Sensor = Sensor()

@@ -45,8 +45,8 @@ things."""
 _FREE = 3
 """The degrees of freedom of a second point."""
 _USUAL_GAIN = 2.366
-"""The usual gain: the median decrease of the cost of the rays of one thing if two points explain them in place of one. It is
-the median of chi-squared with `_FREE` degrees of freedom."""
+"""Two points explain the rays of one thing better than one point does. This is the median decrease of the cost, the median
+of chi-squared with `_FREE` degrees of freedom."""
 _USUAL_GAINS = ((0.5, _USUAL_GAIN), (0.8, 4.642))
 """Two probabilities, each with its quantile of chi-squared with `_FREE` degrees of freedom. Errors that last for a while,
 such as those of a wheel that slips, concern only some landmarks. They show in the second quantile. If one landmark in five
@@ -131,9 +131,9 @@ def _most(bundles: Bundles, free: FreeFit) -> Floats:
 
 
 def _overlap(bundles: Bundles, position: Floats) -> Bools:
-    """Return for each pair (S,) of bundles whether things of their size at points (G, 3) m would overlap.
+    """Return for each pair (S,) of bundles whether the two things would overlap at the points (G, 3), m.
 
-    Two things do not overlap. But two points inside one large thing may explain its rays better than one point, because the
+    Two real things do not overlap. But two points inside one large thing may explain its rays better than one point: the
     rays from two sides to the middles of its boxes do not meet in one point.
     """
     apart = np.linalg.norm(position[::2] - position[1::2], axis=1)

@@ -32,7 +32,7 @@ _CLASS_SIZE, _OF_CLASS = 0.7, 3.0
 landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, the size says less about
 the distance. With a larger number, the assumed deviation counts longer."""
 _LEAST_VIEW = 1e-3
-"""The least measured deviation of ln size between views, so that its logarithm is finite."""
+"""The smallest deviation of ln size between views that is used. It keeps the logarithm of the deviation finite."""
 _SIZED_BY = 5
 """The least number of boxes that give a landmark a size. A larger number leaves more landmarks without one."""
 _MARGIN = (2.0, 2.0, 0.3)

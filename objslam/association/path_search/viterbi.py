@@ -24,9 +24,9 @@ _LEVELS = 250
 
 @dataclass(frozen=True)
 class Motions:
-    """The motions between G stretches. error: (G - 1, 3) of the present path against the odometry in x, y (m) and yaw (rad),
-    along the axes of map. variance: (G - 1, 3) of this error, from the odometry's drift. way: (G - 1, 2) m, from pivot to
-    pivot."""
+    """The motions from each of G stretches of the path to the next. error: (G - 1, 3) the motion of the present path minus
+    that of the odometry: x, y (m) and yaw (rad), along the axes of map. variance: (G - 1, 3) of this error, from the
+    odometry's drift. way: (G - 1, 2) m, the motion in x and y."""
 
     error: Floats
     variance: Floats

@@ -165,7 +165,7 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Outer:
-    """The outer problem at parameters theta (P,).
+    """The state of the search for the parameters theta (P,) of shared errors and noise.
 
     gradient: (P,) and information: (P, P) of the likelihood. curvature: (P, P) the information with the prior. step: (P,) of
     Gauss-Newton.

@@ -1,8 +1,6 @@
-"""Edges of boxes that may be the edges of a thing in front, by the other boxes of the image and the map.
-
-The body behind may reach beyond such an edge. A box also counts as in front if its thing has no place in the map, so that
-its distance is unknown, or if the edge of the image cuts the box off.
-"""
+"""Find edges of boxes that may belong to a thing in front, from the other boxes of the image and from the map. The body
+behind may reach beyond such an edge. A box of a thing without a place in the map counts as in front, because its distance is
+unknown. So does a box that the edge of the image cuts off."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ larger share makes positions less sure."""
 def edges_behind_boxes(
     solution: Solution, cameras: tuple[Camera, ...], settings: Settings, map_T_camera: Floats, half: Floats, ray: Ints
 ) -> Bools:
-    """Return which edges (B, 4) of the boxes of some rays (B,) a thing in front may have made.
+    """Return which edges (B, 4) of the boxes of some rays (B,) may belong to a thing in front.
 
     map_T_camera: (K, 4, 4) of the keyframes. half: (N,) m, the apparent half axes of the objects, NaN if unknown.
     """

@@ -1,7 +1,8 @@
 """Bearings and ranges to the centres of bodies, for the joint mode.
 
 The centre of a box is not the image of the centre of the object. For large objects nearby, this error bends the estimated
-path. A range ends on the surface of the object. A body that was seen from many sides tells how far its centre is behind.
+path. A range ends on the surface of the object. A body that was seen from many sides shows how far its centre is behind its
+surface.
 """
 
 from __future__ import annotations

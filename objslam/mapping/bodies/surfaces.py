@@ -1,7 +1,5 @@
-"""How far the centres of bodies are behind the surfaces on which ranges end.
-
-The widths of boxes tell a share that all things have in common. A body that was seen from many sides tells its own.
-"""
+"""How far the centres of bodies are behind the surfaces on which ranges end. The widths of boxes give one share for all
+things. A body that was seen from many sides gives its own share."""
 
 from __future__ import annotations
 

@@ -30,9 +30,9 @@ _LOOSE = 9.0
 robots have up to 8.1. If the multiple is larger, the fault is often not in the odometry: a camera that turns on the robot
 looks the same. A larger value gives fewer warnings."""
 _NAMED = 3.0
-"""From this multiple of the noise in the settings on, an assessment names the noise of the odometry. Nine tenths of its
-variance are then not in the settings. The cause may be wheels that slip, or a path that was bent to make one object of two
-things. A larger value names it less often."""
+"""An assessment names the noise of the odometry if it is at least this multiple of the settings. Nine tenths of its variance
+are then not in the settings. The cause may be wheels that slip, or a path that was bent to make one object of two things. A
+larger value names it less often."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
 gives more warnings."""

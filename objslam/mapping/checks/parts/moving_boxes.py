@@ -9,7 +9,7 @@ _NEAR = 12.0
 """Two boxes lie at one place of the image if their centres are nearer than this (px). It exceeds the noise of boxes, and
 things that a moving camera passes move farther within `_LATER`. A larger distance takes slow motion for a stop."""
 _NEAR_SHARE = 0.1
-"""The same, as a share of the mean of a box's width and height, because the noise of a box grows with its size."""
+"""The same distance as a share of the mean of a box's width and height, because the noise of a box grows with its size."""
 _LATER = 2.0
 """The time (s) after which a box shows whether it moved. A longer time shows slower motions, and needs longer stops."""
 _STAYS = 0.25
