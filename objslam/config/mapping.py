@@ -131,8 +131,8 @@ class AssociationSettings(Section):
     loop_evidence: Positive = 7.0
     """Minimum log odds that the current landmarks are landmarks of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
-    """Minimum lead in log odds of the best place over the second-best place. A smaller lead closes no loop. A larger value
-    confuses fewer similar places."""
+    """Minimum lead in log odds of the best place over the second-best place. With a smaller lead, a loop is not closed. A
+    larger value confuses fewer similar places."""
     fuse_labels: bool = True
     """Merge objects of different labels that are the same thing into one object with several labels."""
 

@@ -22,8 +22,8 @@ from objslam.graph.calibration.pose_errors import ComparedPoses, averaged, most_
 from objslam.graph.calibration.shared_error_jacobian import linearise
 
 _LOOSE = 1e4
-"""The factor on the noise of the localisation in the graph that predicts it. With a larger factor, the prediction contains
-less of the localisation, and more rounding errors."""
+"""In the graph that predicts the localised poses, their noise is multiplied by this factor, so that they hardly count. With
+a larger factor, the prediction contains less of the localisation, and more rounding errors."""
 _FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
 """In a long log, the poses are compared at `_FIRST` times, spread evenly, and at the numbers `_LAGS` of keyframes after
 each. Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are
