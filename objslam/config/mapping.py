@@ -18,9 +18,9 @@ class Poses(Section):
     max_gap: Positive = 1.1
     """Maximum time in s between two consecutive poses of the path. A frame in a longer gap is dropped and counted."""
     jumps: Literal["correct", "keep"] = "correct"
-    """What happens to jumps of the localisation that are shorter than 1 m. correct: the poses on both sides of a jump are
-    moved together unless the boxes refute it, and the map says that nobody knows which side was right. keep: the poses
-    stay as they are. With checks.use=false, they always stay."""
+    """What happens to jumps of the localisation that are shorter than 1 m. correct: the path is joined at each jump, unless
+    the boxes refute it. The map then says that nobody knows which side was right. keep: the poses stay as they are. With
+    checks.use=false, they always stay."""
 
 
 class RayNoise(Section):

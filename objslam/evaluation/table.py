@@ -13,7 +13,7 @@ _OBJECT_ROWS = (
     ("matched", "matched objects", ""),
     ("missed", "missed objects", ""),
     ("false", "false objects", ""),
-    ("unresolved", "unresolved objects (their true ones count as missed)", ""),
+    ("unresolved", "unresolved objects (without a position)", ""),
     ("precision", "precision", ""),
     ("recall", "recall", ""),
     ("position_rmse", "position RMSE", " m"),

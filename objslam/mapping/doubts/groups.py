@@ -122,7 +122,8 @@ def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
 
 
 def described_group(evidence: Evidence, rays: Ints, settings: Settings) -> BoxGroups:
-    """Return one group of given rays (n,) of one label, none of which belongs to an object, with the reason why."""
+    """Return rays (n,) of one label as a group, with the reason why it is no object. None of the rays may belong to an
+    object."""
     free = replace(evidence.state, matched=np.where(evidence.left, -1, evidence.state.matched))
     mine = np.flatnonzero(np.isin(evidence.ray, rays))
     return _described(replace(evidence, state=free), [mine], np.array([_OPEN]), np.array([-1]), settings)
