@@ -190,7 +190,7 @@ class State:
 
     def split(self, which: Ints, second: Bools, position: Floats) -> State:
         """Split the landmarks `which` (S,) in two. The second of each comes after all others, and gets its rays that are in
-        the mask `second` (R,). position: (S, 2, 3) m, of both."""
+        the mask `second` (R,). position: (S, 2, 3) m, of the two landmarks."""
         number = np.full(self.count + 1, -1)
         number[which] = self.count + np.arange(len(which))
         moved = self.landmarks.position.copy()

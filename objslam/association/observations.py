@@ -180,8 +180,8 @@ def overlap(one: Floats, two: Floats) -> Floats:
 class UsualSizes:
     """What the boxes of N landmarks usually measure.
 
-    number: (N,) of the boxes with a size. ln_size: (N, 2) medians of ln width and ln height, in m. variance: (N, 2) of both
-    over the boxes of the landmark. Without boxes, the medians are NaN.
+    number: (N,) of the boxes with a size. ln_size: (N, 2) medians of ln width and ln height, in m. variance: (N, 2) of ln
+    width and ln height over the boxes of the landmark. Without boxes, the medians are NaN.
     """
 
     number: Ints

@@ -158,7 +158,7 @@ def warn_of_neighbours(out: Path) -> None:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """Return the console of stdout or stderr. Its width is that of the terminal, or COLUMNS. Without both it is 120 columns.
+    """Return the console of stdout or stderr. It has the width of the terminal, or COLUMNS. Without both it is 120 columns.
 
     Each stream has one console, so that a line printed during a progress bar or status line does not mix with it. The
     console has no markup: it prints [red] and :smile: as they are. `printable` replaces characters that cannot be printed.

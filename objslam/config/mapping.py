@@ -84,8 +84,8 @@ class Odometry(Section):
 
 
 class Planar(Section):
-    """Configure how far the robot deviates from a planar path. A real floor is not perfectly flat. The defaults are those of
-    a floor in a house. Grass, tracks and slopes deviate by far more, and a run estimates by how much (noise.ground)."""
+    """Configure how far the robot deviates from a planar path. A real floor is not perfectly flat. The defaults suit a floor
+    in a house. Grass, tracks and slopes deviate by far more, and a run estimates by how much (noise.ground)."""
 
     z: Positive = 1e-3
     """Standard deviation of the height in m."""

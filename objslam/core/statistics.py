@@ -53,8 +53,8 @@ MOST_NOISE_FACTOR = 5.0
 """The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the
 box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
 NOISE_MEASURED_BY = 6
-"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise is
-that of the settings. A larger number rejects more rays of noisy objects."""
+"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise of
+the settings counts. A larger number rejects more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
 """The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. At the
 same number of rays of a class, the noise of the class and the nominal noise have equal weight. A larger number keeps objects

@@ -72,7 +72,7 @@ def box_depth(image: NDArray[Any], box: Floats, focal: float) -> float:
 
 
 def _of_thing(depths: Floats, size: float) -> Floats:
-    """Return those of the depths (n,) that are of the nearest surface.
+    """Return the depths, among depths (n,), that belong to the nearest surface.
 
     A thing may be as deep as it is wide or high. What is farther behind is the background, if a gap parts it from the thing.
     size: the larger side of the thing, per unit of its depth.

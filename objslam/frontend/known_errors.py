@@ -27,10 +27,10 @@ _PLACE_BESIDE_ODOMETRY = 0.02
 effect of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by 11 cm with `USUAL_PLACE`.
 Logs with places that were 1.5 cm off were as good with both."""
 USUAL_FOCAL = 0.02
-"""The prior standard deviation of the focal length, as a share, as of a field of view from a data sheet. A calibrated camera
-errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone bends
-to fit a wrong focal length, and then a wrong association fits too: one of 36 parts of recorded drives had four landmarks
-twice. With a larger value, a log must show more before an error counts as known."""
+"""The prior standard deviation of the focal length, as a share, if the field of view is from a data sheet. A calibrated
+camera errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone
+bends to fit a wrong focal length, and then a wrong association fits too: one of 36 parts of recorded drives had four
+landmarks twice. With a larger value, a log must show more before an error counts as known."""
 COARSE = 0.3
 """Fixed poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
@@ -49,8 +49,8 @@ def error_names(log: Log) -> tuple[str, ...]:
 def usual_place(log: Log, settings: Settings) -> float:
     """Return the prior standard deviation, m, of the place of a camera on the base, if `calibration.translation` is auto.
 
-    Against given poses, those of a localisation or of fixed mode, a wrong place of a camera moves all objects. A map from
-    odometry alone moves with the camera.
+    Against given poses (a localisation, or fixed mode), a wrong place of a camera moves all objects. A map from odometry
+    alone moves with the camera.
     """
     if settings.mode == "fixed":
         return USUAL_PLACE

@@ -72,7 +72,7 @@ class SizedRays:
 
 
 def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return the solution with the errors that boxes share added to its covariances, also to those of hidden bodies.
+    """Return the solution with the errors that boxes share added to its covariances. Hidden bodies get them too.
 
     The centres of an object's boxes have one offset that is equal from all sides, and one for each side. Both are a share of
     the object's size. `rays.box_sigma` is the prior standard deviation of this share. The share is estimated from the rays

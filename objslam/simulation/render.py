@@ -26,7 +26,7 @@ from objslam.simulation.trajectory import Path as Course
 from objslam.simulation.trajectory import frame_stamps, localization, odometry
 
 TRUTH_BOXES = "boxes.jsonl"
-"""The name of the file of true boxes, which is in the groundtruth folder. Its format is that of detections.jsonl."""
+"""The name of the file of true boxes, which is in the groundtruth folder. It has the format of detections.jsonl."""
 ROUNDS = 40  # The largest number of random rooms that are tried. With a larger value, more settings find a good room.
 LOOK_AHEAD = 4
 """When a room is tried, the width and the height of the images are divided by this factor. A larger factor is faster and

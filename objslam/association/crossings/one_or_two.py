@@ -33,11 +33,11 @@ _CLEAR = 3.0
 """The least log odds of two things over one for a landmark that is split: 3 is a factor of 20. A larger value splits fewer
 landmarks. A thing may be lost if it is split."""
 _ASSUMED = 3
-"""The number of landmarks that are assumed to have the usual gain (`_USUAL_GAIN`), in addition to those of the log. With a
-larger number, errors that rays share split more landmarks."""
+"""The number of landmarks that are assumed to have the usual gain (`_USUAL_GAIN`), in addition to the landmarks of the log.
+With a larger number, errors that rays share split more landmarks."""
 _LEAST_EXCESS = 1 / 16
-"""The least factor on the usual gain of two points. It is that of rays with a quarter of the nominal noise. A smaller factor
-splits more landmarks."""
+"""The least factor on the usual gain of two points. Rays with a quarter of the nominal noise have this factor. A smaller
+factor splits more landmarks."""
 _OFF_CENTRE = 0.02
 """The offset between the middle of a thing and the middles of its boxes in one bundle, as a share of the boxes' size.
 Perspective alone gives this share for a cube that is seen from six times its size. A larger share splits fewer large
@@ -155,9 +155,9 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
 def excess_of(gain: Floats) -> Floats:
     """Return for each landmark (S,) the factor by which two points usually gain more than the nominal noise explains.
 
-    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses
-    can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second thing. The
-    factor comes from the gains of the other landmarks. gain: (S,) by how much two free points lower the cost.
+    Rays share errors, such as those of poses and clocks. Then two points fit the rays of one thing better than noise
+    explains. Poses can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second
+    thing. The factor comes from the gains of the other landmarks. gain: (S,) by how much two free points lower the cost.
     """
     every = np.append(gain, np.full(_ASSUMED, _USUAL_GAIN))
     order = np.argsort(every, kind="stable")
@@ -189,7 +189,7 @@ def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
 
     The excess comes from a limited number of landmarks, so the odds are those of an F distribution.
 
-    gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) as of
+    gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) from
     `excess_of`. landmarks: the number of gains that gave it.
     """
     number = landmarks - 1 + _ASSUMED

@@ -39,7 +39,7 @@ objects do not lie everywhere where boxes could show them. A larger upper limit 
 _SHARES = np.geomspace(1e-4, 1.0, _TRIED)
 """The tried shares of stray boxes. A smaller lower limit trusts the boxes of a clean log more."""
 _PRIOR_STRAYS = 1.0
-"""The number of strays of each label that are assumed in addition to those of the log. A larger number keeps fewer
+"""The number of strays of each label that are assumed in addition to the strays in the log. A larger number keeps fewer
 landmarks."""
 _LOOK = np.radians(2.0)
 """Two rays of a landmark count as independent if the angle (rad) between them is at least this. It is the least parallax of

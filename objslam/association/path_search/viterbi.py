@@ -75,7 +75,7 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
     """Return the states (G, 3) of x, y (m) and yaw (rad) with the least total cost. costs: (Y, X, X) of each stretch.
 
     A state that costs `_SLIP` more than the best state of its stretch is on no best path, because a slip from the best state
-    costs less. So a byte is enough for the cost above that of the best state.
+    costs less. So a byte is enough for the difference from the cost of the best state.
     """
     stored, total = list[NDArray[np.uint8]](), np.zeros(0, dtype=np.float32)
     for k, seen in enumerate(costs):

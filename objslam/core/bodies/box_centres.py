@@ -85,10 +85,9 @@ def _around_points(points: Floats, centre: Floats, body: Floats, half: Floats) -
 def image_axes(map_R_camera: Floats, to: Floats, fisheye: Bools) -> Floats:
     """Return the axes (n, 3, 3) of the images around bodies, in map, for `beside_centres`.
 
-    For a fisheye lens, the image around a body is taken as that of a camera turned towards the body. For other lenses, the
-    axes are those of the camera. The distortion of such a lens bends the edges of a box a little, but the error is small
-    compared with the vectors of `beside_centres`. map_R_camera: (n, 3, 3). to: (n, 3), m, from the cameras to the bodies.
-    fisheye: (n,).
+    For a fisheye lens, a camera that is turned towards the body gives the axes. For other lenses, the camera itself gives
+    them. The distortion of such a lens bends the edges of a box a little, but the error is small compared with the vectors
+    of `beside_centres`. map_R_camera: (n, 3, 3). to: (n, 3), m, from the cameras to the bodies. fisheye: (n,).
     """
     if not fisheye.any():
         return map_R_camera

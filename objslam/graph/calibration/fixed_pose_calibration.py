@@ -260,7 +260,7 @@ class _Misses:
 
     All arrays have a first axis for M values of the errors. deviation: (M, n, 2) the angles between rays and points, in
     standard deviations, along the axes `basis` (M, n, 2, 3). to: (M, n, 3) the unit vectors to the points. distance: (M, n)
-    m. angle: (M, n) rad, the noise of directions. sigma: (M, n) rad, that of misses.
+    m. angle: (M, n) rad, the noise of directions. sigma: (M, n) rad, the noise of misses.
     """
 
     deviation: Floats
@@ -285,8 +285,8 @@ class _Misses:
     def by_point(self, trusted: bool) -> Floats:
         """Return the derivatives (M, n, 2, 3) of the deviations by the points.
 
-        If the noise is trusted, they contain those of the standard deviation. Without them, the noise would bias the errors
-        of the camera and the points, and more rays would not reduce this bias.
+        If the noise is trusted, they contain the derivatives of the standard deviation. Without them, the noise would bias
+        the errors of the camera and the points, and more rays would not reduce this bias.
         """
         along = self.deviation * self.sigma[..., None] * (self.angle / self.sigma)[..., None] ** 2 * trusted
         across = self.basis - along[..., None] * self.to[..., None, :]

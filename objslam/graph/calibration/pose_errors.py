@@ -223,7 +223,7 @@ def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasti
     """Return the noise and the lasting parts of headings and places, averaged over their posterior if they last.
 
     A log contains few independent samples of an error that lasts. The most likely values would make the noise too small. So
-    the variance of the error, and that of its mean over the log, are averaged. The time is the one that gives this mean.
+    two variances are averaged: of the error, and of its mean over the log. The time is the one that gives this mean.
     """
     duration = float(np.ptp(data.times))
     found = dict[str, tuple[float, Lasting]]()

@@ -77,8 +77,8 @@ def fit(seen: Corners, squares: Squares, free: Bools, iterations: int) -> tuple[
     """Return the squares that fit the corners best, near the given ones, by Levenberg-Marquardt with Cauchy's loss.
 
     free: (H,) whether the side is fitted too. Returns the squares, their costs (H,), and the information (H, 7, 7) about
-    each: rotation and position in the frame of the square, then the logarithm of the side. The rows of a fixed side are
-    those of the identity.
+    each: rotation and position in the frame of the square, then the logarithm of the side. For a fixed side, the rows are
+    those of an identity matrix.
     """
     count = len(squares.side)
     damping = np.full(count, _DAMPING)

@@ -39,7 +39,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     """Return the estimate from bearings and ranges to the centres of bodies, and the shift of the rays.
 
     A ray that the solve rejects is not shifted. If an object would be lost, its bearings stay at the centres of its boxes.
-    If an object would be lost even so, or if no body shifts its bearings or ranges enough, the estimate does not change and
+    If an object would still be lost, or if no body shifts its bearings or ranges enough, the estimate does not change and
     the second value is None. The bodies are not fitted again at the new poses. In 24 simulated drives between large objects,
     this would change the path by 1 mm, and the objects by less than their noise.
     """

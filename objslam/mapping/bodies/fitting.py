@@ -42,9 +42,9 @@ off by 1 to 4 % of half the height (tools/bench_shapes.py). A larger share makes
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
     """Return a solution with a body for each object whose boxes show one. The points and their covariances do not change.
 
-    The covariance of a centre contains the noise of the boxes and the errors that they share, also those of a thing that has
-    not exactly the shape of its body. The covariance of the point may be larger than the noise of its rays explains, because
-    solved poses have noise, or because errors of given poses last. This excess is added too.
+    The covariance of a centre contains the noise of the boxes, and the errors that they share: also the error of a thing
+    that has not exactly the shape of its body. The covariance of the point may be larger than the noise of its rays
+    explains, because solved poses have noise, or because errors of given poses last. This excess is added too.
     """
     if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution

@@ -96,7 +96,8 @@ class BoxGroups:
 def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
     """Return the groups of boxes without an object, each with the reason why it is no object.
 
-    A box belongs to the first group that takes it. The reasons at a place are those of the association itself, in its order.
+    A box belongs to the first group that takes it. The association itself has the same reasons at a place, in the same
+    order.
     """
     left = np.flatnonzero(evidence.left)
     # A rejected ray shows another thing than its object, so it is no box of this object.

@@ -38,8 +38,8 @@ def with_errors_of_tracks(state: JointState) -> tuple[JointState, Floats]:
 
     A track is a chain of boxes in images that follow each other (`frontend.tracks`). Nobody needs to know which tracks show
     the same thing: at the right clocks, turns and rotations of cameras, the rays of each track meet in one point. So the
-    tracks are solved as landmarks, with the odometry and the priors of all errors. With ranges, the noise stays that of
-    the settings. Short tracks leave the noise of distances open: in simulated videos, it was found twenty times too large.
+    tracks are solved as landmarks, with the odometry and the priors of all errors. With ranges, the noise of the settings
+    stays. Short tracks leave the noise of distances open: in simulated videos, it was found twenty times too large.
 
     The first association of a drive takes these errors as given. With a gyroscope that turns by 0.2 degrees a second too
     much, the rays of one minute meet nowhere.

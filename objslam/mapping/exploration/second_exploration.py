@@ -79,7 +79,7 @@ def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = 
 
 
 def _at_least_nominal(noise: NoiseFactors) -> NoiseFactors:
-    """Return the noise of an exploration: no noise of rays or odometry below that of the settings, and no shrinkage."""
+    """Return the noise of an exploration: no noise of rays or odometry below the settings, and no shrinkage."""
     odometry = {name: max(getattr(noise, name), 1.0) for name in ("along", "across", "turning")}
     return replace(noise, rays=max(noise.rays, 1.0), shrinkage=0.0, **odometry)
 

@@ -155,7 +155,7 @@ def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
 
 
 def _counted(times: Floats) -> Ints:
-    """Return the cells that count, ascending: all, or those of stretches that are spread evenly over the time."""
+    """Return the cells that count, ascending: all cells, or the cells of stretches that are spread evenly over the time."""
     if len(times) <= _MOST:
         return np.arange(len(times))
     stretches = np.array_split(np.argsort(times, kind="stable"), -(-len(times) // _TOGETHER))

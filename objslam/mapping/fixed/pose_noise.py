@@ -78,9 +78,9 @@ def noise_in_frames(
 
     A variance component model (Searle, Casella and McCulloch 1992): seen from above, the miss of a ray is a sum of three
     errors: the noise of the ray, the error of the heading of its pose, and the error of the place of its pose, as seen from
-    the object. The sizes of the three errors are those of the largest posterior density. Both factors are 1 unless the rays
-    refute the settings. Only poses with rays to two objects and more count, because a single ray does not show which of the
-    three errors it has.
+    the object. The sizes of the three errors have the largest posterior density. Both factors are 1 unless the rays refute
+    the settings. Only poses with rays to two objects and more count, because a single ray does not show which of the three
+    errors it has.
 
     positions: (N, 3) m, NaN for an object without a position.
     """

@@ -53,8 +53,8 @@ taken for noisy places."""
 _FEWEST = 20
 """The fewest boxes of a log that is searched. Fewer boxes agree with any noise by chance."""
 _NEAR = 30.0
-"""A noise is tried as a start if its log odds are at most this below those of the likeliest noise. With a larger number,
-more starts are tried, and each takes about a second."""
+"""A noise is tried as a start if its log odds are lower than those of the likeliest noise by at most this. With a larger
+number, more starts are tried, and each takes about a second."""
 _NOISY = 3.0
 """Places count as noisy from this factor on `localization.xy` on. If any start leads to noisy places, results with more
 exact places are left out. Large errors of boxes would explain few boxes as well, but they are rare, and the sigmas would

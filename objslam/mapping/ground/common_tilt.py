@@ -138,9 +138,9 @@ class _Poses:
 class Uneven:
     """How uneven the ground is.
 
-    tilt: rad, the standard deviation of roll and of pitch. height: m, that of the height. seconds: s, the time after which
-    the correlation of both is 1/e, 0 if both are new in each pose. share: the noise that tilt and height add to a usual ray,
-    as a multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
+    tilt: rad, the standard deviation of roll and of pitch. height: m, the standard deviation of the height. seconds: s, the
+    time after which the correlation of both is 1/e, 0 if both are new in each pose. share: the noise that tilt and height
+    add to a usual ray, as a multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
     """
 
     tilt: float

@@ -26,8 +26,8 @@ around had 0.2 to 0.75 in simulations. A larger share drops more objects."""
 _SCATTER = 1.5
 """The things of a label move only if the root mean square of its rays is more than this multiple of the usual one. Tracks
 also pass from one thing to the next where equal things stand close together, but their rays fit. Single real landmarks in
-groups had 0.8 to 2.0. All objects of people together had 3 and more, and those of carts 1.9 to 2.4. A larger multiple drops
-fewer objects."""
+groups had 0.8 to 2.0. All objects of people together had 3 and more, and all objects of carts together had 1.9 to 2.4. A
+larger multiple drops fewer objects."""
 _USUAL = 3
 """The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
 label does not seem to move. With a larger number, fewer maps are asked."""

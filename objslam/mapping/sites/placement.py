@@ -31,7 +31,7 @@ Seen = tuple[int, MapObject]
 class Part:
     """Sessions that share objects, as one map.
 
-    objects: the map, in the frame of one of the sessions. Its objects are those of `tracks`, in the same order: first all
+    objects: the map, in the frame of one of the sessions. It has the objects of `tracks`, in the same order: first all
     objects that are present in a session, then the gone objects. tracks: each object as its sessions have it.
     site_T_session: how each session lies in this frame. log_odds: the log odds of the registration that tied each session to
     the others, NaN for the session that gives the frame.

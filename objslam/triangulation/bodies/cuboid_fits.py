@@ -15,9 +15,9 @@ from objslam.triangulation.bodies.residuals import Residuals
 from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
 
 _TURNS = np.radians([0.0, 22.5, 45.0, 67.5])
-"""The headings (rad) at which square cuboids are fitted, from that of the best one so far. A square repeats after a quarter
-turn. In simulations of things seen over 30 degrees, four headings always found the best cuboid, and two missed it for one
-thing in 20. More headings are slower."""
+"""The headings (rad) at which square cuboids are fitted, relative to the best cuboid so far. A square repeats after a
+quarter turn. In simulations of things seen over 30 degrees, four headings always found the best cuboid, and two missed it
+for one thing in 20. More headings are slower."""
 _ONE_SIDE = np.radians(35.0)
 """A thing was seen from one side if no view is farther (rad) from the mean view. In simulations, cuboids seen over 60
 degrees and more had one clear heading. A larger angle searches at more things."""

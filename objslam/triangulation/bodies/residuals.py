@@ -164,7 +164,7 @@ def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
 
 
 def whole_axes(edges: BoxEdges) -> Bools:
-    """Return which of the residuals (B, 4) of boxes are shifts and sizes: those of an axis without a bound."""
+    """Return which of the residuals (B, 4) of boxes are shifts and sizes: an axis has them if it has no bound."""
     return np.tile((edges.bound[:, :2] == 0) & (edges.bound[:, 2:] == 0), 2)
 
 

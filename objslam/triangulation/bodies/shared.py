@@ -35,8 +35,9 @@ _ALONG = 1.0
 this distance, in standard deviations of the error. With a larger change, the growth of boxes says less about the
 distance."""
 _BEYOND = 0.5
-"""The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. It is that of
-lengths between 0 and 0.9 of the size. A larger share makes objects that something hides less sure."""
+"""The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. Lengths that
+are evenly spread between 0 and 0.9 of the size have this value. A larger share makes objects that something hides less
+sure."""
 _SHARES = 41
 """The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
@@ -257,7 +258,7 @@ def _weights_of_bounds(edges: BoxEdges, found: Residuals) -> Floats:
 
 
 def _ln_distances(edges: BoxEdges, fit: Fit) -> Floats:
-    """Return ln of the distance (B,) of each box's camera from its body, less the mean over the boxes of the body."""
+    """Return ln of the distance (B,) of each box's camera from its body, minus the mean over the boxes of the body."""
     away = np.linalg.norm(fit.values[edges.body, :3] - edges.origin, axis=1)
     found = np.log(np.maximum(away, 1e-9))
     number = np.maximum(np.bincount(edges.body, minlength=len(fit.values)), 1)

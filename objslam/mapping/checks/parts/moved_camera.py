@@ -92,7 +92,7 @@ def finding_of_turns(moved: Mapping[str, float]) -> list[Finding]:
 
 
 def in_halves(cameras: Sequence[CameraLog]) -> tuple[CameraLog, ...]:
-    """Return two cameras in place of each one: first those of the first half, then those of the second half.
+    """Return two cameras in place of each one: first the cameras of the first half, then the cameras of the second half.
 
     All of them have the boxes of both halves.
     """
