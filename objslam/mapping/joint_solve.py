@@ -192,8 +192,8 @@ def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
 def _unclear(state: JointState) -> bool:
     """Return whether a map may be wrong, so that other starts are worth their time.
 
-    Explorations go wrong by chance, each in another place. The false boxes of a detector agree with no object in the best of
-    maps, but they are single boxes. So only the rays of tracks are judged, if there are any.
+    An exploration goes wrong by chance, so another start may be right. The false boxes of a detector agree with no object in
+    the best of maps, but they are single boxes. So only the rays of tracks are judged, if there are any.
     """
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0

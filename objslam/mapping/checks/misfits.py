@@ -1,4 +1,5 @@
-"""Objects whose rays do not agree: they miss their object by more than their noise, and than the rays of other objects."""
+"""Objects whose rays do not agree. Such rays miss their object by more than their noise, and by more than the rays of other
+objects."""
 
 from __future__ import annotations
 

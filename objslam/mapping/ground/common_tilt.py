@@ -168,7 +168,7 @@ class CommonTilt:
     prior: float
 
     def lasting(self) -> Uneven:
-        """Return the ground with the time for which its tilt lasts, and with the size of the tilt if it lasts that long.
+        """Return the ground with the most likely time for which its tilt lasts, and with the size that the tilt then has.
 
         A tilt that lasts moves all rays of a thing up or down together, so the rays still meet. They show only a part of the
         tilt, and the tilt is larger than this part.

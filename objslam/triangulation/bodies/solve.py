@@ -54,11 +54,11 @@ class Bodies:
     ellipsoid, 3 cuboid, 4 cylinder. evidence: (5, N) the logarithm of the evidence of each shape, plus the logarithm of how
     usual the shape is (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share: (2,) the standard
     deviations of the errors of shift and size that boxes of one side share, as shares of half their size. factors: (2,) on
-    the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus that to the
-    centre of its predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on each axis, as in
-    `hidden_edges`. between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes, about the chosen
-    one. It is not in `covariance`. unlike: (N, 7, 7) what is added to `covariance` because no thing has exactly the shape of
-    its body.
+    the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus the unit
+    direction to the centre of its predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on
+    each axis, as in `hidden_edges`. between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes,
+    about the chosen one. It is not in `covariance`. unlike: (N, 7, 7) what is added to `covariance` because no thing has
+    exactly the shape of its body.
     """
 
     values: Floats
