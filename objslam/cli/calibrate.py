@@ -84,7 +84,7 @@ def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: L
 
     log = read(path, ledger, options)
     if settings.mode == "fixed" and log.localization is None:
-        hint = "the log needs localisation, or give --mode joint"
+        hint = "the log has no localisation: give --mode joint"
         raise ConfigError("nothing to calibrate", where=str(path), hint=hint)
     result = pipeline.run(log, settings, ledger, show)
     if result.calibration is None:

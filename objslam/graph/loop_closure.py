@@ -36,9 +36,9 @@ _EPOCH = 40
 a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
 
 _BENDS = ((0.5, 0.5, 0.1), (2.0, 2.0, 0.5))
-"""Standard deviations of the bends of a solved path that missed a loop: in x, y (m) and yaw (rad). They were chosen: the
-first is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated drive). Larger
-values propose more loops, and a solve judges each."""
+"""Standard deviations of the bends of a solved path that missed a loop: in x, y (m) and yaw (rad). They are chosen, not
+measured. The first is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated
+drive). Larger values propose more loops, and a solve judges each."""
 _CUTS = 20
 """The most keyframes that divide a path into a part before a missed loop and a part after it. Most keyframes near a loop
 show it, so few are enough. A larger number takes longer."""

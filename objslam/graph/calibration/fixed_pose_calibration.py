@@ -246,7 +246,8 @@ def _slopes(residual: Callable[[Floats], Floats], errors: CalibratedMeasurements
 def _moved_together(
     names: tuple[str, ...], cameras: tuple[str, ...]
 ) -> tuple[tuple[tuple[int, ...], ...], tuple[int | None, ...]]:
-    """Return groups of errors, as indices, that move no ray together, and the camera of each error, None if it has none."""
+    """Return groups of errors, as indices, and the camera of each error, None if it has none. No two errors of a group move
+    the same ray."""
     owner = [cameras.index(name.rpartition(".")[0]) if name.rpartition(".")[0] in cameras else None for name in names]
     together: dict[str, list[int]] = {}
     for k, name in enumerate(names):

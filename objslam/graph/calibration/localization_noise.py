@@ -25,9 +25,9 @@ _LOOSE = 1e4
 """In the graph that predicts the localised poses, their noise is multiplied by this factor, so that they hardly count. With
 a larger factor, the prediction contains less of the localisation, and more rounding errors."""
 _FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
-"""In a long log, the poses are compared at `_FIRST` times, spread evenly, and at the numbers `_LAGS` of keyframes after
-each. Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are
-more exact, and the time grows with the cube of their number."""
+"""In a long log, the compared poses are at `_FIRST` keyframes, evenly spread, and `_LAGS` keyframes after each of them.
+Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are more
+exact, and the time grows with the cube of their number."""
 
 
 def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
@@ -104,7 +104,7 @@ def _without_places(settings: Settings) -> Settings:
 
 
 def _poses(count: int) -> Ints:
-    """Return the indices of the compared poses of `count`, in increasing order."""
+    """Return the indices of the poses that are compared, among `count` poses, in increasing order."""
     if count <= _FIRST * len(_LAGS):
         return np.arange(count)
     begin = np.linspace(0, count - 1 - max(_LAGS), _FIRST).astype(np.int64)

@@ -255,7 +255,7 @@ def _variance_of_mean(seconds: Floats, duration: float) -> Floats:
 
 
 def _with(model: PoseErrors, name: str, kind: ErrorKind) -> PoseErrors:
-    """Return a model with another error of this name."""
+    """Return a model in which `kind` replaces the error of this name."""
     return replace(model, heading=kind) if name == "heading" else replace(model, place=kind)
 
 
