@@ -152,9 +152,7 @@ def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
             so += f". It is the result of a live session: objslam run {b} -o {again}, then objslam diff {a} {again}"
         warnings.append(so)
     if not found.has_views[0]:
-        warnings.append(
-            f"{a} does not say what was in view (it has no {VIEWS}), so all objects that only {b} has count as new"
-        )
+        warnings.append(f"{a} does not say what was in view (it has no {VIEWS}), so objects that only {b} has count as new")
     return warnings
 
 

@@ -99,8 +99,8 @@ def _bins(x: Floats, low: float, width: float) -> Ints:
 class Strays:
     """The density of stray boxes.
 
-    image: (R,) sr^-1, the density of the boxes of a ray's label in the image at the ray. frames: the number of frames.
-    log_range: the densities of ln range, None if no ray has a range. ranged: (L,) the share of boxes with a range.
+    image: (R,) sr^-1, the density, at the place of a ray in the image, of the boxes of its label. frames: the number of
+    frames. log_range: the densities of ln range, None if no ray has a range. ranged: (L,) the share of boxes with a range.
     """
 
     image: Floats

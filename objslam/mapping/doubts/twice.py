@@ -26,8 +26,8 @@ common. A larger share finds fewer losses."""
 
 @dataclass(frozen=True)
 class Twice:
-    """A place that is twice in a map. stamp: s, when it was lost. first, second: the numbers of objects in both parts.
-    registration: of the first part to the second."""
+    """A place that is twice in a map. stamp: s, when the place was lost. first, second: the numbers of objects in both
+    parts. registration: of the first part to the second."""
 
     stamp: float
     first: int

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
 _NARROWER = (0.3, 0.0)
-"""If a log fits poorly, narrower first associations are tried. Each of these shares gives one, which allows for this share
-of the uncertainty of the shared errors. Each further share takes the time of one association."""
+"""If a log fits poorly, narrower first associations are tried, one for each of these shares. It allows for this share of the
+uncertainty of the shared errors. More shares take longer: each takes the time of one association."""
 _FITS = 2.0
 """If the mean squared miss of a ray, in variances of its noise, is at most this, the widest association is taken, and no
 other is tried. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take
@@ -179,7 +179,7 @@ class _Trial:
     trace: Trace | None
 
     def left(self) -> tuple[float, float]:
-        """Return what the calibration leaves (`_left`), infinities without a calibration."""
+        """Return the misfit that the calibration leaves (`_left`). It is infinite without a calibration."""
         if self.found is None:
             return float("inf"), float("inf")
         return _left(self.corrected, self.association, self.moved)

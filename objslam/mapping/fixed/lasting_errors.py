@@ -43,8 +43,8 @@ _FEWEST = 3
 """A run warns of lasting errors only if at least this number of objects show them. All boxes of one object may lie beside
 the object in the same way for seconds, so one object says little about the poses. A larger number warns less often."""
 _SMALL = 0.2
-"""The errors are estimated again with the boxes around the centres of bodies, if they are above this multiple of the noise
-`localization`. A larger value takes less time, and blames the poses for boxes of large things."""
+"""If the errors are above this multiple of the noise `localization`, they are estimated again, with the boxes moved to the
+centres of bodies. A larger value takes less time, and blames the poses for boxes of large things."""
 LASTING = "lasting localisation errors"
 """The name of the finding that given poses err for seconds."""
 _POOLED = 20.0
@@ -212,7 +212,7 @@ def _by_cell(
 
 
 def _joined(one: Cells, other: Cells) -> Cells:
-    """Return the cells of both, in the order of objects."""
+    """Return the cells of `one` and of `other`, in the order of objects."""
     both = Cells(*(np.concatenate(pair) for pair in zip(vars(one).values(), vars(other).values(), strict=True)))
     return both.take(np.argsort(both.owner, kind="stable"))
 

@@ -62,7 +62,7 @@ class Cells:
         return np.asarray(np.exp(-np.abs(self.times[:, None] - self.times) / time))
 
     def covariances(self, variances: Floats) -> tuple[Ints, Floats]:
-        """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 of each by errors that last.
+        """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 that lasting errors cause in each.
 
         variances: (2, T) as in `lasting_variances`.
         """

@@ -57,8 +57,8 @@ _NEAR = 30.0
 number, more starts are tried, and each takes about a second."""
 _NOISY = 3.0
 """Places count as noisy from this factor on `localization.xy` on. If any start leads to noisy places, results with more
-exact places are left out. Large errors of boxes would explain few boxes as well, but they are rare, and the sigmas would
-then be too small. With a larger factor, a good GPS is taken for a bad detector."""
+exact places are left out. They explain the boxes by large errors of the boxes instead. Such errors are rare, and the sigmas
+would be too small. With a larger factor, a good GPS is taken for a bad detector."""
 _SETTLED = 2
 """How often the objects are searched with the noise of their residuals. A third time gave the same objects on 15 simulated
 streets. A larger number takes longer."""

@@ -102,7 +102,7 @@ class JointState:
         return replace(state, errors=errors, theta=theta, keyframes=keyframes, rays=rays)
 
     def counted(self, found: Association) -> Self:
-        """Return the state with one more round that found an association."""
+        """Return the state after one more round, which found the association `found`."""
         changed = len(self.rays) if self.association is None else rays_moved(self.association.object, found.object)
         return replace(self, rounds=(*self.rounds, {"objects": found.count, "rays_changed": changed}))
 

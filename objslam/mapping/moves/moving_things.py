@@ -30,7 +30,7 @@ groups had 0.8 to 2.0. All objects of people together had 3 and more, and all ob
 larger multiple drops fewer objects."""
 _USUAL = 3
 """The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
-label does not seem to move. With a larger number, fewer maps are asked."""
+label does not seem to move. With a larger number, fewer maps are judged."""
 
 
 def without_moving_things(state: JointState) -> JointState:

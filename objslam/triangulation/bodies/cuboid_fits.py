@@ -133,7 +133,7 @@ def all_headings(
 
 
 def _repeated(others: OtherCuboids, chosen: Ints) -> Bools:
-    """Return which cuboids (M, N) are the chosen one, or the same as the chosen one or an earlier one."""
+    """Return which cuboids (M, N) equal the chosen cuboid or an earlier one."""
     axes = others.axes
     same = np.abs(axes[:, None] - axes[None]).max(axis=3) < _SAME  # (M, M, N)
     repeated = np.array([same[at, :at].any(axis=0) for at in range(len(axes))])
@@ -141,7 +141,7 @@ def _repeated(others: OtherCuboids, chosen: Ints) -> Bools:
 
 
 def mixed_fit(which: Bools, body: Ints, first: Fit, second: Fit) -> Fit:
-    """Return the first fit for some bodies (N,), and the second for the others."""
+    """Return a fit with the bodies `which` (N,) of the first fit, and the other bodies of the second."""
     boxes = which[body]
     found = Residuals(
         *(_rows(boxes, a, b) for a, b in zip(vars(first.found).values(), vars(second.found).values(), strict=True))

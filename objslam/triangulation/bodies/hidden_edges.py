@@ -56,7 +56,7 @@ class Noise:
 
 
 def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
-    """Return the edges, of which those in the mask `hidden` (B, 4) are bounds too."""
+    """Return the edges. Those in the mask `hidden` (B, 4) become bounds, too."""
     return replace(edges, bound=edges.bound | hidden)
 
 
