@@ -191,7 +191,7 @@ def size_odds(state: State) -> Floats:
 
 
 def _no_stronger(number: Ints, label: Ints) -> Ints:
-    """For each landmark, count the rays (N,) of all landmarks of its class that have no more rays than it has."""
+    """Return for each landmark the sum (N,) of the rays of all landmarks of its class with at most as many rays."""
     rank = label * (int(number.max(initial=0)) + 1) + number
     order = np.argsort(rank)
     total = np.append(0, np.cumsum(number[order]))

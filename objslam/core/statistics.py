@@ -63,8 +63,8 @@ POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
 _FEW_GROUPS = 1 << 16
-"""Up to this number of groups, their numbers fit into 16 bits, which numpy sorts several times as fast. It is the number of
-such values."""
+"""The number of values of 16 bits. Up to this number of groups, the index of a group fits into 16 bits, which numpy sorts
+several times as fast."""
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,8 @@ class Landmarks:
     def see(self, keyframe: Ints, owner: Ints, which: Ints, first_ray: Ints) -> None:
         """Note that the landmarks own new rays `which` (n,). Rays are sorted by keyframe.
 
-        keyframe, owner: (R,) the keyframe of each ray, and its landmark, or -1. first_ray: (K+1,) of each keyframe.
+        keyframe, owner: (R,) the keyframe of each ray, and its landmark, or -1. first_ray: (K+1,) the first ray of each
+        keyframe.
         """
         if not len(which):
             return

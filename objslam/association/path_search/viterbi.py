@@ -99,7 +99,7 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
 
 
 def _steps_to(state: int, count: int) -> slice:
-    """Return the indices in `Motions.costs` of the steps from each of `count` states, in order, to one state."""
+    """Return indices into `Motions.costs`. They are of the steps from each of `count` states, in order, to `state`."""
     return slice(state + count - 1, state - 1 if state else None, -1)
 
 

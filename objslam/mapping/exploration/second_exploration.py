@@ -22,7 +22,7 @@ factor explores fewer logs twice."""
 _CLEAR = 0.95
 """If at least this share of the rays agrees, much noise is no reason to explore a log again. The exception is a log that the
 filter for ranges is sure of. A larger share explores more logs twice. In simulation, maps that show objects twice explained
-at most 0.93 of the rays, but up to 0.96 with ranges. A good map can explain as few."""
+at most 0.93 of the rays, but up to 0.96 with ranges. A good map sometimes explains no more."""
 _SAME = 0.01
 """If a second exploration gives at most this share of the rays to other objects than the map does, it is not continued. Two
 explorations of one drive always assign a few rays between neighbours in different ways. With a larger share, more second
