@@ -293,7 +293,8 @@ def _of_shapes(fitted: tuple[Floats, ...], shape: Ints) -> Floats:
 
 
 def _dots(edges: BoxEdges, now: _State, weights: Weights, side: Floats) -> tuple[Floats, Floats]:
-    """Return points (N, 7), which do not explain the sides of boxes, and the logarithm of their evidence (N,)."""
+    """Return the objects as points (N, 7), and the logarithm of their evidence (N,). Points do not explain the sizes of
+    boxes."""
     prior, variance, spread = dot_prior(now.prior), weights.variance.copy(), weights.spread.copy()
     free_rows = ~whole_axes(edges)
     free_rows[:, 2:] = True  # The size of a box is free, and the place of one edge of it too.

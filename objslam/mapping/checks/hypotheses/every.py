@@ -38,7 +38,7 @@ def hypotheses(log: Log) -> Iterator[Hypothesis]:
 
 
 def coarse_hypotheses(log: Log) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about mounts, paths and images. Each moves most rays far, if it is wrong."""
+    """Yield the hypotheses about mounts, paths and images. A wrong one moves most rays by far."""
     yield from mounts(log)
     yield from _paths(log)
     yield from _images()
