@@ -22,8 +22,8 @@ _FEWEST = 4
 _LEAST_ANGLE = np.radians(4.0)
 """The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
 _NARROW = 0.9
-"""The remaining rays of a label show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction. With
-a smaller share, false rays are excused too."""
+"""The remaining rays of a label are nearly parallel, and so neither meet nor miss, if this share of them lies within
+`_LEAST_ANGLE` of their mean direction. With a smaller share, false rays count as nearly parallel too."""
 _NEAREST = 0.25
 """The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself. A larger distance
 loses points near a camera."""
