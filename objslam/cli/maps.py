@@ -75,7 +75,7 @@ def merge_results(
     names = [session.name for session in sessions]
     warnings = warnings_of(sessions, islands)
     folders = write_site(islands, names, out, warnings)
-    warnings += [f"{old} is of an earlier merge" for old in islands_of_earlier_merges(out, len(islands))]
+    warnings += [f"{old} remains from an earlier merge" for old in islands_of_earlier_merges(out, len(islands))]
     for line in warnings:
         say(f"warning: {line}", stderr=True)
     for folder, island in zip(folders, islands, strict=True):

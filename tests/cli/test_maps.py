@@ -165,7 +165,7 @@ def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, objslam):
     assert (tmp_path / "site" / "island_2" / "objects.json").is_file()
     code, _, warned = objslam("merge", out / "a", "-o", tmp_path / "site")
     assert code == 0
-    assert f"{tmp_path / 'site' / 'island_2'} is of an earlier merge" in warned
+    assert f"{tmp_path / 'site' / 'island_2'} remains from an earlier merge" in warned
     with pytest.raises(ValueError, match="at least one"):
         merge([])
 

@@ -123,7 +123,7 @@ def _as_two(alone: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple
 
 
 def _most(bundles: Bundles, free: FreeFit) -> Floats:
-    """Return the greatest log likelihood (G,), without the bearings, that a bundle can have as a thing of its own."""
+    """Return the greatest log likelihood (G,), without the bearings, of each bundle if it shows a thing of its own."""
     usual, landmark = bundles.usual, bundles.landmark
     variance_ = usual.class_spread[landmark] ** 2 + usual.view**2
     size = np.maximum(_size_odds(usual.class_mean[landmark], usual.class_mean[landmark], variance_), 0.0)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _FEWEST = 4
 """The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number saves
-time, and misses losses among few objects."""
+time, and misses more losses if there are few objects."""
 _SPANNING = 0.5
 """The largest share of objects that both parts of the drive show. After a loss, an object is in both parts only if another
 object is at its place by chance. A larger share searches more maps."""
