@@ -121,8 +121,8 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
 
 
 def _squares(edges: set[int]) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about boxes in px of a detector's square. edges: (px), as returned by `_clipped_edges`. A square
-    of another side does not explain boxes that end there."""
+    """Yield the hypotheses about boxes in px of a detector's square. edges: (px), as returned by `_clipped_edges`. If boxes
+    end at another edge than the side of a square, this square is left out."""
     for side in _SQUARES:
         if edges - {side}:
             continue
