@@ -50,9 +50,9 @@ _EXPLAINED = 0.8
 simulated rooms and on the log Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM logs, whose landmarks stand 0.18 m apart.
 With a larger limit, fewer explorations are used."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
-"""How the factors on the motion's variances adapt to the ratio of a squared correction to its expectation. `_GAIN` is how
-far one ratio moves a factor, `_MOST` the largest factor, `_LARGEST` the largest ratio that counts. Larger values adapt
-sooner to rough odometry, and also to outliers."""
+"""The factors on the motion's variances grow if corrections are larger than expected. The ratio of each squared correction
+to its expectation moves a factor by the share `_GAIN`. `_MOST` is the largest factor, and `_LARGEST` the largest ratio that
+counts. Larger values adapt sooner to rough odometry, and also to outliers."""
 
 
 def explore(

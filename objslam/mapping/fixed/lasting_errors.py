@@ -61,9 +61,9 @@ def with_lasting_errors(
     A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
     poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. On uneven ground, planar
     poses turn rays up and down by `planar` times a factor of its own, and ground whose tilt lasts also rises (`rise_of`).
-    The size of the errors is `localization` times a factor with a half-normal prior of 1. Their correlation falls
-    exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood (Patterson
-    and Thompson 1971), and averaged over their posterior.
+    The size of the errors is `localization` times a factor, whose prior is half-normal with the scale 1. Their correlation
+    falls exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood
+    (Patterson and Thompson 1971), and averaged over their posterior.
 
     The centre of the box of a large thing nearby lies beside the image of its centre, for as long as the robot drives by.
     with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was called, the

@@ -103,9 +103,9 @@ def lasting_variances(cells: Cells) -> Floats:
     """Return the expected squared factors (2, T) of the errors of rotations and of places that last for each of `TIMES`.
     Their sums over these times are the squared factors of all errors.
 
-    The factor has a half-normal prior of 1. Its likelihood is restricted (Patterson and Thompson 1971): the errors of the
-    positions of all objects are integrated out. The mixture, the factor and the correlation time are averaged over their
-    posterior. SolveError if the likelihood is not finite.
+    The prior of the factor is half-normal, with the scale 1. Its likelihood is restricted (Patterson and Thompson 1971): the
+    errors of the positions of all objects are integrated out. The mixture, the factor and the correlation time are averaged
+    over their posterior. SolveError if the likelihood is not finite.
     """
     cells = cells.take(_counted(cells.times))
     from scipy.linalg.lapack import dpotrf, dsygst, dtrtrs  # Here, so that `load_libraries` comes first.
