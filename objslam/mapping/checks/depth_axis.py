@@ -50,7 +50,7 @@ def check_depth_axis(
         remedy = "give them as the sensor measured them"
     return Finding(
         "depth axis",
-        f"the depths of boxes look like {what}: they are too {wrong} towards the edge of the image, by a power of the cosine "
+        f"the depths of boxes look like {what}: they are too {wrong} near the edge of the image, by a power of the cosine "
         f"of their angle from the axis, {abs(power):.2f} +- {sigma:.2f}. A depth is the distance along the optical axis; "
         f"{remedy}",
         spoils=False,
