@@ -178,7 +178,8 @@ class _Few:
         return few, found
 
     def with_places_of(self, joined: State) -> "_Few":
-        """Return the search from places that are corrected by the errors that `joined`, all landmarks, shows."""
+        """Return the search from corrected places. The landmarks `joined`, which are all of them, show the errors of the
+        places."""
         obs = self.known.obs
         errors = place_errors(replace(joined, obs=obs))
         left = float(np.sqrt((errors.sigma[errors.place] ** 2).mean()))
