@@ -18,9 +18,9 @@ _UNUSUAL_SHARE = 0.05
 """The share of objects that are detected more rarely than their class, because neighbours hide them on one visit, or one of
 their sides is hard to detect. With a larger share, misses drop fewer objects, and more phantoms stay."""
 _UNUSUAL_RATE = (0.6, 12.0)
-"""The detection rates of these rarer objects have a beta distribution. The first number is its mean, as a share of the rate
-of the class: about a half, as for a thing that is hidden on one visit of two. The second number is its concentration. With a
-larger mean, misses drop more objects."""
+"""The detection rates of objects that are detected more rarely (`_UNUSUAL_SHARE`) have a beta distribution. The first number
+is its mean, as a share of the rate of the class: about a half, as for a thing that is hidden on one visit of two. The second
+number is its concentration. With a larger mean, misses drop more objects."""
 _SHARED_RAYS = 0.5
 """A landmark may be detected more rarely than its class only if at most this share of its rays also passes another landmark
 of the label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""

@@ -21,7 +21,7 @@ _TOLD = 0.9
 """A direction is determined by the log if its variance is at most this share of its prior variance. With a larger share,
 directions count that the log hardly shows."""
 _LEAST = 1e-12
-"""The least variance of a prior. An error with a smaller one is known."""
+"""The least variance of a prior. An error whose prior has a smaller variance is known."""
 
 
 def with_wider_priors(found: Calibration, mean: Floats, prior: Floats) -> Calibration:

@@ -94,7 +94,7 @@ class MapMessages:
     def markers(self, stamp: float, objects: ObjectMap, clear_first: bool = False) -> Any:
         """Make a visualization_msgs/MarkerArray: a shape, a 2-sigma ellipsoid and a caption for each resolved object.
 
-        The shape is the one in which pictures show the body (`drawn_shape`), with its size and yaw. An object without a body is
+        The shape is that in which pictures show the body (`drawn_shape`), with its size and yaw. An object without a body is
         an ellipsoid of the size of its boxes, at least `_MIN_SIZE`. In the map of a site, the caption also says the state of
         the object.
 
