@@ -83,7 +83,7 @@ def associate_globally(
         seed: the seed of the random pairs of rays.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
-        solved: whether the poses are those of a joint solve. The rays of one thing meet there, as at localised poses.
+        solved: whether the poses are from a joint solve. The rays of one thing meet there, as at localised poses.
     """
     rays, keyframes, cameras = of.rays, of.keyframes, of.cameras
     obs, ray, keyframe = observe(of)

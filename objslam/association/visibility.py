@@ -25,8 +25,8 @@ _PAIRS_AT_ONCE = 1 << 18  # The most pairs of an object and a frame processed to
 _USUAL_DISTANCES = (0.02, 0.98)
 """The quantiles of a class's detection distances. Outside them, a miss means nothing. A wider range counts more misses."""
 _CORE_SHARE = 0.8
-"""The usual distances of a class come from this share of its boxes: those of the objects with the most boxes. Objects with
-few boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
+"""The usual distances of a class come from this share of its boxes, on the objects with the most boxes. Objects with few
+boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
 _FRONT_SHARE = 0.95
 """An object has a front if at least this share of its boxes is from one half space. A larger share gives fewer objects a
 front."""

@@ -25,8 +25,8 @@ _LEAST_SHOWN = 0.1
 things, such as a tripod, for the wall behind them. A smaller share takes a thing for what hides a strip of it."""
 _APART = 4.0
 """Two surfaces are different if their depths differ by at least this number of standard deviations of the nearer depths. The
-halves of one Gaussian differ by 2.3, those of a plane that recedes by 2.7. With a larger number, fewer backgrounds are
-found."""
+halves of one Gaussian differ by 2.3, and the halves of a plane that recedes by 2.7. With a larger number, fewer backgrounds
+are found."""
 MAX_IMAGE_LAG = 0.02
 """The longest time (s) between the stamps of the colour image and the depth image of one frame. Some cameras give the two
 images different stamps. A longer time pairs images of different moments."""

@@ -143,13 +143,13 @@ def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
 
     If the run estimates no errors, all errors in the file are corrected. If it estimates some, the errors in the file that
     `possible` does not list are corrected. The ledger warns of errors in the file that the log does not have. ConfigError if
-    the file is wrong, or if it fits nothing in the log.
+    the file is wrong, or if the log has none of its errors.
     """
     known, names, file = known_errors(settings), error_names(log), settings.calibration.file
     if known is None:
         return log
     if not set(known.names) & set(names):
-        raise ConfigError(f"it fits nothing in the log {log.name}: {', '.join(known.names)}", where=file, hint=_parts(log))
+        raise ConfigError(f"log {log.name} has none of its errors: {', '.join(known.names)}", where=file, hint=_parts(log))
     warn_of_others(known, log, settings, ledger)
     estimated = estimates(settings, log.odometry is not None, log.localization is not None)
     sought = set(possible(log, settings)) if estimated else set()
@@ -172,7 +172,7 @@ def _parts(log: Log) -> str:
 def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
     """Return the errors that are estimated from a log by the settings, None if there are none.
 
-    keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
+    keyframes, rays: of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
     """
     names: tuple[str, ...] = ()
     half = half_widths_of_rays(rays, keyframes, [one.camera for one in log.cameras])

@@ -136,8 +136,8 @@ class Jumps:
 def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     """Return the jumps of the localisation that can be corrected, None if there are none.
 
-    The odometry shows the true steps if the log has it. Without it, a step is judged by the steps beside it. A localisation
-    with too many jumps, or with one of more than `ANOTHER_MAP`, has none that can be corrected.
+    The odometry shows the true steps if the log has it. Without it, a step is judged by the steps beside it. If there are
+    too many jumps, or one of more than `ANOTHER_MAP`, none can be corrected.
     """
     path = log.localization
     if path is None or settings.poses.jumps == "keep" or len(path) <= _FEWEST_STEPS:

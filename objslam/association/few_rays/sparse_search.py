@@ -18,7 +18,7 @@ _MOST_PAIRS = 4096
 _MOST_POINTS = 512
 """The most points that are compared with all rays. A larger number finds more in dense clutter, and costs time."""
 _MORE_RAYS = 3.0
-"""The log odds that further rays may add to those of a pair. A larger value tries more points."""
+"""The log odds that further rays may add to the log odds of a pair. A larger value tries more points."""
 _REFINEMENTS = 2
 """How often each point moves to the best fit of its rays. A larger number costs time."""
 _DAMPING = 1e-6

@@ -24,7 +24,7 @@ _STEPS_APART = 4.0
 less far: it reaches `_SHIFTS` / `_STEPS_APART` neighbours."""
 _MOST_TURN = np.radians(1.0)
 """The largest grid step (rad) in yaw. The step of shifts is this turn at the median distance of landmarks. A larger value
-reaches farther: the heading of a solved path errs by 14 degrees at most."""
+finds larger errors of the path. The heading of a solved path errs by 14 degrees at most."""
 
 
 @dataclass(frozen=True)

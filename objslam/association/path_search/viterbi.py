@@ -25,7 +25,7 @@ _LEVELS = 250
 @dataclass(frozen=True)
 class Motions:
     """The motions from each of G stretches of the path to the next. error: (G - 1, 3) the motion of the present path minus
-    that of the odometry: x, y (m) and yaw (rad), along the axes of map. variance: (G - 1, 3) of this error, from the
+    the motion of the odometry: x, y (m) and yaw (rad), along the axes of map. variance: (G - 1, 3) of this error, from the
     odometry's drift. way: (G - 1, 2) m, the motion in x and y."""
 
     error: Floats
@@ -34,8 +34,8 @@ class Motions:
 
     @classmethod
     def of(cls, keyframes: Keyframes, middle: Ints, base: Floats, grid: Grid) -> Self:
-        """Compare the motions of the path with those of the odometry. middle: (G,) the keyframe at the middle of each
-        stretch. base: (G, 4, 4) the poses of the path at these keyframes."""
+        """Compare the motions of the path and of the odometry. middle: (G,) the keyframe at the middle of each stretch.
+        base: (G, 4, 4) the poses of the path at these keyframes."""
         assert keyframes.drift is not None
         assert keyframes.odom_T_base is not None
         odometry = keyframes.odom_T_base[middle]

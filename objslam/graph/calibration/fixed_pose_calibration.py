@@ -56,8 +56,8 @@ class PointSystem:
 
     matrix: (P, P). vector: (P,) half the gradient of the cost. cost: the sum of the weighted squared deviations. variance:
     the factor (at least 1) by which the cost exceeds its expectation. curvature: 0 to 1, the mean curvature of Cauchy's loss
-    divided by that of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3, P) the
-    derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
+    divided by the mean curvature of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3,
+    P) the derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
     """
 
     matrix: Floats

@@ -14,7 +14,7 @@ from objslam.core.calibration import Calibration
 
 _CHANCE = 2.0
 """Up to this many standard deviations, the distance from a prior is chance. A larger number widens fewer priors. Beyond it,
-the widening is near that of a Student prior with 4 degrees of freedom. An example is a sum of two errors that is 3 prior
+a prior is widened about as by a Student prior with 4 degrees of freedom. An example is a sum of two errors that is 3 prior
 standard deviations of the first error and 4.5 of the second. The standard deviation of each error grows by a factor of 1.5,
 and by 1.9 with the Student prior."""
 _TOLD = 0.9

@@ -97,7 +97,7 @@ def _solve(
 ) -> Estimate:
     """Solve poses and objects once more, from the estimate, with the measured rays turned by `shift`.
 
-    keyframes, rays: those of the state, with the shared errors of the estimate removed.
+    keyframes, rays: from the state, with the shared errors of the estimate removed.
     """
     from objslam.graph import batch_solver
 

@@ -57,8 +57,8 @@ the run does not estimate. A larger value reports fewer errors."""
 class Diagnosis:
     """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
 
-    errors: small errors of the calibration that a run does not correct, None if there are none. jumps: those of the
-    localisation, which a run takes out, None if there are none.
+    errors: small errors of the calibration that a run does not correct, None if there are none. jumps: of the localisation.
+    A run takes them out. None if there are none.
     """
 
     findings: tuple[Finding, ...] = ()

@@ -93,7 +93,7 @@ def _excerpt(state: JointState) -> JointState:
 
 
 def _apart(stamps: Floats, camera: Ints) -> Bools:
-    """Return a mask (K,) of keyframes of which each camera has one in each span of `_APART`. stamps: (K,) s."""
+    """Return a mask (K,) that keeps one keyframe of each camera in each span of `_APART`. stamps: (K,) s."""
     span = np.stack([camera, np.floor((stamps - stamps.min()) / _APART).astype(np.int64)])
     _, first = np.unique(span, axis=1, return_index=True)
     keep = np.zeros(len(stamps), dtype=bool)

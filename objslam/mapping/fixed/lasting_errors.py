@@ -65,7 +65,7 @@ def with_lasting_errors(
     falls exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood
     (Patterson and Thompson 1971), and averaged over their posterior.
 
-    The centre of the box of a large thing nearby lies beside the image of its centre, for as long as the robot drives by.
+    If a large thing is near, the centre of its box is not at the image of its centre, for as long as the robot drives by.
     with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was called, the
     returned solution has the bodies.
     """

@@ -32,8 +32,7 @@ _PLACES = (1.0, 2.0, 6.0, 20.0, 60.0, 200.0)
 _RANGES = (1.0, 3.0, 8.0)
 """The factors on the noise of depths that are tried first."""
 _RAYS = (1.0, 4.0)
-"""The factors on the noise of rays that are tried first. On a street, this noise can hardly be told apart from that of the
-places."""
+"""The factors on the noise of rays that are tried first. On a street, noisy rays look almost like noisy places."""
 _TURN = 15
 """The steps (degrees) of the tried turns of all cameras about the vertical axis. A larger step misses more wrong mounts."""
 _LEAD = 15.0
@@ -53,7 +52,7 @@ taken for noisy places."""
 _FEWEST = 20
 """The fewest boxes of a log that is searched. Fewer boxes agree with any noise by chance."""
 _NEAR = 30.0
-"""A noise is tried as a start if its log odds are lower than those of the likeliest noise by at most this. With a larger
+"""A noise is tried as a start if its log odds are at most this far below the log odds of the likeliest noise. With a larger
 number, more starts are tried, and each takes about a second."""
 _NOISY = 3.0
 """Places count as noisy from this factor on `localization.xy` on. If any start leads to noisy places, results with more

@@ -151,7 +151,7 @@ def without_phantoms(state: JointState) -> JointState:
 
 
 def _candidates(state: JointState) -> Ints:
-    """Return the objects that may be phantoms, the least likely first: those of labels with several objects."""
+    """Return the objects that may be phantoms, the least likely first. Only labels with several objects have any."""
     association, estimate = state.association, state.estimate
     assert association is not None
     assert estimate is not None

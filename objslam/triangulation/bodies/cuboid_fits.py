@@ -101,7 +101,7 @@ def all_headings(
     Args:
         found: the fits of the cuboids so far.
         evidence: (N,) the logarithm of their evidence.
-        rival: (N,) that of the best other shape.
+        rival: (N,) the logarithm of the evidence of the best other shape.
         prior: the prior of ellipsoids.
         side: (B,) as in `log_evidence`.
 

@@ -28,8 +28,8 @@ WITHIN = 0.7
 mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
 UNLIKE = 0.04
 """No thing has exactly the shape of its body, so the boxes of one side share an error. This is its least standard deviation,
-as a share of half the size. The outline of a hexagonal prism differs by 4 % from that of the best cylinder. Things that were
-seen from one side do not show this error, because their bodies bend to it. A larger share makes their depths less sure."""
+as a share of half the size. The outlines of a hexagonal prism and of the best cylinder differ by 4 %. Things that were seen
+from one side do not show this error, because their bodies bend to it. A larger share makes their depths less sure."""
 _ALONG = 1.0
 """The error of a side changes with the distance. This is the standard deviation of the change from a distance to e times
 this distance, in standard deviations of the error. With a larger change, the growth of boxes says less about the
