@@ -105,10 +105,10 @@ def diff_results(
 ) -> None:
     """Compare two maps of one place: which objects are confirmed, moved, gone, new or unconfirmed.
 
-    An object is unconfirmed if only one map has it, and the other drive did not have its place in view. The ids are those of
-    map A and of map B. The result of a live session does not say what was in view. So if it is map B, no object counts as
-    gone or moved: run its journal (objslam run LIVE_RESULT -o AGAIN), and compare that. The exit code is 1 if the maps
-    cannot be registered to each other.
+    An object is unconfirmed if only one map has it, and the other drive did not have its place in view. The ids are from map
+    A and map B. The result of a live session does not say what was in view. So if it is map B, no object counts as gone or
+    moved: run its journal (objslam run LIVE_RESULT -o AGAIN), and compare that. The exit code is 1 if the maps cannot be
+    registered to each other.
     """
     from objslam.api.sites import diff
     from objslam.core.object_map import FATES

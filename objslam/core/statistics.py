@@ -176,7 +176,7 @@ _FEW = 20_000
 """Up to this many numbers, special functions are computed without scipy.special. Its import takes 0.06 s, about as long as
 the association of a small log. The computation without it takes 0.02 s for this many numbers."""
 _DEVIATIONS = 9.0
-"""A Poisson tail is summed up to this many standard deviations above the mean, plus as many squared for small means. What
+"""A Poisson tail is summed up to this many standard deviations above the mean. Its square is added, for small means. What
 lies beyond is below 1e-16 of the tail. With a larger number, the sum is longer."""
 
 

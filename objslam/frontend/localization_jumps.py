@@ -32,9 +32,9 @@ _TIMES_ODD = 3.5
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
 deviations. A larger number finds fewer jumps."""
 _CERTAIN = float(np.sqrt(27.6))
-"""The least size of a jump, in standard deviations. The standard deviation is that of two poses and of the odometry between
-them, by the settings. Noise exceeds this size with a probability of 1e-6 (chi-squared with 2 degrees of freedom), which is
-once in a thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
+"""The least size of a jump, in standard deviations. The standard deviation is for two poses and the odometry between them,
+by the settings. Noise exceeds this size with a probability of 1e-6 (chi-squared with 2 degrees of freedom), which is once in
+a thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
 _OF_MEDIAN = float(np.sqrt(np.log(10) / np.log(2)))
 """The length that a tenth of the steps exceeds, as a multiple of their median length, for normal noise in a plane."""
 _FEWEST_STEPS = 20

@@ -209,15 +209,15 @@ def find_closure(
 
 
 def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Floats) -> list[Closure]:
-    """Return loops that a whole solved path may have missed, those with the most evidence first.
+    """Return loops that a whole solved path may have missed, with the most evidence first.
 
     A search during initialisation allows for the drift that the odometry says. Landmarks may be confused after an unlikely
     slip, which bends the path by more than that. So this search allows for large bends (`_BENDS`) at keyframes where a
-    landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with those seen mostly before
-    it. The loops are proposals, and a solve must judge them.
+    landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with landmarks seen mostly
+    before it. The loops are proposals, and a solve must judge them.
 
-    middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera:
-    (K, 4, 4) the solved poses.
+    middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera: (K, 4,
+    4) the solved poses.
     """
     counts = np.flatnonzero(np.isfinite(middle))
     if len(counts) < 2 * MIN_LANDMARKS:

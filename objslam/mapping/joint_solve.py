@@ -96,7 +96,7 @@ def _begun(state: JointState) -> JointState:
 
 
 def _with_gross_errors(begin: JointState, found: JointState) -> JointState | None:
-    """Return the start of a solve that also estimates those held errors that the map of `found` shows. None if it shows
+    """Return the start of a solve that also estimates the held errors that the map of `found` shows. None if it shows
     none."""
     if begin.errors is None or found.errors is None or found.association is None or found.estimate is None:
         return None

@@ -15,7 +15,7 @@ _SMOOTHING = 0.05
 """A line at distance d has the weight 1 / sqrt(d^2 + this^2), in mean distances. A larger value keeps more weight on
 outliers."""
 _SINGLE_STEPS = 3
-"""The most Newton steps in single precision, which take half the time of those in double precision. More steps do not
+"""The most Newton steps in single precision, which take half the time of steps in double precision. More steps do not
 improve a single-precision point."""
 _STEPS = 6
 """The most Newton steps in double precision. An object that needs more has a line through or near its solution."""

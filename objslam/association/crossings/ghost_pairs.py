@@ -77,7 +77,7 @@ def replace_ghosts(state: State, gate: float, seed: int = 0) -> State:
 
 
 def _suspects(state: State, gate: float) -> Ints:
-    """Return the pairs (P, 2) of neighbours of one label whose rays fit clearly worse than those of most landmarks of the
+    """Return the pairs (P, 2) of neighbours of one label whose rays fit clearly worse than the rays of most landmarks of the
     label, the worst pair first."""
     if state.count < 2:
         return np.zeros((0, 2), dtype=np.int64)

@@ -49,8 +49,8 @@ _USUAL_GAIN = 2.366
 of chi-squared with `_FREE` degrees of freedom."""
 _USUAL_GAINS = ((0.5, _USUAL_GAIN), (0.8, 4.642))
 """Two probabilities, each with its quantile of chi-squared with `_FREE` degrees of freedom. Errors that last for a while,
-such as those of a wheel that slips, concern only some landmarks. They show in the second quantile. If one landmark in five
-is two things, this does not change the second quantile."""
+such as the slip of a wheel, concern only some landmarks. They show in the second quantile. If one landmark in five is two
+things, this does not change the second quantile."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
 def excess_of(gain: Floats) -> Floats:
     """Return for each landmark (S,) the factor by which two points usually gain more than the nominal noise explains.
 
-    Rays share errors, such as those of poses and clocks. Then two points fit the rays of one thing better than noise
+    Rays share errors, such as errors of poses and clocks. Then two points fit the rays of one thing better than noise
     explains. Poses can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second
     thing. The factor comes from the gains of the other landmarks. gain: (S,) by how much two free points lower the cost.
     """
@@ -187,7 +187,7 @@ def _of_offsets(bundles: Bundles) -> Floats:
 def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
     """Return the log odds (K, S) of two things over one by bearings.
 
-    The excess comes from a limited number of landmarks, so the odds are those of an F distribution.
+    The excess comes from a limited number of landmarks, so the odds are from an F distribution.
 
     gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) from
     `excess_of`. landmarks: the number of gains that gave it.

@@ -142,7 +142,7 @@ def _log_density(state: State) -> Floats:
 def _of_class(size: Floats, label: Ints) -> tuple[Floats, Floats]:
     """Return mean and standard deviation (N,) of ln size (N,) among the other landmarks of each landmark's class.
 
-    If there are none, those of all other landmarks are taken.
+    If there are none, the values of all other landmarks are taken.
     """
     count = len(size)
     mean, spread = np.full(count, np.nan), np.full(count, 2 * _CLASS_SIZE)

@@ -230,7 +230,7 @@ def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floa
 def log_evidence(state: State, gate: float, strays: Strays, rates: Rates) -> float:
     """Return the log odds of all landmarks together over the case that all boxes are strays.
 
-    The share of strays and the density of objects are those that fit each label best.
+    The share of strays and the density of objects are chosen for each label, so that they fit best.
     """
     boxes, objects = _expected(state, rates)
     grid = _likelihoods(_evidence(state, gate, strays, rates), _looks(state), state.label, boxes, objects)

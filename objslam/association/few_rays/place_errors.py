@@ -1,4 +1,4 @@
-"""Estimate the errors of the places from which a log was recorded, such as those of GPS.
+"""Estimate the errors of the places from which a log was recorded, such as places by GPS.
 
 All boxes of one moment share the error of the place of this moment. A box alone cannot show it. But if several boxes of a
 moment have landmarks that other moments see too, the error follows from all of them together.

@@ -25,9 +25,9 @@ def beside_centres(
 
     Let a camera with the axes x, y, z see an ellipsoid with the centre c and the matrix M of squared half axes. The left and
     the right edge of its box are planes with the normal n = x - u z that touch it: (n . c)^2 = n^T M n (Hartley and
-    Zisserman 2004, section 8.3). The mean of the two solutions u is that of the point c - M z / (z . c). The box of a cuboid
-    goes around the images of its corners, that of a cylinder around its rims. The vector is 0 for a body that reaches behind
-    its camera.
+    Zisserman 2004, section 8.3). The mean of the two solutions u is the coordinate u of the point c - M z / (z . c). The box
+    of a cuboid goes around the images of its corners. The box of a cylinder goes around the images of its rims. The vector
+    is 0 for a body that reaches behind its camera.
 
     The vectors (n, 3) are in m in map. Their standard deviations (n,), m, are along an axis of the image, to first order.
 

@@ -44,8 +44,8 @@ def covariance_of(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats
     """Return the covariance (P, P) of the parameters, at most the covariance of their prior in every direction.
 
     prior: (P, P) information. wider: (P,) factors on the standard deviations of the gradient, for noise that is not white.
-    They are known only roughly. So they only widen the result, by the sandwich formula (Huber 1967), and the weights stay
-    those of white noise.
+    They are known only roughly. So they only widen the result, by the sandwich formula (Huber 1967), and the weights stay as
+    for white noise.
     """
     weights, information = likelihood(system)
     inverse = np.linalg.inv(information + prior)

@@ -45,7 +45,7 @@ def moved_by_held(
     not white, and bends the path as a held error does. The square of a step that `predict` returns is added, as the solution
     does not follow it. Landmarks outside the graph do not move.
 
-    held: (P,) which errors the solution held. The other parameters and SolveError are those of `predict`.
+    held: (P,) which errors the solution held. The other parameters and SolveError are as in `predict`.
     """
     state, reduced = _reduced(errors, association, estimate, theta)
     step, _ = _step(reduced, errors, theta)

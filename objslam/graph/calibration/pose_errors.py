@@ -167,8 +167,8 @@ class ComparedPoses:
 class _Placed:
     """The likelihood of the places of n poses, and the headings given these places.
 
-    cost: -2 ln of the likelihood of the places. off: (n,) rad, the headings minus those that follow from the places. left:
-    (n, n) the covariance of `off` without the error of the headings themselves.
+    cost: -2 ln of the likelihood of the places. off: (n,) rad, the headings minus the headings that follow from the places.
+    left: (n, n) the covariance of `off` without the error of the headings themselves.
     """
 
     cost: float

@@ -1,7 +1,7 @@
 """The graph of a joint solve as arrays: its whitened residuals and its sparse Jacobian, without an object for each factor.
 
 A calibration solves the same graph for many values of the shared errors. The construction of a GTSAM graph takes longer than
-its solution, so these solves use arrays. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
+its solution, so these solves use arrays. Residuals, noise, losses and derivatives are from `Measurements.factors`.
 """
 
 from collections.abc import Callable

@@ -139,7 +139,7 @@ def _drive_factors(
 def _unknown_to(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
 ) -> Floats:
-    """Return the covariances (n, 3, 3), m^2, of those errors of the objects `there` that the graph does not contain."""
+    """Return the covariances (n, 3, 3), m^2, of the errors of the objects `there` that the graph does not contain."""
     floor = LEAST**2 * np.eye(3)
     if measured is None:  # `_drive_factors` has the other half. Equal halves condition the linear system best.
         return estimate.covariance[there] / 2 + floor

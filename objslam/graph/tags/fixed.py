@@ -1,4 +1,4 @@
-"""The rotation and size of fiducials at given camera poses. Their positions are triangulated like those of other objects."""
+"""The rotation and size of fiducials at given camera poses. Their positions are triangulated as for other objects."""
 
 import numpy as np
 

@@ -96,7 +96,7 @@ class BodyEstimator:
             self._fitted[j] = replace(fitted, body=body)
 
     def _due(self, m: MapState, covariances: dict[int, Floats]) -> Ints:
-        """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, those that have grown
+        """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, the ones that have grown
         most are fitted."""
         landmarks = m.landmarks
         self._fitted = {j: self._fitted[j] for j in landmarks.id.tolist() if j in self._fitted}

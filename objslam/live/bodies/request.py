@@ -43,7 +43,7 @@ class BodyRequest:
 
 
 def most_grown(m: MapState, rows: Ints, before: Ints) -> Ints:
-    """Return the rows of the landmarks to fit, in the order of their ids. If there are too many, return those whose rays
+    """Return the rows of the landmarks to fit, in the order of their ids. If there are too many, return the ones whose rays
     have grown most.
 
     rows: (n,) of the landmarks that are due. before: (n,) the numbers of their rays in their last fits, 0 without one.

@@ -88,7 +88,7 @@ class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
         name: str,
         patient: bool,
     ) -> None:
-        """Prepare for a session. name: the name of the log. The other arguments are those of `Rounds`."""
+        """Prepare for a session. name: the name of the log. The other arguments are as in `Rounds`."""
         super().__init__(mapper, record, settings.live.calibrate_from, patient)
         self._counters, self._name = counters, name
 

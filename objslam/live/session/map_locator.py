@@ -28,7 +28,7 @@ _EVERY, _AT = 10, 9
 """A search is due every `_EVERY` keyframes, at the keyframe `_AT` of each period. A longer period finds the map later. `_AT`
 differs from the keyframes of the maintenance, so that the two do not delay the same frame."""
 _MOST = 40
-"""A search compares at most this many landmarks, those seen last. A larger number delays the next frame for longer: 40
+"""A search compares at most this many landmarks: the ones seen last. A larger number delays the next frame for longer: 40
 landmarks in a map of 1,000 objects take 0.1 s."""
 _GROWTH = 1.2
 """A search with the same landmarks is repeated when the number of keyframes has grown by this factor, because the landmarks

@@ -86,7 +86,7 @@ class StampLeaps(Generic[T]):
         self._streams: dict[str, _Stream[T]] = {}
 
     def take(self, stream: str, stamp: float, clock: float, message: T, alone: bool) -> tuple[list[T], list[T]]:
-        """Take the next message of a stream. Return the messages that pass, in order, and those that are refuted.
+        """Take the next message of a stream. Return the messages that pass, in order, and the refuted messages.
 
         clock: the newest stamp, s, of another stream, -inf if there is none. It confirms stamps that are not far ahead of
         it. alone: whether the stream itself may confirm a leap of more than `_APART`, as a path may. If not, such a leap

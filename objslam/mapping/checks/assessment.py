@@ -52,13 +52,13 @@ class Evidence:
     boxes that miss their object so far that they do not count. misses: the median residual as a multiple of its expected
     noise, NaN without objects. odometry_frame: whether the map has the frame of the odometry. fixed: whether the run kept
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
-    frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
-    journal: the file with all messages of a live session, "" without one. doubted: the labels that may name one object or
-    several. unsettled: the objects that the last round of association still changed. uncalibrated: whether the estimation of
-    the shared errors failed. odometry: the largest factor on a noise of the odometry that the log shows. scale: the standard
-    deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log that is a
-    part of a recording, as in `Log`. odometry_unused: whether the mode was left to the log, and a `fixed` run did not use
-    its odometry.
+    frames, late: the camera frames of a log or session, and the frames that a live session dropped because they came too
+    late. journal: the file with all messages of a live session, "" without one. doubted: the labels that may name one object
+    or several. unsettled: the objects that the last round of association still changed. uncalibrated: whether the estimation
+    of the shared errors failed. odometry: the largest factor on a noise of the odometry that the log shows. scale: the
+    standard deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log
+    that is a part of a recording, as in `Log`. odometry_unused: whether the mode was left to the log, and a `fixed` run did
+    not use its odometry.
     """
 
     resolved: int

@@ -169,7 +169,7 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 def _corrected(part: Part, found: Agreement | None, settings: Settings) -> tuple[float, str]:
     """Return the score of a log without small errors, and the errors, in words, that are too large for a usual camera.
 
-    The small errors are those that a run in this mode estimates from given poses. If there are none, the score is 0.
+    The small errors are the errors that a run in this mode estimates from given poses. If there are none, the score is 0.
     """
     estimated = _estimated(part, settings)
     if found is None or part.drifts or settings.mode == "joint" or not estimated:

@@ -80,7 +80,7 @@ class _Cones:
 
 
 def cut_things(result: RunResult) -> list[CutThing]:
-    """Return the things of which a result has only cut off boxes. The one with the most boxes comes first.
+    """Return the things that have only cut off boxes in a result. The one with the most boxes comes first.
 
     A cut off box belongs to an object if the object, with its size and 3 sigma, reaches into the cone around the box. The
     other boxes of a label show a thing where their cones meet, if most frames with this place in the image show it.

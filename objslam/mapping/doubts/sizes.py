@@ -30,7 +30,7 @@ thing changes by 6 %. A larger angle judges more objects of cameras that are not
 
 
 def mixed_sizes(result: RunResult) -> list[Doubt]:
-    """Return a doubt for each object whose boxes show sizes that scatter much more than those of other objects.
+    """Return a doubt for each object whose boxes show sizes that scatter much more than the sizes of other objects.
 
     A box and the distance to its object give the size of the thing in the box. The size of one thing stays the same. At
     least its height stays the same in boxes that show the vertical in the same direction, such as the boxes of a level

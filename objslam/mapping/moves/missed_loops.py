@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
 _TRIED = 4
-"""The most loops that are tried before the search ends, those with the most evidence first. Each takes a solve. A larger
-number closes more loops, and takes longer on maps that have missed none."""
+"""The most loops that are tried before the search ends. Loops with more evidence are tried first. Each takes a solve. A
+larger number closes more loops, and takes longer on maps that have missed none."""
 
 
 def with_missed_loops(state: JointState) -> JointState:

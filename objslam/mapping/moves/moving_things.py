@@ -70,7 +70,7 @@ def things_at_rest(
 
 
 def _moving(keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats) -> Bools:
-    """Return which objects (N,) are of things that move. The parameters are those of `things_at_rest`."""
+    """Return which objects (N,) are of things that move. The parameters are as in `things_at_rest`."""
     owner = np.where(estimate.weight > 0, association.object, -1)
     track, length = tracks_of_rays(keyframes, rays, map_T_camera)
     told = np.flatnonzero((owner >= 0) & (length[track] >= FEWEST))

@@ -93,7 +93,7 @@ def _half_axes(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
 
 
 def _body(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
-    """Return half the length, the width and the height of the body of object i, as vectors like those of `_half_axes`.
+    """Return half the length, the width and the height of the body of object i, as vectors like in `_half_axes`.
 
     There are none if the object is a point.
     """

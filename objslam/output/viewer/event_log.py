@@ -49,7 +49,7 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """Return the events of a drive: first those of the whole run, then those of objects in the order of time."""
+    """Return the events of a drive: first events of the whole run, then events of objects in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"

@@ -32,7 +32,7 @@ from objslam.triangulation.bodies.to_centre import directions_to_centres, shifts
 Measure = Callable[[Floats | None], BoxEdges]
 """The edges of the boxes, given points (B, 4, P, 3) in map at which bodies may touch them. None means unknown points."""
 More = Callable[["Bodies"], "BoxEdges | None"]
-"""More edges that can only be found with the bodies, such as those of cut off boxes. None if there are none."""
+"""More edges that can only be found with the bodies, such as the edges of cut off boxes. None if there are none."""
 
 _POINT, _SPHERE, _ELLIPSOID, _CUBOID, _CYLINDER = range(5)
 _SOLID = (_ELLIPSOID, _CUBOID, _CYLINDER)
