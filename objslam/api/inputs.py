@@ -140,7 +140,7 @@ class Log(types.Log):
         return cls(name, views, _path(odometry, "odometry"), _path(localization, "localization"))
 
     def with_detections(self, detections: types.Detections | Mapping[str, types.Detections]) -> Self:
-        """Return the log with other boxes: the detections of its only camera, or those of each camera by name.
+        """Return the log with other boxes: the detections of its only camera, or the detections of each camera by name.
 
         ValueError if the given names differ from the names of the cameras.
         """

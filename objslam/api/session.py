@@ -92,7 +92,7 @@ class Session(LiveSession):
         """
         late = self.counters.dropped().get(LATE_FRAME, 0)
         if self._patient and late:
-            order = "push poses and frames together in the order of their stamps, not first all poses"
+            order = "push poses and frames in the order of their stamps, not all poses first"
             self.counters.ledger.warn(f"{late} frames came after poses that are more than live.max_late newer: {order}")
         return Result.of(self.stop())
 

@@ -17,8 +17,8 @@ _FINE_TURN, _FINE_SHIFT = np.radians(0.4), 0.04  # The finest grid steps (rad, m
 _LANDMARK_SIGMA = 0.03
 """The assumed standard deviation (m) of a landmark's position. A larger value accepts rays farther from landmarks."""
 _MIN_LEVEL = 0.1
-"""The heading noise of a ray is its noise divided by the cosine of its elevation. A smaller cosine counts as this one. A
-larger value trusts steep rays more."""
+"""The heading noise of a ray is its noise divided by the cosine of its elevation, which is taken as at least this. A larger
+value trusts steep rays more."""
 _AT_ONCE = 2_000_000  # The most distances computed together. A larger value needs more memory.
 _MOST_RANGE_COST = 9.0
 """The most that a range adds to a cost, in squared deviations. Some ranges are wrong. A larger value trusts ranges more."""

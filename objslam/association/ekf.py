@@ -204,8 +204,8 @@ def tie(f: Filter, one: Ints, two: Ints, sigma: float) -> None:
 
 
 def _apart(f: Filter, one: Ints, two: Ints) -> Floats:
-    """Return the Jacobian (3P, D) of differences by the state: the positions of landmarks `one` minus those of landmarks
-    `two`."""
+    """Return the Jacobian (3P, D) of differences by the state: the positions of landmarks `one` minus the positions of
+    landmarks `two`."""
     jacobian = np.zeros((len(one), 3, len(f.covariance)))
     for which, sign in ((one, 1.0), (two, -1.0)):
         jacobian[np.arange(len(one))[:, None], np.arange(3), f.columns(which)] = sign

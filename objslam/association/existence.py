@@ -18,12 +18,12 @@ _UNUSUAL_SHARE = 0.05
 """The share of objects that are detected more rarely than their class, because neighbours hide them on one visit, or one of
 their sides is hard to detect. With a larger share, misses drop fewer objects, and more phantoms stay."""
 _UNUSUAL_RATE = (0.6, 12.0)
-"""The detection rates of these rarer objects have a beta distribution. The first number is its mean, as a share of the rate
-of the class: about a half, as for a thing that is hidden on one visit of two. The second number is its concentration. With a
-larger mean, misses drop more objects."""
+"""The detection rates of objects that are detected more rarely (`_UNUSUAL_SHARE`) have a beta distribution. The first number
+is its mean, as a share of the rate of the class: about a half, as for a thing that is hidden on one visit of two. The second
+number is its concentration. With a larger mean, misses drop more objects."""
 _SHARED_RAYS = 0.5
 """A landmark may be detected more rarely than its class only if at most this share of its rays also passes another landmark
-of their label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
+of the label. With a larger share, fewer neighbours are dropped, and more phantoms stay."""
 _CLEAR_LEAD = 5.0  # A concentration this far below the best, in ln likelihood, is excluded. A larger lead excludes fewer.
 _POOLED_BOXES = 100.0  # With this many boxes, a class's own rate weighs as much as the rate of all classes.
 _RATE_LIMITS = (0.01, 0.95)  # The limits of a class's rate, because at 0 or 1 a single box or miss would be a proof.
@@ -45,7 +45,8 @@ _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test
 @dataclass(frozen=True)
 class Rates:
     """Beta distributions of the detection rates in each class. mean: (L,) of each class. concentration: the sum of the two
-    parameters of a distribution, the same for all classes. With several of them (C, 1), results get a first axis (C,)."""
+    parameters of a distribution, the same for all classes. With several concentrations (C, 1), results get a first axis
+    (C,)."""
 
     mean: Floats
     concentration: float | Floats
@@ -190,7 +191,7 @@ def size_odds(state: State) -> Floats:
 
 
 def _no_stronger(number: Ints, label: Ints) -> Ints:
-    """For each landmark, count the rays (N,) of all landmarks of its class that have no more rays than it has."""
+    """Return for each landmark the sum (N,) of the rays of all landmarks of its class with at most as many rays."""
     rank = label * (int(number.max(initial=0)) + 1) + number
     order = np.argsort(rank)
     total = np.append(0, np.cumsum(number[order]))

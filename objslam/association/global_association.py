@@ -36,7 +36,8 @@ _SAMPLE = 4096
 """The most rays of one label that a search uses, in whole frames. Later searches use other frames. A larger number costs
 time."""
 _FRAMES = 12
-"""The fewest frames that a search uses. An object is where rays of several frames meet. A larger number costs time."""
+"""The fewest frames that a search uses, because an object is where rays of several frames meet. A larger number costs
+time."""
 _MOST_RAYS = 1 << 14  # The most rays of one label that a search uses if frames have many rays. A larger value costs time.
 _MIN_SUPPORT = 2.5
 """The least support of a point in a search. A ray that fits perfectly counts 1. A larger one finds fewer, surer points."""
@@ -82,7 +83,7 @@ def associate_globally(
         seed: the seed of the random pairs of rays.
         guess: an initial association of the rays, and the positions (N, 3) m of its objects. NaN drops an object.
         drifts: whether the poses drift as the odometry does, so that objects at rest seem to move.
-        solved: whether the poses are those of a joint solve. The rays of one thing meet there, as at localised poses.
+        solved: whether the poses are from a joint solve. The rays of one thing meet there, as at localised poses.
     """
     rays, keyframes, cameras = of.rays, of.keyframes, of.cameras
     obs, ray, keyframe = observe(of)
@@ -274,8 +275,11 @@ def _without_ghosts(task: _Task, state: State, likely: Floats, sized: Bools) -> 
 
 
 def _without_crossings(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats, Bools]:
-    """Split landmarks that are two things whose rays cross, and search again among the rays that this sets free. Return as
-    `_merged_and_dropped`. likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees sizes."""
+    """Split landmarks that are two things whose rays cross. Then search again among the rays that this sets free.
+
+    Return what `_merged_and_dropped` returns. likely: (N,) of the landmarks. sized: (R,) whether the camera of each ray sees
+    sizes.
+    """
     refuted, earlier = np.zeros(len(state.matched), dtype=bool), set[bytes]()
     while (key := state.matched.tobytes()) not in earlier:  # Rays may return to the landmark that they left.
         earlier.add(key)

@@ -176,8 +176,8 @@ class State:
         return replace(self, landmarks=self.landmarks.take(which), matched=matched)
 
     def joined(self, other: State) -> State:
-        """Return the landmarks of this state, followed by those of another state with the same rays. A ray with a landmark
-        in both states keeps the landmark of this state."""
+        """Return the landmarks of this state, followed by the landmarks of another state with the same rays. A ray with a
+        landmark in both states keeps the landmark of this state."""
         matched = np.where((self.matched < 0) & (other.matched >= 0), other.matched + self.count, self.matched)
         return replace(self, landmarks=self.landmarks.and_also(other.landmarks), matched=matched)
 
@@ -190,7 +190,7 @@ class State:
 
     def split(self, which: Ints, second: Bools, position: Floats) -> State:
         """Split the landmarks `which` (S,) in two. The second of each comes after all others, and gets its rays that are in
-        the mask `second` (R,). position: (S, 2, 3) m, of both."""
+        the mask `second` (R,). position: (S, 2, 3) m, of the two landmarks."""
         number = np.full(self.count + 1, -1)
         number[which] = self.count + np.arange(len(which))
         moved = self.landmarks.position.copy()

@@ -180,8 +180,8 @@ def overlap(one: Floats, two: Floats) -> Floats:
 class UsualSizes:
     """What the boxes of N landmarks usually measure.
 
-    number: (N,) of the boxes with a size. ln_size: (N, 2) medians of ln width and ln height, in m. variance: (N, 2) of both
-    over the boxes of the landmark. Without boxes, the medians are NaN.
+    number: (N,) of the boxes with a size. ln_size: (N, 2) medians of ln width and ln height, in m. variance: (N, 2) of ln
+    width and ln height over the boxes of the landmark. Without boxes, the medians are NaN.
     """
 
     number: Ints
@@ -213,10 +213,10 @@ class UsualSizes:
     ) -> Floats:
         """Return the cost (E,), from 0 to `SIZE_LOSS`, of the size of the box in each match, in squared standard deviations.
 
-        Bearings do not tell a small thing from a large thing on the same line of sight. If only one of the two is detected,
-        its box fits the bearings of both, but only one of the sizes. Boxes of another size than usual cost more. A box
-        without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the matches. distance: (E,) m,
-        from the camera to the landmark. distance_sigma: (E,) m, its uncertainty, by default 0.
+        Bearings do not distinguish a small thing from a large thing on the same line of sight. If only one of the two is
+        detected, its box fits the bearings of both, but only one of the sizes. Boxes of another size than usual cost more. A
+        box without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the matches. distance: (E,)
+        m, from the camera to the landmark. distance_sigma: (E,) m, its uncertainty, by default 0.
         """
         cost = np.zeros(len(ray))
         some = np.flatnonzero((self.number[landmark] >= SIZED_BY) & (obs.size[ray] > 0).all(axis=1))

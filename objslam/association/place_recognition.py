@@ -165,7 +165,7 @@ def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
     """Return the pairs (C,), (C,) of landmarks `here` and `there` that may be one landmark within the drift.
 
-    At most `_CANDIDATES` pairs remain: those of the landmarks `here` that have the fewest partners.
+    At most `_CANDIDATES` pairs remain. Landmarks `here` with the fewest partners go first.
     """
     distance = np.linalg.norm(problem.offset[:, None, :2] - problem.target[None, :, :2], axis=2)
     turned = np.linalg.norm(problem.offset[:, :2], axis=1) * min(float(np.sqrt(problem.prior[2, 2])), 1.0)

@@ -23,10 +23,10 @@ The share was 0.5 in three recordings of such boxes. With a larger value, the mi
 a smaller one, a few wrong boxes change what counts as a miss."""
 _PAIRS_AT_ONCE = 1 << 18  # The most pairs of an object and a frame processed together, which fit into the processor's cache.
 _USUAL_DISTANCES = (0.02, 0.98)
-"""The quantiles of a class's detection distances. Outside them, a miss tells nothing. A wider range counts more misses."""
+"""The quantiles of a class's detection distances. Outside them, a miss means nothing. A wider range counts more misses."""
 _CORE_SHARE = 0.8
-"""The usual distances of a class come from this share of its boxes: those of the objects with the most boxes. Objects with
-few boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
+"""The usual distances of a class come from this share of its boxes, on the objects with the most boxes. Objects with few
+boxes may be phantoms. A larger share lets phantoms widen the usual distances."""
 _FRONT_SHARE = 0.95
 """An object has a front if at least this share of its boxes is from one half space. A larger share gives fewer objects a
 front."""
@@ -248,7 +248,7 @@ def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
 def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, camera: Floats) -> Bools:
     """Return whether a camera at (V, 3) sees the front of its object (V,). A screen, for example, has a front.
 
-    An object has a front if nearly all its boxes come from one half space. Misses from behind then tell nothing. origin,
+    An object has a front if nearly all its boxes come from one half space. Misses from behind then mean nothing. origin,
     index: (P, 3) m and (P,), the camera position and the object of each box.
     """
     count, toward = len(position), origin - position[index]

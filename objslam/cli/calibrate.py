@@ -25,7 +25,7 @@ def calibrate(
     out: Annotated[Path, typer.Option("-o", "--out", help="The calibration file to write.")] = Path("calibration.yaml"),
     mode: Annotated[
         Literal["fixed", "joint"] | None,
-        typer.Option("--mode", help="joint (the default): odometry and cameras. fixed: cameras against the localisation."),
+        typer.Option("--mode", help="joint (the default): odometry and cameras. fixed: cameras against a localisation."),
     ] = None,
     config: Config = None,
     set_: Set = None,
@@ -84,7 +84,7 @@ def _calibrate(path: Path, options: SourceOptions, settings: Settings, ledger: L
 
     log = read(path, ledger, options)
     if settings.mode == "fixed" and log.localization is None:
-        hint = "the log needs localisation, or give --mode joint"
+        hint = "the log has no localisation: give --mode joint"
         raise ConfigError("nothing to calibrate", where=str(path), hint=hint)
     result = pipeline.run(log, settings, ledger, show)
     if result.calibration is None:

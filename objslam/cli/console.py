@@ -27,9 +27,9 @@ Show = Callable[[str, int, int], None]
 """A function of the stage's name, the number of finished items, and the total number of items, 0 if unknown."""
 
 _EVERY = 10.0
-"""The time (s) between two looks at a command that works, and before the first. Each look prints new warnings and, if stderr
-is not a terminal, a line of progress. A larger value prints fewer lines. It is the interval of the status line of
-`objslam live`. A command of a few seconds prints no progress, and one that fails at once prints one line."""
+"""The time (s) between two looks at a running command, and before the first look. Each look prints new warnings and, if
+stderr is not a terminal, a line of progress. A larger value prints fewer lines. `objslam live` prints its status line as
+often. A command of a few seconds prints no progress, and one that fails at once prints one line."""
 
 
 @dataclass
@@ -73,8 +73,8 @@ def progress_bar(ledger: SpeakingLedger | None = None, *, quiet: bool = False) -
 
 @contextmanager
 def _bar() -> Iterator[tuple[Show, Callable[[], None]]]:
-    """Yield the two functions of a progress bar. The first one updates the bar. The second one tells the time, and does
-    nothing here, because the bar shows the time."""
+    """Yield two functions. The first one updates the progress bar. The second one does nothing, because the bar itself shows
+    the time."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -110,7 +110,7 @@ def _bar() -> Iterator[tuple[Show, Callable[[], None]]]:
 
 @contextmanager
 def _lines(quiet: bool) -> Iterator[tuple[Show, Callable[[], None]]]:
-    """Yield a function that takes the newest stage, and one that prints it unless `quiet`."""
+    """Yield two functions. The first one takes the newest stage. The second one prints it, unless `quiet`."""
     begin, newest = time.monotonic(), ("reading", 0, 0)
 
     def show(stage: str, done: int, total: int) -> None:
@@ -127,10 +127,8 @@ def _lines(quiet: bool) -> Iterator[tuple[Show, Callable[[], None]]]:
 
 @contextmanager
 def _now_and_then(ledger: SpeakingLedger | None, tell: Callable[[], None]) -> Iterator[None]:
-    """Print the new warnings and call `tell` every `_EVERY` seconds.
-
-    A thread does so, because a stage may last for minutes without a call of the function that shows it.
-    """
+    """Print the new warnings and call `tell` every `_EVERY` seconds. This needs a thread, because a stage may last for
+    minutes without a report of progress."""
 
     def work() -> None:
         while not ended.wait(_EVERY):
@@ -155,12 +153,12 @@ def warn_of_neighbours(out: Path) -> None:
 
     if found := foreign_files(out):
         shown = ", ".join([*found[:_NEIGHBOURS], *(["..."] if len(found) > _NEIGHBOURS else [])])
-        what = f"{out} holds other files ({shown}), and the files of the result go among them"
+        what = f"{out} holds other files ({shown}), and the files of the result would be among them"
         say(f"warning: {what} (-o names a folder of its own)", stderr=True)
 
 
 def console(*, stderr: bool = False) -> Console:
-    """Return the console of stdout or stderr. Its width is that of the terminal, or COLUMNS. Without both it is 120 columns.
+    """Return the console of stdout or stderr. It has the width of the terminal, or COLUMNS. Without both it is 120 columns.
 
     Each stream has one console, so that a line printed during a progress bar or status line does not mix with it. The
     console has no markup: it prints [red] and :smile: as they are. `printable` replaces characters that cannot be printed.

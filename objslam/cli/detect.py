@@ -32,7 +32,7 @@ def detect(
 
     if out is not None and out.suffix.lower() not in PICTURES:
         raise ConfigError(
-            "the photo with the boxes is a PNG or JPEG file", where=str(out), hint=f"end it with {PICTURES[0]}"
+            "the photo with the boxes must be a PNG or JPEG file", where=str(out), hint=f"end it with {PICTURES[0]}"
         )
     settings = settings_of(None, config, set_, names=names)
     pixels = decode_colour(read_bytes(image))
@@ -56,7 +56,7 @@ def detect(
     if json:
         put(dump_json({"layout": recipe.layout, "image": [width, height], "boxes": rows}))
         return
-    units = recipe.box_units or "pixels or fractions as their values tell"
+    units = recipe.box_units or "pixels or fractions, decided by their values"
     say(f"{model}: outputs in the {recipe.layout} layout, boxes as {recipe.box_form} in {units}, {recipe.resize}")
     say(f"{image}: {width}x{height}, {len(rows)} boxes with a score of {settings.detector.min_score:g} or more")
     for row in rows:

@@ -65,7 +65,7 @@ def doctor(
     for doubt in doubts:
         say(f"check: {doubt}")
     if not wrong and not doubts:
-        refuted = ": the boxes that fit poorly above agree after the joint solve" if found.findings else ""
+        refuted = ": the boxes fit poorly at the given poses, but agree after the joint solve" if found.findings else ""
         say(f"nothing wrong was found{refuted}")
     if any(finding["spoils_positions"] for finding in wrong):
         raise typer.Exit(SPOILT)
@@ -103,7 +103,7 @@ def _show_trials(found: Diagnosis) -> None:
         share = f"{100 * first.share:.0f} % of the boxes fit the log as it is"
         say(f"{share}; {len(others)} corrections were tried, and none fits{better} better")
         return
-    table = Table(title="what the boxes say")
+    table = Table(title="how well the boxes fit")
     for name in ("what if", "boxes that fit", "score", "drives where it heads"):
         table.add_column(name, justify="left" if name == "what if" else "right")
     for trial in found.trials[: _ROWS + 1]:

@@ -61,7 +61,8 @@ def explain(
         )
     if label is None and (left := summary.get("counts", {}).get("rays_unexplained")):
         grouped = sum(len(one.rays) for one in chosen if one.kind == "boxes")
-        say(f"{left} boxes became no object: {grouped} in these groups, and {left - grouped} scattered")
+        where = f"{grouped} in these groups, and {left - grouped} scattered" if grouped else "all scattered"
+        say(f"{left} boxes became no object: {where}")
 
 
 def _labels(out: Path, doubts: Sequence[Doubt], cut: Iterable[str]) -> list[str]:

@@ -29,7 +29,7 @@ Sources = Annotated[
 OutUrl = Annotated[str, typer.Option("-o", "--out", help="Folder or URL for results, sites and tables.")]
 By = Annotated[
     str,
-    typer.Option("--by", help="What a site is named by: a field of --layout, or `folder`. `none`: all logs are one site."),
+    typer.Option("--by", help="What names the site of a log: a field of --layout, or `folder`. `none`: one site."),
 ]
 LayoutOption = Annotated[
     str, typer.Option("--layout", help="The folders above a log, as {site}/{robot}/{day}/{log}. A log is the last part.")
@@ -39,7 +39,7 @@ Jobs = Annotated[
 ]
 RayAddress = Annotated[
     str | None,
-    typer.Option("--ray", metavar="ADDRESS", help="Run on the Ray cluster at an address, or with `auto` on the one here."),
+    typer.Option("--ray", metavar="ADDRESS", help="Run on the Ray cluster at this address. `auto`: the cluster here."),
 ]
 MemoryLimit = Annotated[
     float | None,
@@ -50,7 +50,7 @@ MemoryLimit = Annotated[
     ),
 ]
 TimeLimit = Annotated[float, typer.Option("--time-limit", min=0.0, help="Time limit of a task, s; 0 for none.")]
-Retries = Annotated[int, typer.Option("--retries", min=0, help="How many times a task begins again after its process died.")]
+Retries = Annotated[int, typer.Option("--retries", min=0, help="How often a task is started again after its process died.")]
 Gpus = Annotated[
     float, typer.Option("--gpus", min=0.0, help="With --ray and --detector: the share of a GPU that each task takes.")
 ]

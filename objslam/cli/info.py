@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
 _SPARE = ("from s", "to s", "frame", "what", "gap s", "type")
-"""The columns that a narrow terminal has no room for, in the order in which they are left out. `--json` has them all."""
+"""The columns that are left out on a narrow terminal, in this order. `--json` has them all."""
 
 
 @with_options
@@ -74,7 +74,7 @@ def _show_log(found: Contents, kind: Source) -> None:
 
 
 def _show_bag(bag: BagInfo, part: Contents | None) -> None:
-    """Show the whole bag, because a table of its topics is for their choice, and then the part that was asked for."""
+    """Show all topics of the bag, so that the user can choose among them. Then show the part that was asked for."""
     from objslam.core.diagnostics import is_drop
     from objslam.sources.summary import in_words
 

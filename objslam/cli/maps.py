@@ -75,7 +75,7 @@ def merge_results(
     names = [session.name for session in sessions]
     warnings = warnings_of(sessions, islands)
     folders = write_site(islands, names, out, warnings)
-    warnings += [f"{old} is of an earlier merge" for old in islands_of_earlier_merges(out, len(islands))]
+    warnings += [f"{old} remains from an earlier merge" for old in islands_of_earlier_merges(out, len(islands))]
     for line in warnings:
         say(f"warning: {line}", stderr=True)
     for folder, island in zip(folders, islands, strict=True):
@@ -105,10 +105,10 @@ def diff_results(
 ) -> None:
     """Compare two maps of one place: which objects are confirmed, moved, gone, new or unconfirmed.
 
-    An object is unconfirmed if only one map has it, and the other drive did not have its place in view. The ids are those of
-    map A and of map B. The result of a live session does not say what was in view. So if it is map B, no object counts as
-    gone or moved: run its journal (objslam run LIVE_RESULT -o AGAIN), and compare that. The exit code is 1 if the maps
-    cannot be registered to each other.
+    An object is unconfirmed if only one map has it, and the other drive did not have its place in view. The ids are from map
+    A and map B. The result of a live session does not say what was in view. So if it is map B, no object counts as gone or
+    moved: run its journal (objslam run LIVE_RESULT -o AGAIN), and compare that. The exit code is 1 if the maps cannot be
+    registered to each other.
     """
     from objslam.api.sites import diff
     from objslam.core.object_map import FATES
@@ -138,7 +138,7 @@ def diff_results(
 
 
 def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
-    """Return a warning for each map that does not say what was in view: what the comparison then cannot tell, and why."""
+    """Return a warning for each map that does not say what was in view: what the comparison then cannot show, and why."""
     from objslam.io.results.files import VIEWS
     from objslam.sources.journal.segments import NAME
 
@@ -152,7 +152,7 @@ def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
             so += f". It is the result of a live session: objslam run {b} -o {again}, then objslam diff {a} {again}"
         warnings.append(so)
     if not found.has_views[0]:
-        warnings.append(f"{a} does not say what was in view (it has no {VIEWS}), so all that only {b} has counts as new")
+        warnings.append(f"{a} does not say what was in view (it has no {VIEWS}), so objects that only {b} has count as new")
     return warnings
 
 

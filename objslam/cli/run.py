@@ -63,7 +63,7 @@ _NOISE: Final = {
     "heading": "heading of the poses",
     "place": "place of the poses",
 }
-"""The words for the factors of the noise. A factor of 1 is not shown: the log does not determine it, or confirms the
+"""The names of the noise factors in the output. A factor of 1 is not shown: the log does not determine it, or confirms the
 settings."""
 NOT_LOCALISED = 3
 """The exit code of a run that wrote its result, but was not found in the map that --map names."""
@@ -164,7 +164,7 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
         if any(of["observable"] for of in calibration["parameters"].values()):
             console().print(calibration_table(calibration))
         else:
-            none = "this log does not show any of them; their assumed sizes widen the sigmas"
+            none = "this log shows none of them; the sigmas contain their usual sizes"
             say(f"errors that all measurements share: {none}")
     noise = result.summary.get("noise") or {}
     factors = {words: f"{noise.get(name, 1.0):.2g}" for name, words in _NOISE.items()}
@@ -238,8 +238,8 @@ def calibration_table(calibration: dict[str, Any]) -> Table:
     table = Table(
         title="errors that all measurements share", caption=f"this log cannot tell apart: {pairs}" if pairs else None
     )
-    for name in ("error", "found", "sigma", "prior sigma", "unit", "told by"):
-        words = name in ("error", "unit", "told by")
+    for name in ("error", "found", "sigma", "prior sigma", "unit", "known from"):
+        words = name in ("error", "unit", "known from")
         table.add_column(name, justify="left" if words else "right", no_wrap=True)
     for name, of in calibration["parameters"].items():
         numbers = (f"{of[key]:.4f}" for key in ("value", "sigma", "prior_sigma"))

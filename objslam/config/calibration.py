@@ -11,8 +11,8 @@ class CalibrationSettings(Section):
 
     use: Literal["auto"] | bool = "auto"
     """auto: in joint mode, estimate all errors. In fixed mode, estimate the errors of cameras if the log has a localisation
-    that is not coarse. If base_T_camera is the identity, the poses are those of the camera, so its rotation and place are
-    not estimated. true: estimate them too, and in fixed mode also from coarse poses. false: never estimate."""
+    that is not coarse. If base_T_camera is the identity, the poses are of the camera, so its rotation and place are not
+    estimated. true: estimate them too, and in fixed mode also from coarse poses. false: never estimate."""
     file: str | None = None
     """a file of `objslam calibrate`, or the summary.json of a run. Its values and covariance are the prior of its errors. An
     error of the file that is not estimated keeps its value from the file."""

@@ -22,9 +22,9 @@ class Encoder(Section):
     divide_by: Positive | None = None
     """Divisor of the pixel values (0 to 255). The input is (value / divide_by - mean) / std. null uses 255."""
     mean: tuple[Finite, Finite, Finite] | None = None
-    """Mean of each channel, in the channel order of the input. null uses that of ImageNet."""
+    """Mean of each channel, in the channel order of the input. null uses the values of ImageNet."""
     std: tuple[Positive, Positive, Positive] | None = None
-    """Standard deviation of each channel, in the channel order of the input. null uses that of ImageNet."""
+    """Standard deviation of each channel, in the channel order of the input. null uses the values of ImageNet."""
     margin: NotNegative = 0.0
     """Part of the width and height of a box that is added on each side before the crop. A larger value shows more of the
     surroundings, which helps only if objects do not move between them."""

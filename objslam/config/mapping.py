@@ -18,9 +18,9 @@ class Poses(Section):
     max_gap: Positive = 1.1
     """Maximum time in s between two consecutive poses of the path. A frame in a longer gap is dropped and counted."""
     jumps: Literal["correct", "keep"] = "correct"
-    """What happens to jumps of the localisation that are shorter than 1 m. correct: the poses on both sides of a jump are
-    moved together unless the boxes refute it, and the map says that nobody knows which side was right. keep: the poses
-    stay as they are. With checks.use=false, they always stay."""
+    """What happens to jumps of the localisation that are shorter than 1 m. correct: the path is joined at each jump, unless
+    the boxes refute it. The map then says that nobody knows which side was right. keep: the poses stay as they are. With
+    checks.use=false, they always stay."""
 
 
 class RayNoise(Section):
@@ -86,8 +86,8 @@ class Odometry(Section):
 
 
 class Planar(Section):
-    """Configure how far the robot deviates from a planar path. A real floor is not perfectly flat. The defaults are those of
-    a floor in a house. Grass, tracks and slopes deviate by far more, and a run estimates by how much (noise.ground)."""
+    """Configure how far the robot deviates from a planar path. A real floor is not perfectly flat. The defaults suit a floor
+    in a house. Grass, tracks and slopes deviate by far more, and a run estimates by how much (noise.ground)."""
 
     z: Positive = 1e-3
     """Standard deviation of the height in m."""
@@ -133,8 +133,8 @@ class AssociationSettings(Section):
     loop_evidence: Positive = 7.0
     """Minimum log odds that the current landmarks are landmarks of an earlier place. A larger value closes fewer loops."""
     loop_lead: NotNegative = 3.0
-    """Minimum lead in log odds of the best place over the second-best place. A smaller lead closes no loop. A larger value
-    confuses fewer similar places."""
+    """Minimum lead in log odds of the best place over the second-best place. With a smaller lead, a loop is not closed. A
+    larger value confuses fewer similar places."""
     fuse_labels: bool = True
     """Merge objects of different labels that are the same thing into one object with several labels."""
 

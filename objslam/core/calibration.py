@@ -52,9 +52,8 @@ class Calibration:
 
     names: P names, such as `odometry.scale` or `CAMERA.clock`. values: (P,) in the unit of each. covariance: (P, P). prior:
     (P,) standard deviations before the solve. prior_mean: (P,) values expected before the solve, None if all are 0.
-    prior_covariance: (P, P) before the solve, None if the parameters were independent.
-    prior_factor: (P,) by how much the covariance takes each prior for wider, because the values are far from it. None if it
-    takes none for wider.
+    prior_covariance: (P, P) before the solve, None if the parameters were independent. prior_factor: (P,) the factors by
+    which the covariance treats priors as wider, because the values are far from them. None if no prior is widened.
     """
 
     names: tuple[str, ...]

@@ -65,7 +65,7 @@ class Ledger:
         )
 
     def restore(self, earlier: Ledger) -> None:
-        """Replace all entries by those of an earlier copy."""
+        """Replace all entries by the entries of an earlier copy."""
         self.dropped, self.totals, self.examples, self.warnings = vars(earlier.copy()).values()
 
     def lines(self) -> list[str]:

@@ -103,9 +103,8 @@ MOST_NOISE = 20.0
 Real robots have up to 6.3, for odometry that is only the commanded speed."""
 
 MOST_POSE_NOISE = 300.0
-"""The largest estimated factor on `localization.xy` and `localization.yaw`. With the defaults of these settings, it allows
-6 m, as of a GPS between houses, and any heading. With a larger factor, wrong units of a path are
-taken for noise."""
+"""The largest estimated factor on `localization.xy` and `localization.yaw`. With the defaults of these settings, it allows 6
+m, such as a GPS between houses has, and any heading. With a larger factor, wrong units of a path are taken for noise."""
 
 NOMINAL = NoiseFactors()
 """The noise in the settings, unchanged."""

@@ -38,10 +38,10 @@ COLUMNS: dict[str, str] = {
     **{"state": "string", "probability": "float64", "sessions_expected": "int64", "sessions_seen": "int64"},
     **dict.fromkeys(("updated", "moved_from_x", "moved_from_y", "moved_from_z"), "float64"),
 }
-"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s,
-yaws in rad. size_l, size_w and size_h are length, width and height of the body. width and height are those of the boxes.
-tag_qx to tag_qw are the unit quaternion of map_R_tag of a fiducial. The columns from state on are those of `Life`, and only
-the map of a site has values there."""
+"""The columns of a table of objects with their types: positions and sizes are in m, covariances in m^2, stamps in s, yaws in
+rad. size_l, size_w and size_h are length, width and height of the body. width and height are of the boxes. tag_qx to tag_qw
+are the unit quaternion of map_R_tag of a fiducial. The columns from state on are from `Life`. Only the map of a site has
+values there."""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class RunResult:
     camera. surface: the surroundings, None without depth images. surface_before: the surroundings at the poses before the
     estimation, None unless the settings ask for it. calibration: the shared errors that were estimated, None if none were.
     residual_before: (R,) rad, the residual before the correction of the shared errors, None if none were estimated. views:
-    all camera frames on the path, also those without a box, at the solved poses. None if they were not asked for. doubts:
+    all camera frames on the path, also frames without a box, at the solved poses. None if they were not asked for. doubts:
     what is doubtful in the result, in words. Their rays are indices into `rays`.
     """
 

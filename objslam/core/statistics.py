@@ -53,8 +53,8 @@ MOST_NOISE_FACTOR = 5.0
 """The largest factor by which outlier rejection multiplies the nominal noise of an object's rays. It is large because the
 box centres of a large object vary. A larger factor keeps more rays of noisy objects."""
 NOISE_MEASURED_BY = 6
-"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise is
-that of the settings. A larger number rejects more rays of noisy objects."""
+"""The noise of an object's rays is measured if at least this number of them are inliers. With fewer inliers, the noise of
+the settings counts. A larger number rejects more rays of noisy objects."""
 POOLED_WITH_CLASS = 30.0
 """The number of rays at which the measured noise of an object and the noise of its class have equal weight, offline. At the
 same number of rays of a class, the noise of the class and the nominal noise have equal weight. A larger number keeps objects
@@ -63,8 +63,8 @@ POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
 _FEW_GROUPS = 1 << 16
-"""Up to this number of groups, their numbers fit into 16 bits, which numpy sorts several times as fast. It is the number of
-such values."""
+"""The number of values of 16 bits. Up to this number of groups, the index of a group fits into 16 bits, which numpy sorts
+several times as fast."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ _FEW = 20_000
 """Up to this many numbers, special functions are computed without scipy.special. Its import takes 0.06 s, about as long as
 the association of a small log. The computation without it takes 0.02 s for this many numbers."""
 _DEVIATIONS = 9.0
-"""A Poisson tail is summed up to this many standard deviations above the mean, plus as many squared for small means. What
+"""A Poisson tail is summed up to this many standard deviations above the mean. Its square is added, for small means. What
 lies beyond is below 1e-16 of the tail. With a larger number, the sum is longer."""
 
 

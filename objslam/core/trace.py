@@ -91,7 +91,7 @@ class Trace:
         self._iterations += attempt._iterations
 
     def replace(self, attempt: Trace) -> None:
-        """Take the iterations of an attempt instead of those since the end of the previous round."""
+        """Replace the iterations since the end of the previous round by the iterations of an attempt."""
         self._iterations = list(attempt._iterations)
 
     def end_round(self, why: Why, association: Association, estimate: Estimate) -> None:

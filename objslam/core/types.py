@@ -206,8 +206,8 @@ class Keyframes:
     odometry pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error since its
     start, in the frame of odom_T_base. stretch: (K,) the number of each keyframe's stretch of the odometry between two gaps,
     None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step:
-    (K,) the place of each keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are those
-    of `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses. given_stamps: (K,) s, as the
+    (K,) the place of each keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from
+    `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses. given_stamps: (K,) s, as the
     frames have them in the log or came from the robot, None if they are `stamps`.
     """
 

@@ -197,7 +197,8 @@ def _possible(noise: RangeNoise) -> bool:
 
 
 def is_date(stamp: float) -> bool:
-    """Return whether a stamp, s, is Unix time: above about three years. Other clocks start at 0 and stay below this."""
+    """Return whether a stamp, s, is Unix time, because it is above about three years. Other clocks start at 0 and stay below
+    this."""
     return 1e8 < stamp < _LAST_DATE
 
 

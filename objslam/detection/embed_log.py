@@ -21,7 +21,8 @@ _AHEAD = 8  # The number of images that are decoded before the network needs the
 
 
 def embed_log(log: Log, encoder: Encoder, ledger: Ledger, progress: Progress = lambda stage, done, total: None) -> Log:
-    """Return the log with an appearance vector for each box that has an rgb image. The vectors replace those of the log.
+    """Return the log with an appearance vector for each box that has an rgb image. The vectors replace the vectors of the
+    log.
 
     The image of a frame is the nearest image in time, at most `MAX_IMAGE_LAG` away. A frame without an image that can be
     used is counted, and its boxes stay without a vector. LogError if no frame has an image, DetectorError if the network

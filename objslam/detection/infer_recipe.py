@@ -97,7 +97,7 @@ def settle(
 def _habits(
     layout: Layout, roles: Roles, named: Mapping[Role, Array], facts: Facts, *, free_size: bool, bytes_in: bool
 ) -> Habits:
-    """Return the usual properties of models of the layout, changed for families of models with other properties."""
+    """Return the usual properties of models of a layout. Some families of models differ: they get their own properties."""
     habits = HABITS[layout]
     if layout == "ssd" and free_size:
         habits = replace(habits, resize="none")  # An ssd model of free size resizes the image itself.

@@ -78,7 +78,7 @@ def recognise(outputs: Sequence[Output], settings: config.Detector, facts: Facts
         where=str(model),
         hint=f"set detector.layout to one of {', '.join(get_args(Layout))}, and detector.outputs to "
         "{boxes: NAME, labels: NAME, scores: NAME}, {boxes: NAME, logits: NAME} or {predictions: NAME}"
-        + ("; or name its classes with --names FILE, whose number tells the layout" if facts.classes is None else ""),
+        + ("; or name its classes with --names FILE, whose number shows the layout" if facts.classes is None else ""),
     )
 
 

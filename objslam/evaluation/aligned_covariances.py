@@ -2,7 +2,7 @@
 
 The alignment takes out the errors that all objects share, as far as it can follow them, and spreads a little of each
 object's own error over all others. The remaining errors have another covariance than the map gives. The squared Mahalanobis
-distances after an alignment must use this covariance. Only then do they tell whether the covariances of the map are right.
+distances after an alignment must use this covariance. Only then do they show whether the covariances of the map are right.
 """
 
 import numpy as np

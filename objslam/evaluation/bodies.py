@@ -1,4 +1,4 @@
-"""Compare the body of a map object with that of a true object."""
+"""Compare the bodies of a map object and of a true object."""
 
 from __future__ import annotations
 

@@ -246,7 +246,7 @@ def _warnings(objects: ObjectScores | None, path: PathScores | None, kind: Align
             f"the map is scaled by {objects.transform.scale:.3g} to fit the truth: check that both show the same place"
         )
     if path is not None and not len(path.errors):
-        warnings.append("no pose of the path has a truth at its timestamp: check that both use the same clock")
+        warnings.append("the truth has no pose at any timestamp of the path: check that both use the same clock")
     return warnings
 
 

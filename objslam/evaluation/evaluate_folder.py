@@ -28,7 +28,7 @@ def choose_alignment(out: Path) -> tuple[Alignment, str]:
     if summary.get("map_frame") == "localization":
         return "none", "the map has the frame of the localisation"
     if summary.get("map_frame") == "map":
-        return "none", "the drive was found in an older map, whose frame it has"
+        return "none", "the drive was found in an older map, and has its frame"
     if summary.get("map_frame") == SITE_FRAME:
         return "se2", "the map has the frame of its first session"
     if summary.get("map_frame") == "odometry":

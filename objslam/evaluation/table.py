@@ -13,7 +13,7 @@ _OBJECT_ROWS = (
     ("matched", "matched objects", ""),
     ("missed", "missed objects", ""),
     ("false", "false objects", ""),
-    ("unresolved", "unresolved objects (their true ones count as missed)", ""),
+    ("unresolved", "unresolved objects (without a position)", ""),
     ("precision", "precision", ""),
     ("recall", "recall", ""),
     ("position_rmse", "position RMSE", " m"),
@@ -24,11 +24,11 @@ _OBJECT_ROWS = (
     ("inside_95_3d", "share of truths inside the 95 % ellipsoid", ""),
 )
 _NOT_SHARED = {"mahalanobis_median": "squared Mahalanobis in x, y, median (honest: 1.39 or less)"}
-"""The names of rows after an alignment, if the map does not say which errors its objects share. The alignment may have taken
-out such errors, and the covariances still contain them."""
+"""The names of rows that differ after an alignment, if the map does not say which errors its objects share. An alignment may
+remove such errors, but the covariances still contain them."""
 _BODY_ROWS = (
     ("bodies", "bodies compared", ""),
-    ("size_error_median", "error of length, width and height, share, median", ""),
+    ("size_error_median", "error of length, width and height as a share, median", ""),
     ("yaw_error_deg_median", "error of the yaw, median", " deg"),
     ("iou_median", "3D overlap (IoU) of the bodies, median", ""),
 )
@@ -61,7 +61,7 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
     from rich.table import Table
 
     data = evaluation.to_dict()
-    title = f"align {evaluation.align} ({evaluation.why}), radius {evaluation.radius:g} m"
+    title = f"alignment {evaluation.align} ({evaluation.why}), radius {evaluation.radius:g} m"
     scores = Table()
     scores.add_column("against the ground truth" if evaluation.truth is None else f"against {evaluation.truth}")
     scores.add_column("value", justify="right")

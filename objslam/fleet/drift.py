@@ -19,7 +19,7 @@ class Drift:
     """The weighted mean of one shared error of one robot on each day.
 
     name: of the shared error. days: their names, in order. value, sigma: (D,) in `unit`. change: the value of the last day
-    minus that of the first, in standard deviations of this difference.
+    minus the value of the first day, in standard deviations of this difference.
     """
 
     robot: str

@@ -99,7 +99,7 @@ def dump_sessions(rows: Sequence[dict[str, Any]]) -> bytes:
 def dump_objects(rows: Sequence[dict[str, Any]], *, lives: bool = False) -> bytes:
     """Return the content of a GeoParquet file of objects. The geometry of an unresolved object is null.
 
-    lives: whether the objects are those of a site, which have no columns session, source and robot.
+    lives: whether the objects are of a site. Such objects have no columns session, source and robot.
     """
     import pyarrow as pa
 

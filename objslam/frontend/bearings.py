@@ -127,7 +127,7 @@ def _corner_rays(boxes: Detections, camera: Camera, settings: Settings, ledger: 
 def _features(boxes: Detections, before: list[Floats32 | None], camera: Camera, ledger: Ledger) -> Floats32 | None:
     """Return the appearance vectors (M, D) of boxes, None if they have none.
 
-    Vectors whose length differs from those of earlier cameras cannot be compared with them. The ledger counts such vectors.
+    Vectors can be compared only if they have the length of earlier cameras' vectors. The ledger counts the others.
     """
     if boxes.features is None:
         return None

@@ -25,8 +25,8 @@ _LEAST_SHOWN = 0.1
 things, such as a tripod, for the wall behind them. A smaller share takes a thing for what hides a strip of it."""
 _APART = 4.0
 """Two surfaces are different if their depths differ by at least this number of standard deviations of the nearer depths. The
-halves of one Gaussian differ by 2.3, those of a plane that recedes by 2.7. With a larger number, fewer backgrounds are
-found."""
+halves of one Gaussian differ by 2.3, and the halves of a plane that recedes by 2.7. With a larger number, fewer backgrounds
+are found."""
 MAX_IMAGE_LAG = 0.02
 """The longest time (s) between the stamps of the colour image and the depth image of one frame. Some cameras give the two
 images different stamps. A longer time pairs images of different moments."""
@@ -72,7 +72,7 @@ def box_depth(image: NDArray[Any], box: Floats, focal: float) -> float:
 
 
 def _of_thing(depths: Floats, size: float) -> Floats:
-    """Return those of the depths (n,) that are of the nearest surface.
+    """Return the depths, among depths (n,), that belong to the nearest surface.
 
     A thing may be as deep as it is wide or high. What is farther behind is the background, if a gap parts it from the thing.
     size: the larger side of the thing, per unit of its depth.

@@ -31,7 +31,7 @@ KNOWN: dict[str, dict[int, str]] = {"coco": dict(enumerate(COCO_NAMES)), "coco91
 
 
 def load_names(given: str, folders: Sequence[Path] = ()) -> dict[int, str]:
-    """Return the names of classes by their numbers: a known list, or those of a file.
+    """Return the names of classes by their numbers: from a known list or from a file.
 
     given: coco, coco91, or a file, which is looked up as given, then in `folders`. The file has a name in each line, or is
     YAML or JSON: a list, a mapping by number, or either under the key `names`, as the data.yaml of YOLO. ConfigError if the

@@ -274,7 +274,7 @@ def refocused(directions: Floats, errors: Floats | tuple[float, float, float]) -
     The factors are on the standard deviations of the directions. The correction is a linear map M and a projection onto the
     unit sphere. It multiplies areas on the sphere by det M / |M d|^3 at direction d, and standard deviations by the root.
     Towards the edge of an image, angles change by less than in its middle. With one factor for all directions, noise at the
-    edge would ask for a shorter focal length.
+    edge would favour a shorter focal length.
 
     directions: (R, 3) unit. errors: (..., R, 3) of each direction, or (3,) of all.
     """

@@ -107,7 +107,7 @@ def _overlap(log: Log, camera: Ints) -> float:
     """Return the share of the images of one moment that can show the same thing. camera: (K,) of each image.
 
     For each direction that an image shows, take the share of all images that show it too, this image included. The result is
-    the mean of these shares over all images and directions. A direction is that of a point far away. A camera that moves on
+    the mean of these shares over all images and directions. A direction stands for a point far away. A camera that moves on
     the robot counts as if it were at its `base_T_camera`.
     """
     images = np.bincount(camera, minlength=len(log.cameras)) / len(camera)

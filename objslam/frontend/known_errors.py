@@ -27,10 +27,10 @@ _PLACE_BESIDE_ODOMETRY = 0.02
 effect of a wrong place. In a short live drive, the map was off by 4 cm with this value, and by 11 cm with `USUAL_PLACE`.
 Logs with places that were 1.5 cm off were as good with both."""
 USUAL_FOCAL = 0.02
-"""The prior standard deviation of the focal length, as a share, as of a field of view from a data sheet. A calibrated camera
-errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone bends
-to fit a wrong focal length, and then a wrong association fits too: one of 36 parts of recorded drives had four landmarks
-twice. With a larger value, a log must show more before an error counts as known."""
+"""The prior standard deviation of the focal length, as a share, if the field of view is from a data sheet. A calibrated
+camera errs less. The focal length is estimated only if a localisation or fixed mode gives poses. A path from odometry alone
+bends to fit a wrong focal length, and then a wrong association fits too: one of 36 parts of recorded drives had four
+landmarks twice. With a larger value, a log must show more before an error counts as known."""
 COARSE = 0.3
 """Fixed poses with at least this noise, m, reveal no error of a camera. A robot at 1 to 2 m/s drives less than this during
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
@@ -49,8 +49,8 @@ def error_names(log: Log) -> tuple[str, ...]:
 def usual_place(log: Log, settings: Settings) -> float:
     """Return the prior standard deviation, m, of the place of a camera on the base, if `calibration.translation` is auto.
 
-    Against given poses, those of a localisation or of fixed mode, a wrong place of a camera moves all objects. A map from
-    odometry alone moves with the camera.
+    Against given poses (a localisation, or fixed mode), a wrong place of a camera moves all objects. A map from odometry
+    alone moves with the camera.
     """
     if settings.mode == "fixed":
         return USUAL_PLACE
@@ -143,13 +143,13 @@ def take_out_known(log: Log, settings: Settings, ledger: Ledger) -> Log:
 
     If the run estimates no errors, all errors in the file are corrected. If it estimates some, the errors in the file that
     `possible` does not list are corrected. The ledger warns of errors in the file that the log does not have. ConfigError if
-    the file is wrong, or if it fits nothing in the log.
+    the file is wrong, or if the log has none of its errors.
     """
     known, names, file = known_errors(settings), error_names(log), settings.calibration.file
     if known is None:
         return log
     if not set(known.names) & set(names):
-        raise ConfigError(f"it fits nothing in the log {log.name}: {', '.join(known.names)}", where=file, hint=_parts(log))
+        raise ConfigError(f"log {log.name} has none of its errors: {', '.join(known.names)}", where=file, hint=_parts(log))
     warn_of_others(known, log, settings, ledger)
     estimated = estimates(settings, log.odometry is not None, log.localization is not None)
     sought = set(possible(log, settings)) if estimated else set()
@@ -172,7 +172,7 @@ def _parts(log: Log) -> str:
 def shared_errors(log: Log, keyframes: Keyframes, rays: Rays, settings: Settings) -> SharedErrors | None:
     """Return the errors that are estimated from a log by the settings, None if there are none.
 
-    keyframes, rays: those of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
+    keyframes, rays: of the solve. An error is a parameter if its prior sigma is not 0 and it affects a measurement.
     """
     names: tuple[str, ...] = ()
     half = half_widths_of_rays(rays, keyframes, [one.camera for one in log.cameras])

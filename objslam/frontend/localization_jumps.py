@@ -32,9 +32,9 @@ _TIMES_ODD = 3.5
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
 deviations. A larger number finds fewer jumps."""
 _CERTAIN = float(np.sqrt(27.6))
-"""The least size of a jump, in standard deviations. They are those of two poses and of the odometry between them, by the
-settings. Noise exceeds this size with a probability of 1e-6 (chi-squared with 2 degrees of freedom), which is once in a
-thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
+"""The least size of a jump, in standard deviations. The standard deviation is for two poses and the odometry between them,
+by the settings. Noise exceeds this size with a probability of 1e-6 (chi-squared with 2 degrees of freedom), which is once in
+a thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
 _OF_MEDIAN = float(np.sqrt(np.log(10) / np.log(2)))
 """The length that a tenth of the steps exceeds, as a multiple of their median length, for normal noise in a plane."""
 _FEWEST_STEPS = 20
@@ -136,8 +136,8 @@ class Jumps:
 def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     """Return the jumps of the localisation that can be corrected, None if there are none.
 
-    The odometry shows the true steps if the log has it. Without it, a step is judged by the steps beside it. A localisation
-    with too many jumps, or with one of more than `ANOTHER_MAP`, has none that can be corrected.
+    The odometry shows the true steps if the log has it. Without it, a step is judged by the steps beside it. If there are
+    too many jumps, or one of more than `ANOTHER_MAP`, none can be corrected.
     """
     path = log.localization
     if path is None or settings.poses.jumps == "keep" or len(path) <= _FEWEST_STEPS:
@@ -176,7 +176,7 @@ def _usual_corrections(off: Floats, usual: Floats) -> Floats:
     """Return the distance, m, and the turn, rad, up to which corrections of a localisation are usual.
 
     A particle filter follows the odometry, and corrects itself every few seconds. Most steps are then no corrections, so
-    their oddness does not tell how large corrections are. The largest of many corrections are not wrong, and without them
+    their oddness does not show how large corrections are. The largest of many corrections are not wrong, and without them
     the path drifts as the odometry does. So a jump has to stand out from the corrections, too. A few corrections may all be
     jumps.
 

@@ -40,7 +40,7 @@ class OdometryBridge:
         their difference has the variance q (1 / T + 1 / U), and the path wanders by q T. If the velocity is a random walk of
         density p, the variances are p (T + U) / 3 and p T^3 s^2 (1 - s)^2 / 3. Over a step, this second variance has the
         same mean as p T^3 / 15 * s (1 - s), which is used instead. Between a step and the next but one, white noise gives
-        the same variance as between neighbours, and a random walk gives 2.5 times as much. This tells, for each axis, which
+        the same variance as between neighbours, and a random walk gives 2.5 times as much. This shows, for each axis, which
         share of the changes is a random walk.
 
         Messages that waited come together. If they are stamped then, their steps take almost no time, and their velocities

@@ -53,7 +53,7 @@ class DriftPath:
 
     @classmethod
     def of(cls, odometry: Trajectory) -> Self:
-        """Measure the steps of the odometry. A step may leave out poses. Its length is then that of the whole way."""
+        """Measure the steps of the odometry. A step may leave out poses. Its length is then the length of the whole way."""
         poses = odometry.poses
         start, places = poses[0, :3, :3], (poses[:, :3, 3] - poses[0, :3, 3]) @ poses[0, :3, :3]
         up = start[:, 2] @ poses[:, :3, :3]

@@ -320,7 +320,7 @@ class SharedErrors:
         return self._kept_drift.get(self._odometry_key(error), lambda: self._correctable().drift(self._of_odometry(error)))
 
     def _odometry_key(self, error: Mapping[str, float]) -> tuple[float, ...]:
-        """The errors of the odometry. Its scale includes the compensation of the map's shrinkage."""
+        """The key of a kept path: the errors of the odometry. Their scale also corrects the shrinkage of the map."""
         scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
         return (1 + scale) * (1 + self.noise.shrinkage) - 1, *others
 

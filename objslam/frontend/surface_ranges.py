@@ -72,7 +72,7 @@ def measured_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floa
 
 
 def centre_factors(rays: Rays, errors: Mapping[str, float], half: Floats, settings: Settings) -> Floats:
-    """Return the ratios (R,) of corrected ranges of centres to those of surfaces. half: (R,) as `half_widths`."""
+    """Return the ratios (R,) of corrected ranges of centres to corrected ranges of surfaces. half: (R,) as `half_widths`."""
     common = to_centres(half * weights_of(rays), errors.get("surface", 0.0))
     return to_centres(half, shares_of(rays, settings)) * common
 

@@ -13,13 +13,13 @@ _NEAR = np.radians(6.0)
 moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
 _BRIDGED = 0.5
 """The longest time (s) between two boxes of a track if the detector missed the thing between them. Ten robots were
-simulated. Those with 5 to 15 images a second had a third of the errors of clock and turns that they had without a bridge.
-With 1 s, those with 2 images a second had larger errors, because neighbours were joined."""
+simulated. With 5 to 15 images a second, the bridge reduced the errors of clock and turns to a third. With 1 s and 2 images a
+second, these errors grew, because neighbours were joined."""
 _IMAGES = 3
 """The number of images before a ray in which its track may have its last ray. With 1, each missed box ends a track: of boxes
 that are missed in one of five images, tracks then have 5 rays on average. A larger number joins neighbours more often."""
 FEWEST = 3
-"""The fewest rays of a track. Two rays nearly always meet. With a larger number, fewer tracks tell anything."""
+"""The fewest rays of a track. Two rays nearly always meet. With a larger number, fewer tracks are of use."""
 
 
 def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
@@ -28,7 +28,7 @@ def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
     A ray continues a track if it and the last ray of the track are the nearest of their label to each other. The images
     before are asked one after the other, because a detector misses boxes. Rays of shorter tracks have no object.
 
-    keyframes: with odometry, which tells where each ray is expected in the next image.
+    keyframes: with odometry, which predicts each ray in the next image.
     """
     assert keyframes.odom_T_base is not None
     track, length = tracks_of_rays(keyframes, rays, keyframes.odom_T_base @ keyframes.base_T_camera)

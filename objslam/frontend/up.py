@@ -62,6 +62,6 @@ def up_vector(up: Up) -> Floats:
 
 
 def upright(keyframes: Keyframes) -> Floats:
-    """Return the rotation (3, 3) from the map to axes of which the first two are level, and the third one points up."""
+    """Return the rotation (3, 3) from the map to new axes. The first two are level, and the third one points up."""
     up = up_axis(keyframes)
     return np.stack([*np.eye(3)[from_above(up)], up_vector(up)])

@@ -31,7 +31,7 @@ from objslam.graph.variables import make_values
 class RowsOfKind(Protocol):
     """The factors of one kind as arrays: n factors with r rows each, on c columns each.
 
-    The columns are those of `JointRows`: three for each landmark of the graph, then six for each pose.
+    The columns are as in `JointRows`: three for each landmark of the graph, then six for each pose.
     """
 
     @property

@@ -1,10 +1,10 @@
 """Find poses, landmarks, and the landmark of each ray by an extended Kalman filter, from odometry and rays.
 
-The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. Their covariance tells where
-in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose shifts all of
-them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old landmark look new.
-So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time for a frame grows
-with the number of landmarks, hardly with the number of frames.
+The state is the pose, all landmarks, and errors that all motions share, such as a clock offset. Their covariance predicts
+where in a frame each landmark may appear. The rays of a frame are assigned together, because an error of the pose shifts all
+of them. A ray with a range that fits no landmark makes a new landmark. After a long way, drift makes an old landmark look
+new. So recent landmarks are tied to old ones if one drift explains all pairs much better than chance. The time for a frame
+grows with the number of landmarks, hardly with the number of frames.
 """
 
 from collections.abc import Callable
@@ -50,9 +50,9 @@ _EXPLAINED = 0.8
 simulated rooms and on the log Lost in the Woods. It is 0.4 to 0.65 on the MRCLAM logs, whose landmarks stand 0.18 m apart.
 With a larger limit, fewer explorations are used."""
 _GAIN, _MOST, _LARGEST = 0.05, 100.0, 10.0
-"""How the factors on the motion's variances adapt to the ratio of a squared correction to its expectation. `_GAIN` is how
-far one ratio moves a factor, `_MOST` the largest factor, `_LARGEST` the largest ratio that counts. Larger values adapt
-sooner to rough odometry, and also to outliers."""
+"""The factors on the motion's variances grow if corrections are larger than expected. The ratio of each squared correction
+to its expectation moves a factor by the share `_GAIN`. `_MOST` is the largest factor, and `_LARGEST` the largest ratio that
+counts. Larger values adapt sooner to rough odometry, and also to outliers."""
 
 
 def explore(

@@ -79,7 +79,7 @@ def noise_up(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
 def noise_of_poses(keyframes: Keyframes, settings: Settings) -> tuple[float, float]:
     """Return the standard deviations of localised poses: of headings, rad, and of places, m. 0 without a localisation.
 
-    Keyframes that share one measured pose share its error. So its variance is multiplied by the number of those that can
+    Keyframes that share one measured pose share its error. So its variance is multiplied by the number of keyframes that can
     show the same thing. The noise is from the settings, or the larger noise that the log shows.
     """
     if not keyframes.localized_every:

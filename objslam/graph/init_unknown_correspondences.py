@@ -150,7 +150,7 @@ class _Exploration:
             self._solve()
 
     def _solve(self, whole: bool = False) -> None:
-        """Solve the window or the whole graph. Without the landmarks that end at a camera, the graph is made again."""
+        """Solve the window or the whole graph. If landmarks end at a camera, make the graph again without them."""
         self.window.solve(_ITERATIONS, whole)
         kept = np.isfinite(self.window.positions[:, 0])
         if kept.all():
@@ -161,7 +161,8 @@ class _Exploration:
             self._solve()
 
     def _settle(self, whole: bool) -> None:
-        """Compute the covariances of the landmarks with clearly more rays than before, or of all after a whole solve."""
+        """Compute the covariances of landmarks that have clearly more rays than before, or of all after a solve of the whole
+        graph."""
         number = np.bincount(self.owner[self.owner >= 0], minlength=len(self.known))
         due = (number >= _AGAIN * self.counted) | whole
         which = np.flatnonzero(due[self.owner] & (self.owner >= 0))

@@ -24,9 +24,10 @@ more than a Gaussian allows. Larger factors find loops after a slip, and more wr
 _BESIDE = 0.03
 """If the heading is known around one landmark, it has this standard deviation (rad) around another landmark that some frame
 showed beside the first. Landmarks about 1 m apart err by 2 or 3 cm. With a smaller value, landmarks are recognised after
-longer ways through the map, of which parts may be bent."""
+longer ways through the map, though parts of the map may be bent."""
 _STEPS = 10
-"""The most landmarks on such a way. More than ten add a larger variance than an exploration accepts."""
+"""The most landmarks on a way through the map from a known landmark to another. More than ten add a larger variance than an
+exploration accepts."""
 _MORE = 1.5
 """Landmarks are compared again when the recent landmark of a pair has this multiple of the rays that it had before. A larger
 number is faster, and finds loops later. With 1, two landmarks that never match would be compared at each step."""
@@ -35,9 +36,9 @@ _EPOCH = 40
 a larger number is faster and less exact. A landmark counts as new for this number of keyframes."""
 
 _BENDS = ((0.5, 0.5, 0.1), (2.0, 2.0, 0.5))
-"""Standard deviations of the bends of a solved path that missed a loop: in x, y (m) and yaw (rad). They were chosen: the
-first is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated drive). Larger
-values propose more loops, and a solve judges each."""
+"""Standard deviations of the bends of a solved path that missed a loop: in x, y (m) and yaw (rad). They are chosen, not
+measured. The first is a slip, the second a path that was bent to confused landmarks (25 degrees and 2 m in a simulated
+drive). Larger values propose more loops, and a solve judges each."""
 _CUTS = 20
 """The most keyframes that divide a path into a part before a missed loop and a part after it. Most keyframes near a loop
 show it, so few are enough. A larger number takes longer."""
@@ -105,7 +106,8 @@ class Landmarks:
     def see(self, keyframe: Ints, owner: Ints, which: Ints, first_ray: Ints) -> None:
         """Note that the landmarks own new rays `which` (n,). Rays are sorted by keyframe.
 
-        keyframe, owner: (R,) the keyframe of each ray, and its landmark, or -1. first_ray: (K+1,) of each keyframe.
+        keyframe, owner: (R,) the keyframe of each ray, and its landmark, or -1. first_ray: (K+1,) the first ray of each
+        keyframe.
         """
         if not len(which):
             return
@@ -120,7 +122,7 @@ class Landmarks:
         """Return the variance (N,), rad^2, of the heading at keyframe `now` in the part of the map around each landmark.
 
         The heading drifts since the last observation of a landmark. If a frame showed another landmark beside it, the other
-        one tells where it is. So if the other one was observed later, the heading drifts only since then.
+        one shows where it is. So if the other one was observed later, the heading drifts only since then.
 
         heading: (K,) the variance of the odometry's heading.
         """
@@ -207,15 +209,15 @@ def find_closure(
 
 
 def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Floats) -> list[Closure]:
-    """Return loops that a whole solved path may have missed, those with the most evidence first.
+    """Return loops that a whole solved path may have missed, with the most evidence first.
 
     A search during initialisation allows for the drift that the odometry says. Landmarks may be confused after an unlikely
     slip, which bends the path by more than that. So this search allows for large bends (`_BENDS`) at keyframes where a
-    landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with those seen mostly before
-    it. The loops are proposals, and a solve must judge them.
+    landmark is first seen. The landmarks that are seen mostly after this keyframe are matched with landmarks seen mostly
+    before it. The loops are proposals, and a solve must judge them.
 
-    middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera:
-    (K, 4, 4) the solved poses.
+    middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera: (K, 4,
+    4) the solved poses.
     """
     counts = np.flatnonzero(np.isfinite(middle))
     if len(counts) < 2 * MIN_LANDMARKS:
@@ -259,7 +261,8 @@ def closed_path(closure: Closure, landmarks: Landmarks, map_T_camera: Floats, dr
 def heading_variance(drift: Floats) -> Floats:
     """Return the variance (K,), rad^2, of the heading at each keyframe, by the drift (K, 6, 6) of the odometry.
 
-    It never falls, so that it can tell how far the heading drifted between two keyframes."""
+    It never falls, so its increase shows how far the heading drifted between two keyframes.
+    """
     return np.maximum.accumulate(np.linalg.eigvalsh(drift[:, :3, :3])[:, -1])
 
 

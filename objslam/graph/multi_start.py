@@ -25,9 +25,9 @@ bearings only, the first graph led to landmarks that were 1 to 2 m off. All thre
 two with twice the parallax. Two of the three graphs may end in one wrong minimum, so both values count. More values take
 longer."""
 _FEW_RAYS = 1500
-"""In logs with more rays, the first start that ends in a known minimum is the last one. In random parts of real drives whose
-second start ended in the minimum of the first, the third had a better one in 7 of 59 with fewer rays, and in 2 of 71 with
-more. A larger number makes logs of some minutes slower."""
+"""In logs with more rays, the first start that ends in a known minimum is the last one. In some random parts of real drives,
+the second start ended in the minimum of the first. With fewer rays than this, the third start then had a better minimum in 7
+of 59 parts, and with more rays in 2 of 71. A larger number makes logs of some minutes slower."""
 _SAME = 0.1
 """Two solutions are in one minimum if no landmark differs by more than this share of the size of the map. In wrong minima of
 real drives, some landmark differs by a third of it or more. A larger share compares fewer solutions."""

@@ -89,5 +89,5 @@ class Multiframes:
 
 
 def _path(images: Keyframes) -> Floats:
-    """Return the poses (K, 4, 4) of base from which motions are taken: those of the odometry, if there is one."""
+    """Return the poses (K, 4, 4) of base from which motions are taken. If there is odometry, they are its poses."""
     return images.map_T_base if images.odom_T_base is None else images.odom_T_base

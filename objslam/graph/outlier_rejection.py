@@ -72,7 +72,7 @@ def reject_outliers(
     solve ends if the cost decreases by less than this share. Earlier solves end at `_COARSE`, if that is larger. Inliers of
     an earlier solve seldom change. So with them, the first solve already ends at `tolerance`. near: the normal equations of
     a solve on arrays that ended near the start. Solves on arrays go on from them. close: whether the start is near the
-    optimum, as the solution of nearly the same measurements is, so that not even the first solve needs GTSAM.
+    optimum, because it solves nearly the same measurements. Then not even the first solve needs GTSAM.
     """
     optimum, cost_before, iterations = None, np.nan, 0
     limit = tolerance if used.any() else max(tolerance, _COARSE)

@@ -69,7 +69,8 @@ class SlidingWindow:
         self.end = end
 
     def regrown(self, owner: Ints, positions: Floats, map_T_camera: Floats) -> Self:
-        """Return a window at the same keyframes with other landmarks and poses (K, 4, 4). Its next solve is whole.
+        """Return a window at the same keyframes with other landmarks and poses (K, 4, 4). Its next solve is of the whole
+        graph.
 
         owner: (R,) the landmark of each ray. positions: (N, 3) m, all finite.
         """

@@ -20,7 +20,7 @@ X0 = gtsam.symbol("x", 0)
 L0 = gtsam.symbol("l", 0)
 """The key of L(0). The key of L(j) is L0 + j."""
 TAG0 = gtsam.symbol("y", 0)
-"""The key of Y(0). The key of Y(t) is TAG0 + t. Keys of fiducials are above those of keyframes and landmarks, so that the
+"""The key of Y(0). The key of Y(t) is TAG0 + t. Keys of fiducials are above the keys of keyframes and landmarks, so that the
 columns of a linear system begin with landmarks and poses."""
 TAG_SIZE0 = gtsam.symbol("z", 0)
 """The key of Z(0). The key of Z(t) is TAG_SIZE0 + t."""

@@ -81,7 +81,7 @@ def read_mounts(path: Path) -> tuple[Mount, ...]:
 
 
 def _sections(path: Path) -> list[tuple[str | None, _Mapping]]:
-    """Return the name and the keys of each camera in a file. The name is None if the file is that of a single camera."""
+    """Return the name and the keys of each camera in a file. The name is None if the file has a single camera."""
     top = _load(path, read_bytes(path), "the file")
     if _CAMERAS not in top:
         return [(None, top)]

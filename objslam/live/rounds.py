@@ -34,8 +34,8 @@ class Rounds(ABC, Generic[Answer, Told]):
     growth: float
     delay: float
     quick: bool
-    """Whether a round takes less time than the start of a process. Then a patient session works itself, and any other
-    session keeps the process."""
+    """Whether a round takes less time than the start of a process. Then a patient session does the work itself, and any
+    other session keeps its process running."""
 
     def __init__(self, mapper: Mapper, record: Callable[[Told], bool], first: int, patient: bool) -> None:
         """Prepare for a session. record: writes a correction to the journal, and returns whether it may be made.

@@ -1,8 +1,5 @@
 """Errors that the boxes of an object share. The centre of a box is off the centre of the object. From one side, all boxes
-have about the same offset.
-
-Many rays from one side do not average this offset out, so they count as few (Kish 1965).
-"""
+have about the same offset. Many rays from one side do not average it out, so they count as few rays (Kish 1965)."""
 
 from dataclasses import dataclass, replace
 from typing import Self
@@ -75,7 +72,7 @@ class SizedRays:
 
 
 def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
-    """Return the solution with the errors that boxes share added to its covariances, also to those of hidden bodies.
+    """Return the solution with the errors that boxes share added to its covariances. Hidden bodies get them too.
 
     The centres of an object's boxes have one offset that is equal from all sides, and one for each side. Both are a share of
     the object's size. `rays.box_sigma` is the prior standard deviation of this share. The share is estimated from the rays

@@ -91,12 +91,12 @@ def _associated_again(begin: JointState, state: JointState, start: InitialEstima
 
 
 def _begun(state: JointState) -> JointState:
-    """Return the state with what a log tells before its first solve: clocks, and the noise of localised poses."""
+    """Return the state with what a log shows before its first solve: clocks, and the noise of localised poses."""
     return _with_noise_of_poses(_with_clocks(state))
 
 
 def _with_gross_errors(begin: JointState, found: JointState) -> JointState | None:
-    """Return the start of a solve that also estimates those held errors that the map of `found` shows. None if it shows
+    """Return the start of a solve that also estimates the held errors that the map of `found` shows. None if it shows
     none."""
     if begin.errors is None or found.errors is None or found.association is None or found.estimate is None:
         return None
@@ -180,8 +180,8 @@ def _from_tracks(begin: JointState) -> JointState:
 
 
 def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
-    """Return the state, or one from another start, if this explains the log better. A start from which nothing can be
-    solved changes nothing."""
+    """Return the state from another start if it explains the log better, else the given state. A start from which nothing
+    can be solved changes nothing."""
     try:
         attempt = _searched(start())
     except SolveError:  # The map of the state is there, whatever is wrong with the other start.
@@ -192,8 +192,8 @@ def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
 def _unclear(state: JointState) -> bool:
     """Return whether a map may be wrong, so that other starts are worth their time.
 
-    Explorations go wrong by chance, each in another place. The false boxes of a detector agree with no object in the best of
-    maps, but they are single boxes. So only the rays of tracks are judged, if there are any.
+    An exploration goes wrong by chance, so another start may be right. The false boxes of a detector agree with no object in
+    the best of maps, but they are single boxes. So only the rays of tracks are judged, if there are any.
     """
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
@@ -254,13 +254,13 @@ def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
 
 
 def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
-    """Return the state, or one from the association of the fixed mode if this explains the log better.
+    """Return the better of two states: the given one, and one that begins with the association of the fixed mode.
 
     The first association at localised poses allows for the noise of the localisation, but not for the errors of cameras. Its
-    gates may be too wide for rows of equal things, and too narrow for a camera that is mounted askew, or for a localisation
-    that errs for seconds. Then an object has rays of two things. The later rounds keep these rays, because the poses were
-    bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in the boxes of each frame.
-    begin: before the first association. state: after the rounds that began there.
+    gates may be too wide for rows of equal things. They may be too narrow for a camera that is mounted askew, or for a
+    localisation that errs for seconds. Then an object has rays of two things. The later rounds keep these rays, because the
+    poses were bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in the boxes of each
+    frame. begin: before the first association. state: after the rounds that began there.
     """
     if begin.errors is None:
         return state
@@ -283,7 +283,8 @@ def _anew(state: JointState) -> JointState:
 
 
 def _improved(state: JointState, step: Callable[[JointState], JointState]) -> JointState:
-    """Return the state after steps, until the rays are no better explained. step: it then returns the state itself."""
+    """Repeat a step until it no longer explains the rays better, and return the state. step: returns the state itself if it
+    finds nothing better."""
     for _ in range(state.settings.joint.max_rounds):
         found = step(state)
         if found is state:

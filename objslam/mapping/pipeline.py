@@ -59,11 +59,11 @@ def run(
 ) -> RunResult:
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
-    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode,
-    if it has odometry too, or if the settings do not tell the noise of the localisation. A log that has odometry, and
-    localised poses at which no object has a place, is solved once more, too. known: the map of another day. If the drive is
-    found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if
-    its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
+    With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
+    it has odometry too, or if the settings leave the noise of the localisation open. A log that has odometry, and localised
+    poses at which no object has a place, is solved once more, too. known: the map of another day. If the drive is found in
+    it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if its
+    stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
     calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RangeShift:
-    """The corrections of R ranges from the surfaces of bodies to their centres. A range is corrected if its body tells more
-    than the width of its box.
+    """The corrections of R ranges from the surfaces of bodies to their centres. A range is corrected if its body is more
+    informative than the width of its box.
 
-    factor: (R,) on the range. bias: (R,) on `Rays.range_bias`. Both are 1 where nothing is told. surface: (R, 2) the new
-    `Rays.surface`, NaN where nothing is told.
+    factor: (R,) on the range. bias: (R,) on `Rays.range_bias`. Both are 1 where nothing is known. surface: (R, 2) the new
+    `Rays.surface`, NaN where nothing is known.
     """
 
     factor: Floats
@@ -39,7 +39,7 @@ class RangeShift:
 
     @property
     def told(self) -> Bools:
-        """(R,) whether a body tells how far the centre is behind the surface."""
+        """(R,) whether a body shows how far the centre is behind the surface."""
         return np.isfinite(self.surface[:, 0])
 
     def only(self, rays: Bools) -> RangeShift:

@@ -21,7 +21,7 @@ class Choices:
     names: dict[tuple[str, str], list[str]] = field(default_factory=dict)
 
     def of(self, role: str, camera: str = "") -> list[str]:
-        """Return the topics chosen for a role of `camera`. Without any, return those chosen for any camera."""
+        """Return the topics chosen for a role of `camera`. Without any, return the topics chosen for any camera."""
         return self.names.get((camera, role)) or self.names.get(("", role)) or []
 
 

@@ -26,7 +26,7 @@ from objslam.simulation.trajectory import Path as Course
 from objslam.simulation.trajectory import frame_stamps, localization, odometry
 
 TRUTH_BOXES = "boxes.jsonl"
-"""The name of the file of true boxes, which is in the groundtruth folder. Its format is that of detections.jsonl."""
+"""The name of the file of true boxes, which is in the groundtruth folder. It has the format of detections.jsonl."""
 ROUNDS = 40  # The largest number of random rooms that are tried. With a larger value, more settings find a good room.
 LOOK_AHEAD = 4
 """When a room is tried, the width and the height of the images are divided by this factor. A larger factor is faster and
@@ -55,8 +55,7 @@ class RenderSettings(CourseSettings):
     camera: InstanceOf[Camera] = make_camera(focal=400.0, position=(0.1, 0.0, 1.0), pitch=-0.25)
     labels: tuple[str, ...] = LABELS  # The labels of the objects in the room. A label may be repeated.
     min_views: Annotated[int, Field(ge=0)] = 18
-    """The least number of images with a good box of each object. A good box is within `limits`, and not cut off by the
-    edge."""
+    """The least number of images in which each object has a good box: within `limits`, and not cut off by the edge."""
     min_parallax_deg: NotNegative = 33.0  # The least parallax of each object over these images, degrees.
     limits: BoxLimits = BoxLimits()
     sensor: Sensor = Sensor()

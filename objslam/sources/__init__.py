@@ -175,7 +175,7 @@ def choose(path: Path, name: str | None = None) -> Source:
     except (OSError, ValueError) as error:  # A NUL in the path raises ValueError.
         raise LogError(f"cannot be read: {getattr(error, 'strerror', None) or error}", where=str(path)) from error
     if (path / "objects.json").is_file() and (path / "summary.json").is_file():
-        raise LogError("this is a result, not a log", where=str(path), hint="give its log, the log_path in summary.json")
+        raise LogError("this is a result, not a log", where=str(path), hint="use its log instead: log_path in summary.json")
     from objslam.sources.unknown import unknown_recording
 
     looked_for = "; ".join(f"{source.name}: {source.looks_for}" for source in SOURCES)

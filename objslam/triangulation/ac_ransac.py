@@ -194,7 +194,7 @@ def _chance(bundle: Bundle, rays: Tensor, real: Tensor, points: Tensor) -> Tenso
 
 def _least_chance(chance: Tensor, number: Tensor, xp: ModuleType) -> tuple[Tensor, Tensor]:
     """Return the lowest log NFA (B, H) over all numbers k of agreeing rays, and the k-th lowest chance for this k. The
-    agreeing rays are those with the lowest chances. chance: (B, H, n) of each ray.
+    agreeing rays have the lowest chances. chance: (B, H, n) of each ray.
 
     NFA(k) = (n - 2) C(n, k) C(k, 2) p_k^(k - 3/2), where p_k is the k-th lowest chance. The k rays measure 2 k coordinates,
     and 3 of them determine the point. Each p counts for 2 coordinates.

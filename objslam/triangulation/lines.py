@@ -11,9 +11,9 @@ from objslam.core.array_module import Tensor, group_sum
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines of many objects, in coordinates of the line's object. foot: (R, 3) the point of each line nearest to the
-    coordinate origin. direction: (R, 3) unit. index: (R,) the object of each line. count: the number N of objects. xp: the
-    library of the arrays, numpy or torch."""
+    """Lines to many objects. Each object has its own coordinates. foot: (R, 3) the point of each line nearest to the
+    coordinate origin of its object. direction: (R, 3) unit. index: (R,) the object of each line. count: the number N of
+    objects. xp: the library of the arrays, numpy or torch."""
 
     foot: Tensor
     direction: Tensor

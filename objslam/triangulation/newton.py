@@ -15,7 +15,7 @@ _SMOOTHING = 0.05
 """A line at distance d has the weight 1 / sqrt(d^2 + this^2), in mean distances. A larger value keeps more weight on
 outliers."""
 _SINGLE_STEPS = 3
-"""The most Newton steps in single precision, which take half the time of those in double precision. More steps do not
+"""The most Newton steps in single precision, which take half the time of steps in double precision. More steps do not
 improve a single-precision point."""
 _STEPS = 6
 """The most Newton steps in double precision. An object that needs more has a line through or near its solution."""
@@ -92,8 +92,8 @@ def off_nearest_line(lines: LineBlock, start: Tensor) -> tuple[Tensor, Tensor, T
 
     First, the point on this line with the least sum of distances from the other lines is found. Across the line, this sum
     has a gradient at the point. If the gradient is at most 1, the point is the optimum of Eq. 1 (Kuhn, Math. Programming 4,
-    1973), and the returned norm is that of the smallest subgradient. If the gradient is larger, the optimum lies beside the
-    line, and Newton steps start there.
+    1973), and the smallest subgradient has the returned norm. If the gradient is larger, the optimum lies beside the line,
+    and Newton steps start there.
     """
     xp = lines.xp
     far = norm(lines.offset(start)) + xp.where(lines.weight > 0, 0.0, xp.full_like(lines.weight, xp.inf))

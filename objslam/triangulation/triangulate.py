@@ -119,7 +119,7 @@ def _triangulate(
     judged: Bools,
     backend: Backend,
 ) -> Triangulation:
-    """Triangulate rays that are already checked. The arguments are those of `triangulate`."""
+    """Triangulate rays that are already checked. The arguments are as in `triangulate`."""
     where, base, bundle = _sorted_bundle(m, n, index, count, noise, position_sigma, backend)
     xp = bundle.xp
     if settings.consensus:

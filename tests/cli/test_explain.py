@@ -58,6 +58,16 @@ def test_no_doubt_is_said_too(explain: Any) -> None:
     assert explain("sure", "--label", sure)[:2] == (0, f"no doubts about {sure}\n")
 
 
+def test_the_boxes_that_became_no_object_are_counted(explain: Any, tmp_path: Path) -> None:
+    for folder, boxes in (("out", 200), ("sure", 82)):
+        file = tmp_path / folder / "summary.json"
+        summary = json.loads(file.read_text())
+        summary["counts"]["rays_unexplained"] = boxes
+        file.write_text(json.dumps(summary))
+    assert "200 boxes became no object: 191 in these groups, and 9 scattered" in " ".join(explain("out")[1].split())
+    assert explain("sure")[1].endswith("82 boxes became no object: all scattered\n")
+
+
 def test_a_label_that_the_result_lacks_is_an_error_that_names_those_there(explain: Any) -> None:
     for words in ((), ("--json",)):
         code, out, err = explain("out", "--label", "zebra", *words)

@@ -117,7 +117,7 @@ def test_a_log_that_tells_no_shared_error_has_no_table_of_them(
     (few / "detections.jsonl").write_text("\n".join(frames[:4]) + "\n")
     told = objslam("run", few, "-o", tmp_path / "out", *LEAN).out
     assert "prior sigma" not in told
-    assert "this log does not show any of them; their assumed sizes widen the sigmas" in told
+    assert "this log shows none of them; the sigmas contain their usual sizes" in told
 
 
 def test_doctor_shows_an_unusual_calibration_if_there_are_too_few_boxes_to_judge_it(

@@ -81,7 +81,7 @@ def test_diff_says_what_a_live_result_cannot_tell_and_what_to_do(days, tmp_path,
     code, said, warned = objslam("diff", live, out / "b", "--json")
     (line,) = json.loads(said)["warnings"]
     assert f"warning: {line}\n" == warned
-    assert f"all that only {out / 'b'} has counts as new" in line
+    assert f"objects that only {out / 'b'} has count as new" in line
 
 
 def test_merge_writes_a_site_that_the_next_session_joins(days, tmp_path, objslam):
@@ -165,7 +165,7 @@ def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, objslam):
     assert (tmp_path / "site" / "island_2" / "objects.json").is_file()
     code, _, warned = objslam("merge", out / "a", "-o", tmp_path / "site")
     assert code == 0
-    assert f"{tmp_path / 'site' / 'island_2'} is of an earlier merge" in warned
+    assert f"{tmp_path / 'site' / 'island_2'} remains from an earlier merge" in warned
     with pytest.raises(ValueError, match="at least one"):
         merge([])
 

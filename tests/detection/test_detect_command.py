@@ -48,7 +48,7 @@ def test_units_that_only_the_values_tell_are_said_in_words(files: tuple[Path, Pa
     model = tiny_model(tmp_path / "ssd.onnx", "ssd")
     done = detect(model, files[1])
     assert done.returncode == 0, done.stderr
-    assert "boxes as xyxy in pixels or fractions as their values tell" in done.stdout
+    assert "boxes as xyxy in pixels or fractions, decided by their values" in done.stdout
 
 
 def test_only_a_picture_is_written(files: tuple[Path, Path], tmp_path: Path) -> None:

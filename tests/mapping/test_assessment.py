@@ -57,7 +57,7 @@ def test_a_usual_result_is_good() -> None:
         ({"unexplained": 220, "rejected": 10}, "check", "24 % of the used boxes belong to no object, and 1 % miss their"),
         ({"odometry": 10.8}, "check", "The boxes agree only if the odometry is 11 times as noisy as the settings say"),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
-        ({"fixed": True, "odometry_frame": True}, "check", "The poses are those of the odometry, so its drift is in"),
+        ({"fixed": True, "odometry_frame": True}, "check", "The poses are those of the odometry, so the map has"),
         (
             {"rays": 20, "unexplained": 0, "rejected": 0},
             "check",
@@ -108,7 +108,7 @@ def test_a_scale_that_the_log_does_not_tell_is_no_flaw_but_said() -> None:
     found = assess(replace(GOOD, odometry_frame=True, scale=0.03))
     assert found.level == "good"
     assert found.reasons[-1].startswith(
-        "The log does not tell the scale of the odometry: all distances may be too long or too"
+        "The log does not show the scale of the odometry: all distances may be too long or too"
     )
     assert "with a sigma of 3 %." in found.reasons[-1]
     assert len(assess(replace(GOOD, scale=0.03, spoilt=True)).reasons) == 1
@@ -119,7 +119,7 @@ def test_boxes_without_depth_do_not_tell_the_scale(depth: bool) -> None:
     """A map and its path can be stretched together, and no box moves. A depth changes."""
     log = small_log(localization=None, odometry=Odometry(), depth=DepthNoise() if depth else None)
     found = objslam.run(log, {**QUIET, "mode": "joint"})
-    assert ("does not tell the scale" in str(found.assessment)) != depth
+    assert ("does not show the scale" in str(found.assessment)) != depth
 
 
 @pytest.mark.parametrize(("sigma", "level"), [(2.0, "good"), (0.8, "check")])
@@ -141,7 +141,7 @@ def test_a_run_from_odometry_says_that_the_map_has_its_frame() -> None:
 def test_fixed_poses_are_good_where_they_are_absolute_and_not_where_they_drift() -> None:
     drifting = objslam.run(small_log(), ALONE, mode="fixed", poses={"use": "odometry"})
     assert drifting.assessment.level == "check"
-    assert "drift is in the map" in drifting.assessment.reasons[0]
+    assert "the map has its drift" in drifting.assessment.reasons[0]
     absolute = objslam.run(small_log(), ALONE, mode="fixed", poses={"use": "localization"})
     assert "drift is in the map" not in str(absolute.assessment)
 

@@ -71,7 +71,7 @@ def test_noise_that_the_rays_of_a_frame_share_is_named_with_its_size():
 def test_after_a_calibration_it_is_no_longer_the_cameras():
     log = drive(pixel_sigma=9.0)
     (line,) = warnings(log, NO_BODIES)
-    assert "the poses or the boxes are worse than that; try --mode joint" in line
+    assert "the poses or the boxes are worse than the settings; try --mode joint" in line
 
 
 def test_a_cause_that_is_named_is_not_told_twice():

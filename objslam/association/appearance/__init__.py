@@ -1,4 +1,2 @@
-"""How likely two boxes show one object, from what they look like: a likelihood ratio of cosines, learnt from the log itself.
-
-Without appearance vectors, nothing in this folder changes anything.
-"""
+"""Decide from appearance how likely two boxes show one object. The likelihood ratio of cosines is learnt from the log
+itself. Without appearance vectors, nothing in this folder changes anything."""

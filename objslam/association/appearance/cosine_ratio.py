@@ -72,7 +72,7 @@ class CosineRatio:
 
     @property
     def informative(self) -> bool:
-        """Whether the vectors tell the objects of any label apart, so that a comparison is worth its time."""
+        """Whether the vectors tell objects of any label apart. Only then is a comparison worth its time."""
         label = np.arange(len(self.same.mean))
         spread = self.different.spread(label, 1, np.inf)
         return bool(((self.same.mean - self.different.mean) > _LEAST_APART * np.sqrt(spread)).any())

@@ -93,7 +93,7 @@ def second_bundle(
         owner: (R,) the object of each ray.
         count: the number of objects.
         least: rad, the least gap.
-        used: (R,) the rays that tell the gap, all by default. The others go with the bundle on their side of it.
+        used: (R,) the rays among which the gap is searched, all by default. The others go with the bundle on their side.
         fewest: the fewest used rays of a bundle.
     """
     mine = np.arange(len(owner)) if used is None else np.flatnonzero(used)

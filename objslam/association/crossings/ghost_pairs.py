@@ -3,7 +3,7 @@
 Seen from two stretches of the path, two things of one label have four points where rays meet: the things, and two ghosts.
 The rays of each ghost come from both things. Both ghosts together have as many rays as the things, and the rays of a short
 look fit them. So no ray fits the other landmark better, and a search that takes the points one by one may find the ghosts
-first. Only rays from a third side tell: both ghosts fit them worse than other landmarks fit their rays.
+first. Only rays from a third side reveal the ghosts: both ghosts fit them worse than other landmarks fit their rays.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def replace_ghosts(state: State, gate: float, seed: int = 0) -> State:
 
 
 def _suspects(state: State, gate: float) -> Ints:
-    """Return the pairs (P, 2) of neighbours of one label whose rays fit clearly worse than those of most landmarks of the
+    """Return the pairs (P, 2) of neighbours of one label whose rays fit clearly worse than the rays of most landmarks of the
     label, the worst pair first."""
     if state.count < 2:
         return np.zeros((0, 2), dtype=np.int64)

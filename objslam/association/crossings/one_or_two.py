@@ -1,10 +1,10 @@
-"""Tell one thing from two things whose rays cross. In tracking by bearings, such a crossing is a ghost.
+"""Distinguish one thing from two things whose rays cross. In tracking by bearings, such a crossing is a ghost.
 
-Rays from a short stretch of the path, a bundle, hardly tell how far away their thing is. Two bundles in a plane always meet
+Rays from a short stretch of the path, a bundle, hardly show how far away their thing is. Two bundles in a plane always meet
 somewhere. So two stretches that see two things give a landmark behind both, or between them, and all rays fit it. The
-likelihood of all data of both bundles tells which explanation is right. The data are the bearings, the sizes of boxes, their
-growth as the robot comes nearer, and whether the distances are usual for the class. The unknown positions are integrated
-out.
+likelihood of all data of both bundles decides which explanation is right. The data are the bearings, the sizes of boxes,
+their growth as the robot comes nearer, and whether the distances are usual for the class. The unknown positions are
+integrated out.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ more landmarks."""
 _HIDDEN, _HIDDEN_WIDTH = 0.1, 4.6
 """`_HIDDEN` is the assumed share of views that show only a part of a thing. Their ln size has a uniform distribution of the
 width `_HIDDEN_WIDTH`: a factor of 100 between the smallest and the largest size. With a larger share, or a smaller width,
-different sizes tell less."""
+different sizes count less."""
 _CLEAR = 3.0
 """The least log odds of two things over one for a landmark that is split: 3 is a factor of 20. A larger value splits fewer
 landmarks. A thing may be lost if it is split."""
 _ASSUMED = 3
-"""The number of landmarks that are assumed to have the usual gain (`_USUAL_GAIN`), in addition to those of the log. With a
-larger number, errors that rays share split more landmarks."""
+"""The number of landmarks that are assumed to have the usual gain (`_USUAL_GAIN`), in addition to the landmarks of the log.
+With a larger number, errors that rays share split more landmarks."""
 _LEAST_EXCESS = 1 / 16
-"""The least factor on the usual gain of two points. It is that of rays with a quarter of the nominal noise. A smaller factor
-splits more landmarks."""
+"""The least factor on the usual gain of two points. Rays with a quarter of the nominal noise have this factor. A smaller
+factor splits more landmarks."""
 _OFF_CENTRE = 0.02
 """The offset between the middle of a thing and the middles of its boxes in one bundle, as a share of the boxes' size.
 Perspective alone gives this share for a cube that is seen from six times its size. A larger share splits fewer large
@@ -45,12 +45,12 @@ things."""
 _FREE = 3
 """The degrees of freedom of a second point."""
 _USUAL_GAIN = 2.366
-"""The usual gain: the median decrease of the cost of the rays of one thing if two points explain them in place of one. It is
-the median of chi-squared with `_FREE` degrees of freedom."""
+"""Two points explain the rays of one thing better than one point does. This is the median decrease of the cost, the median
+of chi-squared with `_FREE` degrees of freedom."""
 _USUAL_GAINS = ((0.5, _USUAL_GAIN), (0.8, 4.642))
 """Two probabilities, each with its quantile of chi-squared with `_FREE` degrees of freedom. Errors that last for a while,
-such as those of a wheel that slips, concern only some landmarks. They show in the second quantile. If one landmark in five
-is two things, this does not change the second quantile."""
+such as the slip of a wheel, concern only some landmarks. They show in the second quantile. If one landmark in five is two
+things, this does not change the second quantile."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
 
     The things of a class may lie anywhere in the mapped space, with the density of its landmarks. The second thing of a
     landmark may also be another landmark that fits the bundle's rays. Only bundles whose boxes have sizes are compared.
-    Without sizes, only the bearings tell how far away the thing is, and the rays of one stretch of the path share errors.
+    Without sizes, only the bearings show how far away the thing is, and the rays of one stretch of the path share errors.
 
     sized: (R,) whether the camera of each ray observes sizes. fewest: the number of such boxes that a bundle must have.
     """
@@ -112,15 +112,18 @@ def find_crossings(state: State, sized: Bools, fewest: int) -> Crossings:
 
 
 def _as_two(alone: tuple[Floats, Floats], other: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-    """Return the log likelihoods (3, S) and the costs (3, S) of pairs of bundles as two things: two new ones, or a new one
-    and another landmark, in both orders. alone, other: the log likelihood (G,) and the cost (G,) of each bundle."""
+    """Return the log likelihoods (3, S) and the costs (3, S) of pairs of bundles that show two things.
+
+    There are three cases: two new things, or a new thing and another landmark, in both orders. alone, other: the log
+    likelihood (G,) and the cost (G,) of each bundle.
+    """
     (a, b), (c, d) = alone[0].reshape(-1, 2).T, other[0].reshape(-1, 2).T
     (p, q), (r, s) = alone[1].reshape(-1, 2).T, other[1].reshape(-1, 2).T
     return np.array([a + b, a + d, c + b]), np.array([p + q, p + s, r + q])
 
 
 def _most(bundles: Bundles, free: FreeFit) -> Floats:
-    """Return the greatest log likelihood (G,), without the bearings, that a bundle can have as a thing of its own."""
+    """Return the greatest log likelihood (G,), without the bearings, of each bundle if it shows a thing of its own."""
     usual, landmark = bundles.usual, bundles.landmark
     variance_ = usual.class_spread[landmark] ** 2 + usual.view**2
     size = np.maximum(_size_odds(usual.class_mean[landmark], usual.class_mean[landmark], variance_), 0.0)
@@ -128,9 +131,9 @@ def _most(bundles: Bundles, free: FreeFit) -> Floats:
 
 
 def _overlap(bundles: Bundles, position: Floats) -> Bools:
-    """Return for each pair (S,) of bundles whether things of their size at points (G, 3) m would overlap.
+    """Return for each pair (S,) of bundles whether the two things would overlap at the points (G, 3), m.
 
-    Two things do not overlap. But two points inside one large thing may explain its rays better than one point, because the
+    Two real things do not overlap. But two points inside one large thing may explain its rays better than one point: the
     rays from two sides to the middles of its boxes do not meet in one point.
     """
     apart = np.linalg.norm(position[::2] - position[1::2], axis=1)
@@ -152,9 +155,9 @@ def without_smaller_bundles(state: State, sized: Bools) -> State:
 def excess_of(gain: Floats) -> Floats:
     """Return for each landmark (S,) the factor by which two points usually gain more than the nominal noise explains.
 
-    Rays share errors, as of poses and clocks. Then two points fit the rays of one thing better than noise explains. Poses
-    can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second thing. The
-    gains of the other landmarks tell the factor. gain: (S,) by how much two free points lower the cost.
+    Rays share errors, such as errors of poses and clocks. Then two points fit the rays of one thing better than noise
+    explains. Poses can also be better than their nominal noise. Then two points gain less, and a small misfit shows a second
+    thing. The factor comes from the gains of the other landmarks. gain: (S,) by how much two free points lower the cost.
     """
     every = np.append(gain, np.full(_ASSUMED, _USUAL_GAIN))
     order = np.argsort(every, kind="stable")
@@ -172,7 +175,7 @@ def excess_of(gain: Floats) -> Floats:
 def _of_offsets(bundles: Bundles) -> Floats:
     """Return for each landmark (S,) the factor by which two points gain more because the boxes of a bundle share an offset.
 
-    More rays do not average such an offset out, so the gain grows with them.
+    More rays do not average such an offset out. So the gain grows with the number of rays.
     """
     obs, ray, count = bundles.state.obs, bundles.ray, bundles.count // 2
     rays = np.bincount(bundles.group, minlength=2 * count).reshape(-1, 2)
@@ -184,10 +187,10 @@ def _of_offsets(bundles: Bundles) -> Floats:
 def _bearing_odds(gain: Floats, excess: Floats, landmarks: int) -> Floats:
     """Return the log odds (K, S) of two things over one by bearings.
 
-    The excess is as uncertain as the number of landmarks says, so that the odds are those of an F distribution.
+    The excess comes from a limited number of landmarks, so the odds are from an F distribution.
 
-    gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) as of
-    `excess_of`. landmarks: how many gains told it.
+    gain: (K, S) by how much K explanations of S landmarks as two things lower the cost of the rays. excess: (S,) from
+    `excess_of`. landmarks: the number of gains that gave it.
     """
     number = landmarks - 1 + _ASSUMED
     tail = 0.5 * (number + _FREE) * np.log1p(np.maximum(gain, 0.0) / (excess * number))

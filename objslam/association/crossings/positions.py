@@ -17,7 +17,8 @@ _FEW_STEPS = 8
 """The number of distances that are tried for the start of a fit of one point to a bundle. Bundles without parallax fit at
 many distances. A larger number is more exact, and slower."""
 _NEAREST, _FURTHEST = 0.03, 2.0
-"""The least and the greatest tried distance of a bundle, in usual distances of its class."""
+"""The least and the greatest distance that are tried for a bundle, as multiples of the usual distance of its class. A wider
+range tries more places, farther apart."""
 
 
 @dataclass(frozen=True)

@@ -25,22 +25,22 @@ _LANDMARKS = 3
 One of three landmarks may be wrong without effect on their median."""
 _VIEW_SIZE, _THINGS = 0.25, 5.0
 """`_VIEW_SIZE` is the assumed standard deviation of ln size between two views of one thing, as in `gating`. With `_THINGS`
-landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, sizes tell less. With a
+landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, sizes count less. With a
 larger number, the assumed deviation counts longer."""
 _CLASS_SIZE, _OF_CLASS = 0.7, 3.0
 """`_CLASS_SIZE` is the assumed standard deviation of ln size within a class: sizes differ by a factor of 2. With `_OF_CLASS`
-landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, the size tells less about
+landmarks, the measured deviation has the same weight as the assumed one. With a larger deviation, the size says less about
 the distance. With a larger number, the assumed deviation counts longer."""
 _LEAST_VIEW = 1e-3
-"""The least measured deviation of ln size between views, so that its logarithm is finite."""
+"""The smallest deviation of ln size between views that is used. It keeps the logarithm of the deviation finite."""
 _SIZED_BY = 5
 """The least number of boxes that give a landmark a size. A larger number leaves more landmarks without one."""
 _MARGIN = (2.0, 2.0, 0.3)
 """The lengths (m) by which the mapped space exceeds the landmarks, along the axes of the map. Larger lengths mean a lower
 density of things."""
 _INNER = 0.9
-"""The share of the landmarks, along each axis, that tell how large the mapped space is. With a larger share, wrong landmarks
-far away enlarge it."""
+"""The share of the landmarks, along each axis, that define how large the mapped space is. With a larger share, wrong
+landmarks far away enlarge it."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ class UsualViews:
         return cls(state, _distances(state), _log_density(state), ln_size[:, side], size, view[side], mean, spread)
 
     def far_odds(self, distance: Floats, landmark: Ints) -> Floats:
-        """Return the log likelihood (G,) of the distances of bundles of rays, relative to a usual distance, at most 0. The
-        boxes of the other landmarks of the class show which distances are usual.
+        """Return the log likelihood (G,) of the distances of bundles of rays, at most 0. It is relative to a usual distance.
 
-        distance: (G,) m. landmark: (G,) the landmark of each bundle. Its own boxes do not count.
+        The boxes of the other landmarks of the class show which distances are usual. distance: (G,) m. landmark: (G,) the
+        landmark of each bundle. Its own boxes do not count.
         """
         state, limit = self.state, distance / _LARGER
         label = state.label[state.owner]
@@ -140,8 +140,10 @@ def _log_density(state: State) -> Floats:
 
 
 def _of_class(size: Floats, label: Ints) -> tuple[Floats, Floats]:
-    """Return mean and standard deviation (N,) of ln size (N,) among the other landmarks of each landmark's class, or among
-    all other landmarks if it has no others."""
+    """Return mean and standard deviation (N,) of ln size (N,) among the other landmarks of each landmark's class.
+
+    If there are none, the values of all other landmarks are taken.
+    """
     count = len(size)
     mean, spread = np.full(count, np.nan), np.full(count, 2 * _CLASS_SIZE)
     known = np.isfinite(size)

@@ -26,7 +26,8 @@ from objslam.core.statistics import logistic
 from objslam.core.types import Association
 
 _MOVING = 6
-"""The number of coordinates of a moving point: those of its position and of its velocity. So it explains any three rays."""
+"""The number of coordinates of a moving point: three of its position and three of its velocity. So it explains any three
+rays."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _TURNS = 8
 """The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
@@ -104,8 +105,8 @@ def few_ray_evidence(
 ) -> FewRayEvidence:
     """Return the evidence of all objects that a search for few rays finds.
 
-    correct_places: whether to correct the places from which the objects were seen. The evidence is always that of the given
-    places, at which each ray has its own error.
+    correct_places: whether to correct the places from which the objects were seen. The evidence is always computed at the
+    given places, where each ray has its own error.
     """
     nothing = Association(np.full(len(of.rays), -1), np.zeros(0, dtype=np.int64))
     few, ray = _few(of, settings, nothing, np.zeros((0, 3)))
@@ -128,7 +129,7 @@ def few_ray_evidence(
 
 
 def _few(of: PosedRays, settings: config.Settings, association: Association, positions: Floats) -> tuple["_Few", Ints]:
-    """Return the search of `add_few_ray_objects`, and the index (P,) of the ray of each observation."""
+    """Return the search of `add_few_ray_objects`, and for each observation the index (P,) of its ray."""
     rays = of.rays
     obs, ray, keyframe = observe(of)
     positions = flattened_points(positions, obs.scale)
@@ -177,7 +178,8 @@ class _Few:
         return few, found
 
     def with_places_of(self, joined: State) -> "_Few":
-        """Return the search from places that are corrected by the errors that `joined`, all landmarks, shows."""
+        """Return the search from corrected places. The landmarks `joined`, which are all of them, show the errors of the
+        places."""
         obs = self.known.obs
         errors = place_errors(replace(joined, obs=obs))
         left = float(np.sqrt((errors.sigma[errors.place] ** 2).mean()))

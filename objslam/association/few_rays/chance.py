@@ -39,7 +39,7 @@ objects do not lie everywhere where boxes could show them. A larger upper limit 
 _SHARES = np.geomspace(1e-4, 1.0, _TRIED)
 """The tried shares of stray boxes. A smaller lower limit trusts the boxes of a clean log more."""
 _PRIOR_STRAYS = 1.0
-"""The number of strays of each label that are assumed in addition to those of the log. A larger number keeps fewer
+"""The number of strays of each label that are assumed in addition to the strays in the log. A larger number keeps fewer
 landmarks."""
 _LOOK = np.radians(2.0)
 """Two rays of a landmark count as independent if the angle (rad) between them is at least this. It is the least parallax of
@@ -99,8 +99,8 @@ def _bins(x: Floats, low: float, width: float) -> Ints:
 class Strays:
     """The density of stray boxes.
 
-    image: (R,) sr^-1, the density of the boxes of a ray's label in the image at the ray. frames: the number of frames.
-    log_range: the densities of ln range, None if no ray has a range. ranged: (L,) the share of boxes with a range.
+    image: (R,) sr^-1, the density, at the place of a ray in the image, of the boxes of its label. frames: the number of
+    frames. log_range: the densities of ln range, None if no ray has a range. ranged: (L,) the share of boxes with a range.
     """
 
     image: Floats
@@ -230,7 +230,7 @@ def chance_odds(state: State, gate: float, strays: Strays, rates: Rates) -> Floa
 def log_evidence(state: State, gate: float, strays: Strays, rates: Rates) -> float:
     """Return the log odds of all landmarks together over the case that all boxes are strays.
 
-    The share of strays and the density of objects are those that fit each label best.
+    The share of strays and the density of objects are chosen for each label, so that they fit best.
     """
     boxes, objects = _expected(state, rates)
     grid = _likelihoods(_evidence(state, gate, strays, rates), _looks(state), state.label, boxes, objects)

@@ -1,4 +1,4 @@
-"""Estimate the errors of the places from which a log was recorded, such as those of GPS.
+"""Estimate the errors of the places from which a log was recorded, such as places by GPS.
 
 All boxes of one moment share the error of the place of this moment. A box alone cannot show it. But if several boxes of a
 moment have landmarks that other moments see too, the error follows from all of them together.
@@ -108,8 +108,8 @@ def _solved(
 def _sigma(weight: Floats, owner: Ints, of: Ints, count: int, places: int, prior: float) -> Floats:
     """Return the standard deviations (G,), m, of the offsets of the places.
 
-    A ray tells of its place as much as the other rays tell of its landmark. So this is one round of belief propagation
-    (Weiss and Freeman, Neural Computation 13, 2001).
+    A ray is as informative about its place as the other rays are about its landmark. So this is one round of belief
+    propagation (Weiss and Freeman, Neural Computation 13, 2001).
     """
     alone = weight - weight @ np.linalg.solve(weight + np.eye(3) / prior, weight)  # With the errors of the place as noise.
     others = grouped_sums(alone.reshape(-1, 9), owner, count).reshape(-1, 3, 3)[owner] - alone

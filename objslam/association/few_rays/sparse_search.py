@@ -14,11 +14,12 @@ from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
 
 _MOST_PAIRS = 4096
-"""The most pairs of rays whose odds are computed, those that fit best. A larger number finds more in dense clutter."""
+"""The most pairs of rays whose odds are computed. The pairs that fit best are taken. A larger number finds more in dense
+clutter."""
 _MOST_POINTS = 512
 """The most points that are compared with all rays. A larger number finds more in dense clutter, and costs time."""
 _MORE_RAYS = 3.0
-"""The log odds that further rays may add to those of a pair. A larger value tries more points."""
+"""The log odds that further rays may add to the log odds of a pair. A larger value tries more points."""
 _REFINEMENTS = 2
 """How often each point moves to the best fit of its rays. A larger number costs time."""
 _DAMPING = 1e-6

@@ -3,8 +3,8 @@
 A path that is bent onto wrong landmarks fits them well, so no small change improves it. This search is global: it tries to
 move each stretch of the path from wrong landmarks to landmarks beside them. It is Markov localisation on a grid (Fox,
 Burgard and Thrun 1999). The states of a short stretch of the path are planar corrections of it, a turn and a shift. The rays
-tell how well a state fits the map, and the odometry tells how well the states of two stretches fit together. Dynamic
-programming finds the most likely states of all stretches (Viterbi 1967).
+show how well a state fits the map. The odometry shows how well the states of two stretches fit together. Dynamic programming
+finds the most likely states of all stretches (Viterbi 1967).
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ _STEPS_APART = 4.0
 less far: it reaches `_SHIFTS` / `_STEPS_APART` neighbours."""
 _MOST_TURN = np.radians(1.0)
 """The largest grid step (rad) in yaw. The step of shifts is this turn at the median distance of landmarks. A larger value
-reaches farther: the heading of a solved path errs by 14 degrees at most."""
+finds larger errors of the path. The heading of a solved path errs by 14 degrees at most."""
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from objslam.core.types import Rays
 _LANDMARK_SIGMA = 0.03
 """The assumed standard deviation (m) of a landmark's position. A larger value accepts rays farther from landmarks."""
 _NEAR = 4.0
-"""The number of standard deviations beyond the grid up to which a landmark counts for a ray. At 4, its cost exceeds that of
-a stray ray. A larger value takes longer."""
+"""The number of standard deviations beyond the grid up to which a landmark counts for a ray. At 4, its cost exceeds the cost
+of a stray ray. A larger value takes longer."""
 _RAYS_AT_ONCE = 2000
 """About how many rays are compared with the map together. A larger number needs more memory."""
 

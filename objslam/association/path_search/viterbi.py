@@ -24,9 +24,9 @@ _LEVELS = 250
 
 @dataclass(frozen=True)
 class Motions:
-    """The motions between G stretches. error: (G - 1, 3) of the present path against the odometry in x, y (m) and yaw (rad),
-    along the axes of map. variance: (G - 1, 3) of this error, from the odometry's drift. way: (G - 1, 2) m, from pivot to
-    pivot."""
+    """The motions from each of G stretches of the path to the next. error: (G - 1, 3) the motion of the present path minus
+    the motion of the odometry: x, y (m) and yaw (rad), along the axes of map. variance: (G - 1, 3) of this error, from the
+    odometry's drift. way: (G - 1, 2) m, the motion in x and y."""
 
     error: Floats
     variance: Floats
@@ -34,8 +34,8 @@ class Motions:
 
     @classmethod
     def of(cls, keyframes: Keyframes, middle: Ints, base: Floats, grid: Grid) -> Self:
-        """Compare the motions of the path with those of the odometry. middle: (G,) the keyframe at the middle of each
-        stretch. base: (G, 4, 4) the poses of the path at these keyframes."""
+        """Compare the motions of the path and of the odometry. middle: (G,) the keyframe at the middle of each stretch.
+        base: (G, 4, 4) the poses of the path at these keyframes."""
         assert keyframes.drift is not None
         assert keyframes.odom_T_base is not None
         odometry = keyframes.odom_T_base[middle]
@@ -75,7 +75,7 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
     """Return the states (G, 3) of x, y (m) and yaw (rad) with the least total cost. costs: (Y, X, X) of each stretch.
 
     A state that costs `_SLIP` more than the best state of its stretch is on no best path, because a slip from the best state
-    costs less. So a byte is enough for the cost above that of the best state.
+    costs less. So a byte is enough for the difference from the cost of the best state.
     """
     stored, total = list[NDArray[np.uint8]](), np.zeros(0, dtype=np.float32)
     for k, seen in enumerate(costs):
@@ -99,7 +99,7 @@ def most_likely_states(motions: Motions, costs: Iterator[Cells], grid: Grid) -> 
 
 
 def _steps_to(state: int, count: int) -> slice:
-    """Return the indices in `Motions.costs` of the steps from each of `count` states, in order, to one state."""
+    """Return indices into `Motions.costs`. They are of the steps from each of `count` states, in order, to `state`."""
     return slice(state + count - 1, state - 1 if state else None, -1)
 
 
@@ -107,7 +107,7 @@ def _reached(total: Cells, x: Cells, y: Cells, yaw: Cells) -> Cells:
     """Return for each state the least sum (Y, X, X) of two costs: of a state before, and of the motion from there.
 
     A sum is at most `_SLIP`. Only states below `_SLIP` can lead to a smaller sum, so only the part of the grid that contains
-    them is searched. This part is small where the rays tell well where the robot is.
+    them is searched. This part is small where the rays show well where the robot is.
 
     Args:
         total: (Y, X, X) the costs of the states before.

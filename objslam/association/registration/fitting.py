@@ -158,9 +158,9 @@ def _weights(miss: Floats, information: Array) -> Floats:
 def transform_covariance(problem: Problem, x: Floats, a: Ints, b: Ints) -> Floats:
     """Return the covariance (4, 4) of a transform x (4,) that was fitted to the pairs of objects a (P,) and b (P,).
 
-    The shared errors of both maps move the fit as `shapes` derives. So the covariance contains the shared shift and yaw in
-    full, however many pairs there are. It also contains the effect of the shared tilt and size on this fit. NaN if the pairs
-    do not determine the transform.
+    The shared errors of both maps move the fit. `shapes` derives by how much. So the covariance contains the shared shift
+    and yaw in full, however many pairs there are. It also contains the effect of the shared tilt and size on this fit. NaN
+    if the pairs do not determine the transform.
     """
     moved = move(x[None], problem.a.position[a][None])
     offset = covariances(problem, x[None], a[None], b[None])[0]

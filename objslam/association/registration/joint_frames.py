@@ -31,7 +31,7 @@ _SAME_NOISE = 0.02
 """The noise is not estimated again if its relative change is smaller than this. A larger value ends sooner."""
 _FEWEST_MAPS = 3
 """With at least this number of maps, each map has a noise of its own. With fewer, all have one noise, because the residuals
-of two maps do not tell which map is worse. A larger number gives more maps one noise."""
+of two maps do not show which map is worse. A larger number gives more maps one noise."""
 _POOLED = 10.0
 """A map's given covariances weigh as much as this number of residuals. A larger number trusts the covariances more. At 10, a
 map of a few objects keeps its covariances, and a map of a few dozen is judged by its residuals."""

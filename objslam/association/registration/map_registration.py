@@ -35,8 +35,9 @@ MIN_LOG_ODDS = 9.2
 """The least log odds against chance of an accepted registration, and the least lead over another place. A larger value
 refuses more registrations. 9.2 allows one false alarm in 10,000 pairs of maps."""
 _STAGES = ((32, 200), (100, 60), (1 << 30, 20))
-"""The stages of the fit, two numbers each. A proposal is fitted to the first number of objects, those nearest to its pair.
-The second number is how many of the best proposals are fitted. Larger numbers find smaller overlaps and take longer."""
+"""The stages of the fit, two numbers each. A proposal is fitted to the first number of objects. The objects nearest to its
+pair are taken. The second number is how many of the best proposals are fitted. Larger numbers find smaller overlaps and take
+longer."""
 _LIMITS = (SAME_POINT, SAME_POINT / 2)
 """The largest squared Mahalanobis distances of a match, one for each count of matches. The best count is the evidence. The
 first holds 99 % of true matches, the second 87 %. With tighter limits, simulated groups of three equal objects gave false

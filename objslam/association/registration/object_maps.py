@@ -46,5 +46,5 @@ def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, st
     odds = f"{len(found.matches)} objects match, log odds {found.log_odds:.1f}, lead {found.lead:.1f}"
     if found.verdict == "ambiguous":
         return f"ambiguous, because another place fits as well ({odds})"
-    needed = f"{MIN_LOG_ODDS:.1f} are needed, as five or six objects usually give"
-    return odds if found.accepted else f"too little evidence ({odds}, and {needed})"
+    needed = f"{MIN_LOG_ODDS:.1f} are needed, and five or six objects usually give them"
+    return odds if found.accepted else f"too little evidence ({odds}; {needed})"

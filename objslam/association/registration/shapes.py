@@ -10,8 +10,8 @@ that belong to g and d, the offset y_i of a matched object from its partner is, 
 x is the transform between the maps, about which nothing is known before. A change of g looks exactly like a change of x.
 Three things follow.
 
-1. The residuals of a fit of x do not depend on g. So only o_i + D_i d may widen gates, and only their covariance is that of
-   an offset. Anything else would take chance matches for true matches.
+1. The residuals of a fit of x do not depend on g. So only o_i + D_i d may widen gates, and only their covariance belongs
+   to an offset. Anything else would take chance matches for true matches.
 2. The best estimate of x is the same with and without g in the covariance of the offsets (Rao 1967). For any weights, a fit
    is x + sum_i K_i (y_i - J_i x), and sum_i K_i J_i = 1. Its error is g + sum_i K_i (D_i d + o_i). So the whole covariance
    of g is added to the covariance of x, however many objects match.

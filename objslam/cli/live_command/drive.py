@@ -148,7 +148,7 @@ def finish(
     if TOO_SLOW in last.dropped and (advice := feed.late()):
         say(f"warning: {advice}", stderr=True)
     if again := sum(n for kind, n in last.counters.items() if kind.endswith(CAME_BEFORE)):
-        say(f"{again} poses and frames had come before and are in the map already, so nothing is lost", stderr=True)
+        say(f"{again} poses and frames came a second time. They are in the map already, so nothing is lost", stderr=True)
     thinned = last.counters.get("keyframes left out", 0)
     more = f" ({thinned} more left out: live.max_keyframes)" if thinned else ""
     if not quiet:

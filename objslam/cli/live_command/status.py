@@ -55,8 +55,8 @@ def status_line(quiet: bool = False) -> Iterator[Callable[[Snapshot, Ledger], No
 class _Rates:
     """The formatter of the status line. Message rates are averages since the previous status line.
 
-    A narrow terminal cuts the end of the line, so long reasons come last. The line leaves out what does not change how the
-    user drives, until the number of dropped data fits.
+    A narrow terminal cuts the end of the line, so long reasons come last. Less important parts are left out until the number
+    of dropped data fits.
     """
 
     def __init__(self) -> None:

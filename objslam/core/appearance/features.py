@@ -32,7 +32,7 @@ class FeatureTable:
 
     @cached_property
     def compact(self) -> Floats32:
-        """(V, d) unit vectors with at most `_COMPACT` numbers, whose cosines are nearly those of the vectors.
+        """(V, d) unit vectors with at most `_COMPACT` numbers, with nearly the same cosines as the vectors.
 
         These are the coordinates along the strongest directions (the largest eigenvalues of the second moments). Comparing
         them takes less time and memory.

@@ -14,8 +14,8 @@ _RIMS = np.array([[np.cos(a), np.sin(a), z] for a in np.arange(16) * np.pi / 8 f
 _OUTLINES = {SHAPES.index("cuboid"): _CORNERS, SHAPES.index("cylinder"): _RIMS}
 """The points that the box of a shape goes around. The other shapes are ellipsoids, whose boxes have a closed form."""
 _NEAREST = 0.1
-"""The least depth of the nearest part of a body, as a share of the depth of its centre. A larger share gives fewer bodies
-that nearly touch the camera a box."""
+"""The least depth of the nearest part of a body, as a share of the depth of its centre. With a larger share, fewer bodies
+near the camera get a box."""
 
 
 def beside_centres(
@@ -25,9 +25,9 @@ def beside_centres(
 
     Let a camera with the axes x, y, z see an ellipsoid with the centre c and the matrix M of squared half axes. The left and
     the right edge of its box are planes with the normal n = x - u z that touch it: (n . c)^2 = n^T M n (Hartley and
-    Zisserman 2004, section 8.3). The mean of the two solutions u is that of the point c - M z / (z . c). The box of a cuboid
-    goes around the images of its corners, that of a cylinder around its rims. The vector is 0 for a body that reaches behind
-    its camera.
+    Zisserman 2004, section 8.3). The mean of the two solutions u is the coordinate u of the point c - M z / (z . c). The box
+    of a cuboid goes around the images of its corners. The box of a cylinder goes around the images of its rims. The vector
+    is 0 for a body that reaches behind its camera.
 
     The vectors (n, 3) are in m in map. Their standard deviations (n,), m, are along an axis of the image, to first order.
 
@@ -85,10 +85,9 @@ def _around_points(points: Floats, centre: Floats, body: Floats, half: Floats) -
 def image_axes(map_R_camera: Floats, to: Floats, fisheye: Bools) -> Floats:
     """Return the axes (n, 3, 3) of the images around bodies, in map, for `beside_centres`.
 
-    For a fisheye lens, the image around a body is taken as that of a camera turned towards the body. For other lenses, the
-    axes are those of the camera. The distortion of such a lens bends the edges of a box a little, but the error is small
-    compared with the vectors of `beside_centres`. map_R_camera: (n, 3, 3). to: (n, 3), m, from the cameras to the bodies.
-    fisheye: (n,).
+    For a fisheye lens, a camera that is turned towards the body gives the axes. For other lenses, the camera itself gives
+    them. The distortion of such a lens bends the edges of a box a little, but the error is small compared with the vectors
+    of `beside_centres`. map_R_camera: (n, 3, 3). to: (n, 3), m, from the cameras to the bodies. fisheye: (n,).
     """
     if not fisheye.any():
         return map_R_camera

@@ -19,7 +19,7 @@ _SQUARE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5,
 
 @dataclass(frozen=True)
 class TagPose:
-    """The rotation and the size of one fiducial. Its position is that of its object.
+    """The rotation and the size of one fiducial. Its position is the position of its object.
 
     xyzw: (4,) the unit quaternion of map_R_tag: x from the first corner to the second, z from the tag to the viewer.
     covariance: (3, 3) rad^2 of a rotation vector in the frame of the tag. size: m, the side. size_sigma: m, 0 for a given

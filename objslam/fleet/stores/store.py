@@ -48,7 +48,7 @@ class Store(Protocol):
 
 
 class Source(Protocol):
-    """A tree of files that has logs. Its paths are those of this machine, or whole URLs."""
+    """A tree of files that has logs. Its paths are paths of this machine, or whole URLs."""
 
     def expand(self, pattern: str) -> list[str]:
         """Return the paths that a path or a glob pattern names, in order; none if nothing is there."""

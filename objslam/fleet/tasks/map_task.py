@@ -38,9 +38,9 @@ WORK = "objslam.fleet.tasks.map_task:map_one"
 class Job:
     """The part that the tasks of all logs of a fleet share.
 
-    store: the path or URL of the output. options: those of the sources. digest: the hash of all that decides a result
-    besides its log. files: the path of each file, or its name in a remote store, by key. The key is a dotted setting, an
-    option of `OPTION_FILES`, or `detector`. report: whether to write the report of each log.
+    store: the path or URL of the output. options: of the sources. digest: the hash of all that decides a result besides its
+    log. files: the path of each file, or its name in a remote store, by key. The key is a dotted setting, an option of
+    `OPTION_FILES`, or `detector`. report: whether to write the report of each log.
     """
 
     store: str

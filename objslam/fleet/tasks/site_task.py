@@ -78,7 +78,8 @@ def folder_of(name: str) -> str:
 
 
 def finish_site(given: SiteTask) -> SiteResult:
-    """Write the folder of a site, and the tables of its days that changed. Errors are those of `load_node` and the store."""
+    """Write the folder of a site, and the tables of its days that changed. Raises the errors of `load_node` and of the
+    store."""
     store = open_store(given.store)
     islands = load_node(store, given.root)
     at = f"{SITES}/{folder_of(given.site)}"
@@ -183,7 +184,7 @@ def _island(found: SiteMap, order: Mapping[str, int]) -> Island:
 
 
 def _write_tables(store: Store, given: SiteTask, islands: Sequence[SiteMap], before: Mapping[str, str]) -> dict[str, str]:
-    """Write the tables of the days that changed, and remove those of days that are gone.
+    """Write the tables of the days that changed, and remove the tables of days that are gone.
 
     Return for each day a hash of the data in its files. before: these hashes from the earlier run.
     """

@@ -2,7 +2,7 @@
 
 The gradient by a parameter is a sum over measurements. It is split into sums over clusters, and its variance is the variance
 of these sums. Noise need not be white inside a cluster (cluster-robust covariance; Liang and Zeger 1986). Errors of poses
-are correlated for some seconds, and those of boxes as long as the robot sees the same thing: a detector draws the box of a
+are correlated for some seconds, and errors of boxes as long as the robot sees the same thing: a detector draws the box of a
 thing too far to one side, from all places nearby.
 """
 

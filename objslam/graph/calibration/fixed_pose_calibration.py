@@ -56,8 +56,8 @@ class PointSystem:
 
     matrix: (P, P). vector: (P,) half the gradient of the cost. cost: the sum of the weighted squared deviations. variance:
     the factor (at least 1) by which the cost exceeds its expectation. curvature: 0 to 1, the mean curvature of Cauchy's loss
-    divided by that of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3, P) the
-    derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
+    divided by the mean curvature of the weighted squares. scores: (n, P) the share of each ray in the vector. back: (N, 3,
+    P) the derivative of the points by the errors. own: (N, 3) m, the step of the points with the errors kept fixed.
     """
 
     matrix: Floats
@@ -246,7 +246,8 @@ def _slopes(residual: Callable[[Floats], Floats], errors: CalibratedMeasurements
 def _moved_together(
     names: tuple[str, ...], cameras: tuple[str, ...]
 ) -> tuple[tuple[tuple[int, ...], ...], tuple[int | None, ...]]:
-    """Return groups of errors, as indices, that move no ray together, and the camera of each error, None if it has none."""
+    """Return groups of errors, as indices, and the camera of each error, None if it has none. No two errors of a group move
+    the same ray."""
     owner = [cameras.index(name.rpartition(".")[0]) if name.rpartition(".")[0] in cameras else None for name in names]
     together: dict[str, list[int]] = {}
     for k, name in enumerate(names):
@@ -260,7 +261,7 @@ class _Misses:
 
     All arrays have a first axis for M values of the errors. deviation: (M, n, 2) the angles between rays and points, in
     standard deviations, along the axes `basis` (M, n, 2, 3). to: (M, n, 3) the unit vectors to the points. distance: (M, n)
-    m. angle: (M, n) rad, the noise of directions. sigma: (M, n) rad, that of misses.
+    m. angle: (M, n) rad, the noise of directions. sigma: (M, n) rad, the noise of misses.
     """
 
     deviation: Floats
@@ -285,8 +286,8 @@ class _Misses:
     def by_point(self, trusted: bool) -> Floats:
         """Return the derivatives (M, n, 2, 3) of the deviations by the points.
 
-        If the noise is trusted, they contain those of the standard deviation. Without them, the noise would bias the errors
-        of the camera and the points, and more rays would not reduce this bias.
+        If the noise is trusted, they contain the derivatives of the standard deviation. Without them, the noise would bias
+        the errors of the camera and the points, and more rays would not reduce this bias.
         """
         along = self.deviation * self.sigma[..., None] * (self.angle / self.sigma)[..., None] ** 2 * trusted
         across = self.basis - along[..., None] * self.to[..., None, :]

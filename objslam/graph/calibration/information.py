@@ -1,4 +1,4 @@
-"""What a linear system, with poses and landmarks eliminated, tells about the shared errors."""
+"""What a linear system says about the shared errors, after its poses and landmarks are eliminated."""
 
 from dataclasses import replace
 
@@ -44,8 +44,8 @@ def covariance_of(system: ReducedSystem, prior: Floats, wider: Floats) -> Floats
     """Return the covariance (P, P) of the parameters, at most the covariance of their prior in every direction.
 
     prior: (P, P) information. wider: (P,) factors on the standard deviations of the gradient, for noise that is not white.
-    With them, the covariance is a sandwich (Huber 1967). Its weights are those of white noise, because the factors are known
-    only roughly, and with too large a factor, other weights would promise too much.
+    They are known only roughly. So they only widen the result, by the sandwich formula (Huber 1967), and the weights stay as
+    for white noise.
     """
     weights, information = likelihood(system)
     inverse = np.linalg.inv(information + prior)

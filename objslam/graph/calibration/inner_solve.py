@@ -86,7 +86,7 @@ class InnerSolve(Linearised):
         """Return the state after at most `_INNER` steps, or `_damped` if a step does not lower the cost.
 
         A step takes the normal equations of the previous step (chord method). Between steps, only the robust weights and the
-        directions change a little. The gradient is fresh, so the steps lead to the same optimum as those of Gauss-Newton. If
+        directions change a little. The gradient is fresh, so the steps lead to the same optimum as steps of Gauss-Newton. If
         a chord step does not lower the cost, the step is taken with fresh normal equations instead.
         """
         state = self

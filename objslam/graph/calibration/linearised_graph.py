@@ -1,4 +1,4 @@
-"""The joint graph at values of its variables, linearised there."""
+"""The joint graph, linearised at given values of its variables."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -41,7 +41,7 @@ class Linearised:
 
     @cached_property
     def graph(self) -> JointGraph:
-        """The graph. The means of the weak priors of landmarks are the `positions` at which it was made."""
+        """The graph. The weak priors of landmarks have as means the `positions` at which the graph was made."""
         if self.known is not None:
             return self.known
         return JointGraph.of(self.measured, self.association, self.used, self.positions)

@@ -22,12 +22,12 @@ from objslam.graph.calibration.pose_errors import ComparedPoses, averaged, most_
 from objslam.graph.calibration.shared_error_jacobian import linearise
 
 _LOOSE = 1e4
-"""The factor on the noise of the localisation in the graph that predicts it. With a larger factor, the prediction contains
-less of the localisation, and more rounding errors."""
+"""In the graph that predicts the localised poses, their noise is multiplied by this factor, so that they hardly count. With
+a larger factor, the prediction contains less of the localisation, and more rounding errors."""
 _FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
-"""In a long log, the poses are compared at `_FIRST` times, spread evenly, and at the numbers `_LAGS` of keyframes after
-each. Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are
-more exact, and the time grows with the cube of their number."""
+"""In a long log, the compared poses are at `_FIRST` keyframes, evenly spread, and `_LAGS` keyframes after each of them.
+Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are more
+exact, and the time grows with the cube of their number."""
 
 
 def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
@@ -98,13 +98,13 @@ def _white(keyframes: Keyframes) -> Keyframes:
 
 
 def _without_places(settings: Settings) -> Settings:
-    """Return settings in which the localisation hardly tells anything."""
+    """Return settings in which the localisation has hardly any weight."""
     of = settings.localization
     return settings.model_copy(update={"localization": of.model_copy(update={"xy": of.xy * _LOOSE, "yaw": of.yaw * _LOOSE})})
 
 
 def _poses(count: int) -> Ints:
-    """Return the indices of the compared poses of `count`, in increasing order."""
+    """Return the indices of the poses that are compared, among `count` poses, in increasing order."""
     if count <= _FIRST * len(_LAGS):
         return np.arange(count)
     begin = np.linspace(0, count - 1 - max(_LAGS), _FIRST).astype(np.int64)

@@ -1,4 +1,4 @@
-"""What a joint solution that held some shared errors tells about them, and what they do to it.
+"""What a joint solution shows about the shared errors that it held, and what these errors do to it.
 
 One outer step of `self_calibration` is enough to see whether a held error is large. It takes a tenth of the time of a solve.
 """
@@ -24,8 +24,8 @@ def predict(errors: CalibratedMeasurements, association: Association, estimate: 
     """Return the shared errors after one Gauss-Newton step from a solution, with their covariance.
 
     A held error bends the path, so it correlates the residuals, and its effect on the odometry looks like noise. So the step
-    takes the residuals for white noise. Otherwise the step would be only a third as long. The covariance is also that of
-    white noise.
+    takes the residuals for white noise. Otherwise the step would be only a third as long. The covariance is for white noise
+    too.
 
     errors: the estimated and the held errors of the same keyframes and rays, at the noise of the solution. theta: (P,) their
     values in the solution. SolveError if the linear system is not finite.
@@ -41,11 +41,11 @@ def moved_by_held(
     """Return how far the held errors may move landmarks: a factor (N, 3, H), m, of their joint covariance (consider
     covariance; Schmidt 1966).
 
-    The estimated errors take up a part of a held error. Its variance is that of its prior, because real noise is not white,
-    and bends the path as a held error does. The square of a step that `predict` returns is added, as the solution does not
-    follow it. Landmarks outside the graph do not move.
+    The estimated errors take up a part of a held error. A held error has the variance of its prior, because real noise is
+    not white, and bends the path as a held error does. The square of a step that `predict` returns is added, as the solution
+    does not follow it. Landmarks outside the graph do not move.
 
-    held: (P,) which errors the solution held. The other parameters and SolveError are those of `predict`.
+    held: (P,) which errors the solution held. The other parameters and SolveError are as in `predict`.
     """
     state, reduced = _reduced(errors, association, estimate, theta)
     step, _ = _step(reduced, errors, theta)

@@ -88,7 +88,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
 
 
 def _random_walks(stamps: Floats) -> Callable[[Floats], Floats]:
-    """Return random walks with steps at `stamps` (m,), s, as a function of times (n,) with values (n, probes)."""
+    """Return a function of times (n,), s, that gives random walks (n, probes). Their steps are at `stamps` (m,), s."""
     rng = np.random.default_rng(0)
     steps = rng.standard_normal((len(stamps) - 1, _PROBES)) * np.sqrt(np.maximum(np.diff(stamps), 0.0))[:, None]
     walks = np.vstack([np.zeros((1, _PROBES)), np.cumsum(steps, axis=0)])

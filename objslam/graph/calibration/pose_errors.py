@@ -165,10 +165,10 @@ class ComparedPoses:
 
 @dataclass(frozen=True)
 class _Placed:
-    """The likelihood of the places of n poses, and what it leaves of the headings.
+    """The likelihood of the places of n poses, and the headings given these places.
 
-    cost: -2 ln of the likelihood of the places. off: (n,) rad, the headings less what the places tell of them. left: (n, n)
-    the covariance of `off` without the error of the headings themselves.
+    cost: -2 ln of the likelihood of the places. off: (n,) rad, the headings minus the headings that follow from the places.
+    left: (n, n) the covariance of `off` without the error of the headings themselves.
     """
 
     cost: float
@@ -222,8 +222,8 @@ def most_likely(data: ComparedPoses) -> PoseErrors:
 def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasting], tuple[float, Lasting]]:
     """Return the noise and the lasting parts of headings and places, averaged over their posterior if they last.
 
-    A log contains few independent samples of an error that lasts. The most likely values would promise too much. So the
-    variance of the error, and that of its mean over the log, are averaged. The time is the one that gives this mean.
+    A log contains few independent samples of an error that lasts. The most likely values would make the noise too small. So
+    two variances are averaged: of the error, and of its mean over the log. The time is the one that gives this mean.
     """
     duration = float(np.ptp(data.times))
     found = dict[str, tuple[float, Lasting]]()
@@ -255,7 +255,7 @@ def _variance_of_mean(seconds: Floats, duration: float) -> Floats:
 
 
 def _with(model: PoseErrors, name: str, kind: ErrorKind) -> PoseErrors:
-    """Return a model with another error of this name."""
+    """Return a model in which `kind` replaces the error of this name."""
     return replace(model, heading=kind) if name == "heading" else replace(model, place=kind)
 
 
@@ -267,7 +267,8 @@ def _with_lasting(model: PoseErrors, names: tuple[str, ...], share: int, time: i
 
 
 def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
-    """Return the best of a few models with sizes of the errors up to `most`, with the prediction's error of a model."""
+    """Return the best of a few models. Their errors have sizes up to `most`, and their prediction has the error of
+    `model`."""
     sizes = [size for size in _SIZES if size <= most]
     tried = [replace(model, heading=ErrorKind(heading), place=ErrorKind(place)) for heading in sizes for place in sizes]
     return min(tried, key=data.cost)

@@ -2,7 +2,7 @@
 
 An estimate that is 3 standard deviations from its prior is improbable. It is far more probable that the prior is too narrow
 for this robot. If the log determines the error alone, the prior hardly matters. If it determines only the sum of two errors,
-the priors decide how the sum is shared out, and then narrow priors promise too much.
+the priors decide how the sum is shared out, and then narrow priors make the covariance too small.
 """
 
 from dataclasses import replace
@@ -14,14 +14,14 @@ from objslam.core.calibration import Calibration
 
 _CHANCE = 2.0
 """Up to this many standard deviations, the distance from a prior is chance. A larger number widens fewer priors. Beyond it,
-the widening is near that of a Student prior with 4 degrees of freedom. An example is a sum of two errors that is 3 prior
+a prior is widened about as by a Student prior with 4 degrees of freedom. An example is a sum of two errors that is 3 prior
 standard deviations of the first error and 4.5 of the second. The standard deviation of each error grows by a factor of 1.5,
 and by 1.9 with the Student prior."""
 _TOLD = 0.9
 """A direction is determined by the log if its variance is at most this share of its prior variance. With a larger share,
-directions count that the log hardly tells."""
+directions count that the log hardly shows."""
 _LEAST = 1e-12
-"""The least variance of a prior. An error with a smaller one is known."""
+"""The least variance of a prior. An error whose prior has a smaller variance is known."""
 
 
 def with_wider_priors(found: Calibration, mean: Floats, prior: Floats) -> Calibration:

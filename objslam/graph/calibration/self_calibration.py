@@ -165,7 +165,7 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Outer:
-    """The outer problem at parameters theta (P,).
+    """The state of the search for the parameters theta (P,) of shared errors and noise.
 
     gradient: (P,) and information: (P, P) of the likelihood. curvature: (P, P) the information with the prior. step: (P,) of
     Gauss-Newton.
@@ -187,7 +187,7 @@ class _Outer:
 
     @property
     def left(self) -> float:
-        """The decrease of the cost that the step promises."""
+        """The decrease of the cost that the linear system predicts for the step."""
         return float(self.step @ self.curvature @ self.step) / 2
 
     def converged(self, step: Floats, share: float) -> bool:

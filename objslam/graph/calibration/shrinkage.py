@@ -19,9 +19,9 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
     Noise in the rays makes the path jitter. This makes its steps longer than the steps of the odometry. A smaller map makes
     the steps shorter again at the least cost (errors in variables; Neyman and Scott 1948). The motion residuals pull on the
     size. Part of the pull is real, and part comes from the noise of the measured motions. Motions that are predicted from
-    their neighbours do not have this noise, and show the real part. The force is the total pull less the real part, at least
-    0. If the prediction is poor (`_LEAST_TOLD`), the total pull counts. Without odometry, or with a localisation, there is
-    no force. The curvature is the information of all measured lengths about the size.
+    their neighbours do not have this noise, and show the real part. The force is the total pull minus the real part, at
+    least 0. If the prediction is poor (`_LEAST_TOLD`), the total pull counts. Without odometry, or with a localisation,
+    there is no force. The curvature is the information of all measured lengths about the size.
     """
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
     before, after = of.graph.moves
@@ -51,7 +51,7 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
 def _of_tags(of: Linearised) -> float:
     """Return the information that the known sizes of fiducials give about the logarithm of the size of the map.
 
-    A view tells the distance to a fiducial by the directions of four corners, each half a diagonal from the centre.
+    A view gives the distance to a fiducial by the directions of four corners, each half a diagonal from the centre.
     """
     tags = of.measured.tags
     if tags is None:

@@ -64,8 +64,8 @@ class _Rows:
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
     owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m, the standard deviation of the bias. motions:
-    those in the graph. parts: (3, s, 6, 6) their covariances by the noise along, across and in turning. rest: (s, 6, 6) by
-    the noise of `planar`. motion_axes: (3, s, 6) twists along, across and in turning, in the camera frame after the motion.
+    in the graph. parts: (3, s, 6, 6) their covariances by the noise along, across and in turning. rest: (s, 6, 6) by the
+    noise of `planar`. motion_axes: (3, s, 6) twists along, across and in turning, in the camera frame after the motion.
     motion_window: (s,), ray_window: (n,) the window of each motion and ray. The errors in a window may be correlated.
     """
 

@@ -1,6 +1,6 @@
 """Factors for the bearing of a box: the angle between ray and object, or the distance of the object from the ray.
 
-The distance is that of Eq. 1 of Staszak & Belter.
+The distance is the one in Eq. 1 of Staszak & Belter.
 """
 
 import gtsam

@@ -22,8 +22,8 @@ from objslam.graph.factors.noise import huber
 from objslam.graph.variables import X0
 
 _UNTOLD = 10.0
-"""The standard deviation (rad, m) of the parts of a motion that a localisation does not tell, such as its change of height.
-A larger value tells less, and costs digits."""
+"""The standard deviation (rad, m) of the parts of a motion that a localisation does not measure, such as the change of
+height. A larger value constrains less, and costs digits."""
 _LONGEST = 0.9999
 """The largest share of a lasting error that stays from one pose to the next. A larger share ties two poses of nearly the
 same time more closely, and costs digits."""
@@ -116,9 +116,9 @@ def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool |
 def _of_ground(keyframes: Keyframes, settings: Settings) -> tuple[tuple[Parts, Parts], tuple[Parts, Parts]]:
     """Return the standard deviations of tilt (rad) and height (m): for each, (K,) of poses and (K-1,) of motions.
 
-    Uneven ground moves a robot as a lasting error would. If `planar.seconds` is 0, motions tell nothing. Poses that share a
-    measurement share its information. The information of the ground is not shared, so the standard deviations undo the
-    division by `localized_every`.
+    Uneven ground moves a robot as a lasting error would. If `planar.seconds` is 0, motions count for nothing. Poses that
+    share a measurement share its information. The information of the ground is not shared, so the standard deviations undo
+    the division by `localized_every`.
     """
     of, root = settings.planar, np.sqrt(keyframes.localized_every)
     if not of.seconds:

@@ -1,7 +1,7 @@
 """The graph of a joint solve as arrays: its whitened residuals and its sparse Jacobian, without an object for each factor.
 
 A calibration solves the same graph for many values of the shared errors. The construction of a GTSAM graph takes longer than
-its solution, so these solves use arrays. Residuals, noise, losses and derivatives are those of `Measurements.factors`.
+its solution, so these solves use arrays. Residuals, noise, losses and derivatives are from `Measurements.factors`.
 """
 
 from collections.abc import Callable
@@ -42,7 +42,9 @@ class JointRows:
     def jacobian(self) -> sparse.csr_matrix:
         """(M, D) by the landmarks, three columns each, then by the poses, six columns each.
 
-        The rows after the last step of a solve, or after a step that is not taken, need no derivatives."""
+        It is computed at its first use: the rows after the last step of a solve, or after a step that is not taken, do not
+        need it.
+        """
         return self.derive()
 
 

@@ -8,8 +8,8 @@ _NEEDED = ("gtsam", "scipy.linalg", "scipy.sparse")
 """The libraries of every solve. Together, they take longer to load than a small solve takes."""
 
 _UNUSED = ("numpy.f2py", "numpy.testing", "numpy.ma")
-"""Modules that no solve uses. scipy copies all names of numpy, which loads them: a compiler of Fortran, 0.06 s, unittest,
-0.02 s, and masked arrays, 0.01 s."""
+"""Modules that no solve uses, but that scipy loads, because it copies all names of numpy: a compiler of Fortran (0.06 s),
+unittest (0.02 s) and masked arrays (0.01 s)."""
 
 
 def load_libraries() -> None:

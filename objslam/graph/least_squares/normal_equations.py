@@ -41,7 +41,8 @@ class NormalEquations:
         return found
 
     def late(self, columns: Ints, most: int) -> Ints:
-        """Return those of `columns` (n,) that are among the last `most` eliminated columns. `last_block` takes them."""
+        """Return the columns, among `columns` (n,), that are among the last `most` eliminated columns. `last_block` takes
+        them."""
         straight = np.arange(len(self.order))
         if not all(np.array_equal(p, straight) for p in (self.factored.perm_c, self.factored.perm_r)):
             return columns[:0]

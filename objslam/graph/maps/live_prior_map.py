@@ -1,6 +1,6 @@
 """Tie a growing graph to an older map: the frame F of the graph in the map, and the objects that both have.
 
-The variables and factors are those of `prior_map`. The graph keeps its own frame. F tells where it is in the map.
+The variables and factors are as in `prior_map`. The graph keeps its own frame. F is its pose in the map.
 """
 
 import gtsam
@@ -25,7 +25,7 @@ def tie_frame(graph: IncrementalGraph, map_T_graph: Floats) -> None:
 def tie_objects(graph: IncrementalGraph, landmarks: Ints, own: Floats, position: Floats, covariance: Floats) -> None:
     """Tie landmarks (n,) to objects of the map with positions (n, 3) m and covariances (n, 3, 3) m^2.
 
-    F must be in the graph. own: (n, 3, 3) m^2, in the frame of the graph: the covariance of those errors that the graph does
+    F must be in the graph. own: (n, 3, 3) m^2, in the frame of the graph: the covariance of the errors that the graph does
     not contain, such as the offsets of boxes.
     """
     frame = map_T_graph(graph)

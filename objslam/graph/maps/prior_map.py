@@ -5,9 +5,9 @@ points. The rays of the drive point to L(j), in the frame of the drive. P(j) = F
 is the sum of the errors that the graph of the drive does not contain, such as the offsets of boxes. If the map has the
 object, its estimate is the prior of P(j).
 
-The registration gives only the start and the matches, so that the map counts once. The objects of a drifted map share errors
-that the map does not tell, and the priors count as independent. So many objects would make the frame look too exact.
-Therefore, the largest error that all objects can share is added to the covariance of the frame.
+The registration gives only the start and the matches, so that the map counts once. The objects of a drifted map share
+errors, but the map does not say which. So the priors count as independent. So many objects would make the frame look too
+exact. Therefore, the largest error that all objects can share is added to the covariance of the frame.
 """
 
 from dataclasses import dataclass
@@ -139,7 +139,7 @@ def _drive_factors(
 def _unknown_to(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, estimate: Estimate, there: Ints, measured: Measurements | None
 ) -> Floats:
-    """Return the covariances (n, 3, 3), m^2, of those errors of the objects `there` that the graph does not contain."""
+    """Return the covariances (n, 3, 3), m^2, of the errors of the objects `there` that the graph does not contain."""
     floor = LEAST**2 * np.eye(3)
     if measured is None:  # `_drive_factors` has the other half. Equal halves condition the linear system best.
         return estimate.covariance[there] / 2 + floor
@@ -191,8 +191,7 @@ def shared_at_most(positions: Floats, covariance: Floats, pivot: Floats) -> Floa
 def _with_doubt(
     spread: Floats, placed: Floats, there: Ints, index: Ints, prior: Floats, doubt: Floats, pivot: Floats
 ) -> Floats:
-    """Return the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m, with the error that all map objects
-    share.
+    """Add the error that all map objects share to the covariances `spread` (n, 3, 3), m^2, of points `placed` (n, 3), m.
 
     doubt: (4, 4) the covariance of this error, from `shared_at_most`. there: (n,) the objects. index: (M,) those with a
     prior. prior: (M, 3, 3) m^2. The more a prior determines a point, the less the shared error moves it.

@@ -16,7 +16,7 @@ from objslam.graph.factors.bearing import EQ1_SIGMA
 from objslam.graph.posterior.marginals import Solved
 
 _VIEW = 1.0
-"""The solid angle (sr) in which a stray ray may lie, about that of a camera. With a larger value, the number of agreeing
+"""The solid angle (sr) in which a stray ray may lie: about the view of a camera. With a larger value, the number of agreeing
 rays counts more, and their noise less."""
 
 

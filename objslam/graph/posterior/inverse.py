@@ -77,7 +77,7 @@ class Inverse:
         return [block[np.ix_(at, at)] if here else next(alone) for at, here in zip(places, in_block, strict=True)]
 
     def _late_block(self, columns: Ints) -> tuple[Ints, Floats]:
-        """Return those of some columns (n,) that are eliminated late, and their block of the inverse."""
+        """Return the columns, among columns (n,), that are eliminated late, and their block of the inverse."""
         key = columns.tobytes()
         if key not in self.late_blocks:
             late = self.normal.late(columns, min(_DENSE, _EACH * len(columns)))

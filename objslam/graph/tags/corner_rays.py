@@ -16,13 +16,13 @@ from objslam.graph.tags.square_fit import Corners, independent
 
 @dataclass(frozen=True)
 class TagCorners:
-    """The T fiducials among N objects, as four landmarks each: the corners. M = N + 3 T landmarks in all.
+    """The T fiducials among N objects. Each fiducial becomes four landmarks, its corners. M = N + 3 T landmarks in all.
 
-    source: (n,) the original ray of each new ray, non-decreasing. corner: (n,) the corner, 0 to 3, of each new ray, -1 for a
-    ray that is not to a corner. association: the landmark of each new ray. The first corner of a fiducial has the number of
-    its object. count: N. object: (T,) the object of each fiducial. landmarks: (T, 4) its corners. shape: (T, 4, 3) the
-    corners at side 1. side: (T,) m, NaN if unknown. first: (V,) the new ray to the first corner of each view of a fiducial;
-    the rays to the other corners follow. tag: (V,) the fiducial of each view.
+    The rays to corners replace the rays to fiducials. source: (n,) the original ray of each ray, non-decreasing. corner:
+    (n,) the corner of each ray, 0 to 3, -1 for a ray that is not to a corner. association: the landmark of each ray. The
+    first corner of a fiducial has the number of its object. count: N. object: (T,) the object of each fiducial. landmarks:
+    (T, 4) its corners. shape: (T, 4, 3) the corners at side 1. side: (T,) m, NaN if unknown. first: (V,) the ray to the
+    first corner in each view of a fiducial. The rays to the other corners follow it. tag: (V,) the fiducial of each view.
     """
 
     source: Ints

@@ -42,7 +42,7 @@ def with_objects(
 
     Args:
         rays: (n,) the new rays. map_T_camera: (P, 4, 4) the solved camera poses.
-        values: the solved values of the graph. covariances: those of its variables.
+        values: the solved values of the graph. covariances: of its variables.
         wider: (M,) the factor on the covariance of each landmark.
         sensitivity: (M, 3, P) of the landmarks by the shared errors of `estimate.calibration`, None without such errors.
         ledger: gets a warning if the graph has no covariances.

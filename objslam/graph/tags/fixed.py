@@ -1,4 +1,4 @@
-"""The rotation and size of fiducials at given camera poses. Their positions are triangulated like those of other objects."""
+"""The rotation and size of fiducials at given camera poses. Their positions are triangulated as for other objects."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from objslam.graph.tags.square_fit import fit, scatter, with_pose_noise
 
 _NOMINAL = 30.0
 """With this many views, half of the scatter beyond the nominal noise counts. A fiducial has seven parameters, so the scatter
-of n views tells a variance with a relative error of about sqrt(7 / n). At 30 views, this is a half. A larger number leaves
+of n views gives a variance with a relative error of about sqrt(7 / n). At 30 views, this is a half. A larger number leaves
 more to the nominal noise."""
 _STEPS = 5
 """The iterations of a fit to all views. It starts at a pose that fits some of the views. More iterations are slower."""

@@ -77,8 +77,8 @@ def fit(seen: Corners, squares: Squares, free: Bools, iterations: int) -> tuple[
     """Return the squares that fit the corners best, near the given ones, by Levenberg-Marquardt with Cauchy's loss.
 
     free: (H,) whether the side is fitted too. Returns the squares, their costs (H,), and the information (H, 7, 7) about
-    each: rotation and position in the frame of the square, then the logarithm of the side. The rows of a fixed side are
-    those of the identity.
+    each: rotation and position in the frame of the square, then the logarithm of the side. For a fixed side, the rows are
+    from an identity matrix.
     """
     count = len(squares.side)
     damping = np.full(count, _DAMPING)
@@ -163,7 +163,7 @@ def scatter(seen: Corners, squares: Squares, free: Bools, covariance: Floats) ->
 
     covariance: (H, 7, 7) the inverse C of the information. The covariance of a fit is C S C, where S is the returned sum
     (cluster-robust; Liang and Zeger 1986). The residuals of a fit are smaller than the errors, most of all in the views that
-    decide it. So the residuals of each view are those of a fit without this view (Mancl and DeRouen 2001).
+    decide it. So the residuals of each view are from a fit without this view (Mancl and DeRouen 2001).
     """
     flat, weighted, residual, _ = _jacobians(seen, squares, free)
     leverage = flat @ covariance[seen.square] @ np.swapaxes(weighted, 1, 2)
@@ -211,8 +211,8 @@ def poses_of_views(seen: Corners, shapes: Floats, iterations: int) -> Squares:
     """Return the two poses of each view of a square of side 1: 2 V squares, the first pose of every view, then the second.
 
     A flat square that is far off, or seen from the front, looks nearly alike in two poses (Schweighofer and Pinz 2006). The
-    first pose is that of the homography between the square and its image. The second pose has the normal on the other side
-    of the line of sight. Both are then fitted to the corners of their view. shapes: (V, 4, 3).
+    first pose is from the homography between the square and its image. The second pose has the normal on the other side of
+    the line of sight. Both are then fitted to the corners of their view. shapes: (V, 4, 3).
     """
     middle = _middle(seen)
     axes = np.concatenate([tangent_basis(middle), middle[:, :, None]], axis=2)

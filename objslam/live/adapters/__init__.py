@@ -97,8 +97,8 @@ class LiveSource:
     """A named source of `objslam live`.
 
     says: its description in `--help`. opens: the function that makes its `Feed`. options: the class of its options, which
-    `LiveOptions` inherits. None if it has no options. recorded: returns whether its messages are now those of a recording.
-    Such messages may be read as fast as they are mapped (--speed 0). None if the messages are never those of a recording.
+    `LiveOptions` inherits. None if it has no options. recorded: returns whether its messages are now from a recording. Such
+    messages may be read as fast as they are mapped (--speed 0). None if the messages are never from a recording.
     """
 
     says: str

@@ -119,7 +119,7 @@ class DdsAdapter:
                 return
 
     def _kept(self) -> set[str]:
-        """Return the topics that are read, and those that the user chose."""
+        """Return the topics that are read, and the topics that the user chose."""
         return {topic for topic, _ in self._readers}.union(*self.choice.chosen.names.values())
 
     def _open(self, age: float) -> list[_Reader]:

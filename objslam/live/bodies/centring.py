@@ -77,7 +77,7 @@ class BodyCentring(Rounds[BodiesMessage, BodiesMessage]):
         self._rays: dict[int, int] = {}  # How many rays each landmark had in its last round, by id.
 
     def _request(self) -> CentringRequest | None:
-        """Return the landmarks that may have a body. If there are too many, those that have grown most."""
+        """Return the landmarks that may have a body. If there are too many, the ones that have grown most."""
         m = self._mapper.state
         landmarks = m.landmarks
         if not any(camera.sees_size for camera in m.cameras):

@@ -38,7 +38,8 @@ class _Fitted:
 class BodyEstimator:
     """Keeps the last body of each landmark, and starts a new fit when bodies are due and the process has rested.
 
-    These bodies only describe the map of a snapshot. The map itself does not depend on them, but on those of `BodyCentring`.
+    These bodies only describe the map of a snapshot. The map itself does not depend on them, but on the bodies of
+    `BodyCentring`.
     """
 
     def __init__(self) -> None:
@@ -72,7 +73,7 @@ class BodyEstimator:
         """Return a resolved object with its body. turned: whether its bearings point to the centre of a body.
 
         If the landmark has moved since the fit, the body has moved with it, unless the landmark has moved to the centre of
-        its body. The covariance is that of the fit.
+        its body. The covariance comes from the fit.
         """
         fitted = self._fitted.get(o.id)
         if fitted is None or fitted.body is None or o.status != "ok":
@@ -95,7 +96,7 @@ class BodyEstimator:
             self._fitted[j] = replace(fitted, body=body)
 
     def _due(self, m: MapState, covariances: dict[int, Floats]) -> Ints:
-        """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, those that have grown
+        """Return the rows of the landmarks to fit, in the order of their ids. If too many are due, the ones that have grown
         most are fitted."""
         landmarks = m.landmarks
         self._fitted = {j: self._fitted[j] for j in landmarks.id.tolist() if j in self._fitted}

@@ -43,7 +43,7 @@ class BodyRequest:
 
 
 def most_grown(m: MapState, rows: Ints, before: Ints) -> Ints:
-    """Return the rows of the landmarks to fit, in the order of their ids. If there are too many, return those whose rays
+    """Return the rows of the landmarks to fit, in the order of their ids. If there are too many, return the ones whose rays
     have grown most.
 
     rows: (n,) of the landmarks that are due. before: (n,) the numbers of their rays in their last fits, 0 without one.
@@ -53,7 +53,8 @@ def most_grown(m: MapState, rows: Ints, before: Ints) -> Ints:
 
 
 def body_request(m: MapState, rows: Ints, covariances: Floats) -> BodyRequest:
-    """Return a request for the landmarks in rows (n,), in the order of their ids. covariances: (n, 3, 3) m^2, of theirs."""
+    """Return a request for the landmarks in rows (n,), in the order of their ids. covariances: (n, 3, 3) m^2, of these
+    landmarks."""
     ids = m.landmarks.id[rows]
     boxes = _some_boxes(m, ids)
     frames, index = np.unique(np.searchsorted(m.keyframes.id, m.rays.keyframe[boxes]), return_inverse=True)

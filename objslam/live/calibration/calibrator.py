@@ -68,7 +68,7 @@ def observed(found: Calibration, now: Floats) -> Calibration:
 
 
 def _without_late(errors: SharedErrors, theta: Floats, known: Container[str]) -> tuple[SharedErrors, Floats]:
-    """Return shared errors and their values (P,) without those of the kinds `_LATE` that are not in `known`."""
+    """Return shared errors and their values (P,). Errors of the kinds `_LATE` are left out, unless they are in `known`."""
     some = np.array([kind(name) not in _LATE or name in known for name in errors.names], dtype=bool)
     names = tuple(name for name, kept in zip(errors.names, some.tolist(), strict=True) if kept)
     return replace(errors, names=names, mean=errors.mean[some], prior=errors.prior[np.ix_(some, some)]), theta[some]
@@ -88,7 +88,7 @@ class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
         name: str,
         patient: bool,
     ) -> None:
-        """Prepare for a session. name: the name of the log. The other arguments are those of `Rounds`."""
+        """Prepare for a session. name: the name of the log. The other arguments are as in `Rounds`."""
         super().__init__(mapper, record, settings.live.calibrate_from, patient)
         self._counters, self._name = counters, name
 

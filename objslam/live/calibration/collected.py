@@ -144,7 +144,7 @@ def _mount(keyframes: Keyframes, camera: int) -> Trajectory | None:
 def _owners(m: MapState) -> tuple[Ints, Ints, Floats]:
     """Return the object id (R,) of each ray, -1 if it has none, and labels (N,) and positions (N, 3) indexed by object id.
 
-    A landmark keeps its id. A track with enough rays gets an id above those of the landmarks.
+    A landmark keeps its id. A track with enough rays gets an id above the ids of the landmarks.
     """
     landmarks, rays = m.landmarks, m.rays
     owner = rays.owner.copy()

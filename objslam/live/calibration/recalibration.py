@@ -98,8 +98,8 @@ def _remeasure_rays(m: MapState, before: dict[str, float]) -> bool:
 def _carried(m: MapState, drifted: Floats) -> Floats:
     """Return the drift (N + T, 6, 6) of landmarks and tracks on the corrected course.
 
-    drifted: (K, 6, 6) the drift of the keyframes before the correction. An object gets the new drift of the first keyframe
-    whose old heading drift was at least that of the object.
+    drifted: (K, 6, 6) the drift of the keyframes before the correction. By its old heading drift, an object is matched to
+    the first keyframe that had drifted at least as far. It gets the new drift of this keyframe.
     """
     order = m.time_order()
     passed = np.maximum.accumulate(drifted[order][:, 2, 2])

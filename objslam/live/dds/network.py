@@ -106,9 +106,9 @@ def _leave(entity: Any) -> None:
     """Leave a domain with all its entities, before the interpreter ends.
 
     Threads of the DDS library release Python's types. A thread that asks for the interpreter while it ends is stopped for
-    ever. The library would wait for this thread, and so the process would never end. Here the thread of `_listen` still
-    runs. Later nobody would read the log of the library, and the library waits if the pipe is full, as beside a flood of
-    malformed packets.
+    ever. The library would wait for this thread, and so the process would never end. The domain is left while the thread of
+    `_listen` still reads the log of the library. Later nobody would read it. A flood of malformed packets would fill the
+    pipe, and the library would wait.
     """
     entity.__del__()  # The binding has no other name for it. A second call does nothing.
 

@@ -35,7 +35,7 @@ class Publications:
     """
 
     def __init__(self, kept: Callable[[], Collection[str]]) -> None:
-        """kept: returns the topics that never give way, such as those that the user chose."""
+        """kept: returns the topics that never give way, such as topics that the user chose."""
         self._kept, self._found = kept, dict[int, Publication]()
         self._gone: dict[int, Kind] = {}  # The kinds of the last publishers that went: their messages may still wait.
         self._count: Counter[str] = Counter()

@@ -74,7 +74,7 @@ class Course:
         self._newest = -np.inf
 
     def add_odometry(self, stamp: float, pose: Floats, keyframes: KeyframeTable) -> None:
-        """Append a pose (4, 4) of the odometry at a stamp, s, later than all others. keyframes: those of the map so far."""
+        """Append a pose (4, 4) of the odometry at a stamp, s, later than all others. keyframes: of the map so far."""
         self.driven.append(stamp, pose, keyframes.stamp)
         self.odometry.append(stamp, self._correction.correct(stamp, pose))
         self._localized_by_then = self.localization.newest

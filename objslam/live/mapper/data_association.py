@@ -23,7 +23,7 @@ def associate(
 ) -> LandmarkUpdate:
     """Assign the rays of the newest keyframe to landmarks and tracks, and add the rays of landmarks to the graph.
 
-    rays: those of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of
+    rays: of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of
     `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)

@@ -136,7 +136,7 @@ def box_centres(
     """Return vectors (n, 3), m, from landmarks to points on the rays through the centres of their boxes, and their noise
     (n,), m.
 
-    The noise is that of the bodies. A landmark without a body has the vector 0. rows: (n,) of the landmarks. camera: (n,)
+    The noise comes from the bodies. A landmark without a body has the vector 0. rows: (n,) of the landmarks. camera: (n,)
     the number of the camera of each. map_T_camera: (n, 4, 4).
     """
     beside, sigma = np.zeros((len(rows), 3)), np.zeros(len(rows))

@@ -30,8 +30,8 @@ _TRACKS = 4096  # The detector tracks whose landmark is stored. A larger number 
 class LandmarkUpdate:
     """The observations of the newest keyframe, which are in the graph already.
 
-    rays: all rays of its frame, those of bodies turned to their centres. matched: (m,) the indices of rays with a landmark.
-    rows: (m,) the rows of their landmarks in the table. tracks: all tracks with a ray of the frame.
+    rays: all rays of its frame. Rays to bodies are turned to their centres. matched: (m,) the indices of rays with a
+    landmark. rows: (m,) the rows of their landmarks in the table. tracks: all tracks with a ray of the frame.
     """
 
     rays: FrameRays

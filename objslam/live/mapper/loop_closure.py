@@ -92,7 +92,8 @@ def _together(m: MapState) -> Bools:
 
 
 def _close(m: MapState, now: Ints, old: Ints, correction: Floats) -> None:
-    """Merge the landmarks in rows `now` (P,) into those in rows `old` (P,). A large correction (4, 4) bends the path."""
+    """Merge the landmarks in rows `now` (P,) into the landmarks in rows `old` (P,). A large correction (4, 4) bends the
+    path."""
     turn = abs(np.arctan2(correction[1, 0], correction[0, 0]))
     pivot = m.landmarks.position[now].mean(axis=0)
     shift = np.linalg.norm((correction[:3, :3] @ pivot + correction[:3, 3] - pivot)[:2])
@@ -112,7 +113,7 @@ def _merge(m: MapState, now: Ints, old: Ints, rebuild: bool = True) -> None:
 
 
 def _expect_around(m: MapState, now: Ints, old: Ints) -> None:
-    """Let the landmarks around those in rows `old` (P,) match rays again, although they are long unseen.
+    """Let the landmarks around the rows `old` (P,) match rays again, although they are long unseen.
 
     They get the drift of the first seen landmark in rows `now` (P,), as if they had been last seen with it.
     """

@@ -208,7 +208,7 @@ def _farther_than_drift(m: MapState, j: int, fit: PointFit, inliers: Ints, outli
 
 
 def _separate(m: MapState, second: _SecondObject) -> None:
-    """Make a new landmark from those outliers of a landmark that show another object."""
+    """Make a new landmark from the outliers of a landmark that show another object."""
     k = m.keyframes
     rows = np.searchsorted(k.id, m.rays.keyframe[second.rays])
     last = rows[k.stamp[rows].argmax()]

@@ -86,7 +86,7 @@ class Mapper:
         before = m.newest_before(stamp)
         placed = m.course.place(stamp, m.keyframes, before)
         if placed is None:
-            m.counters.drop_frame(frame, "frames off the path, or in a gap of it")
+            m.counters.drop_frame(frame, "frames without a pose: the path has a gap there, or does not reach them")
             return None
         view = self._extractor.extract(frame, stamp)
         m.frames[view.camera] += 1

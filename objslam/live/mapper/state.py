@@ -197,7 +197,7 @@ class MapState:
     def to_centres(self, at: Ints) -> tuple[Floats, Floats]:
         """Return what to add (n, 3) to the directions of the rays in rows (n,), so that they point to the centres of bodies.
 
-        The second array (n,) is its noise, rad. The poses are those at the last refresh of the graph.
+        The second array (n,) is its noise, rad. The poses are from the last refresh of the graph.
         """
         ids, index = np.unique(self.rays.keyframe[at], return_inverse=True)
         rows, poses = self.rows_of(self.rays.owner[at]), self.graph.poses(ids)[index]

@@ -50,7 +50,7 @@ class Cameras:
     """Pushes each camera when its calibration and mount are known, then its boxes in order, and mounts that change.
 
     base: returns the name of the base frame. calibrations: from a file, instead of CameraInfo. rectified: whether boxes are
-    in rectified images, None to tell it by the topic names. mounts: from a file, instead of tf.
+    in rectified images. None decides by the names of the topics. mounts: from a file, instead of tf.
     """
 
     def __init__(

@@ -67,7 +67,7 @@ class TopicChoice:
 
 
 def _colour(names: list[str], offered: Mapping[str, str]) -> list[str]:
-    """Return the topics of colour images: first those with a CameraInfo beside them, and uncompressed before compressed."""
+    """Return the topics of colour images: first topics with a CameraInfo beside them, and uncompressed before compressed."""
     infos = [name for name in names if offered[name] == CAMERA_INFO]
     images = [n for n in names if offered[n] in IMAGES and not any(word in n.lower() for word in _NO_COLOUR)]
     near = {name: max((closeness(info, name) for info in infos), default=0) for name in images}

@@ -24,10 +24,11 @@ class Clock:
     _shifts: list[float] = field(default_factory=list)  # Earlier values of `shift`, the newest last.
 
     def step(self, stamp: float) -> tuple[float | None, bool]:
-        """Return a new pose's stamp in session time, None if the pose is refused, and whether the clock was set back.
+        """Return two values: the session time of a new pose, or None if the pose is refused, and whether the clock was set
+        back.
 
-        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too.
-        `stamp_leaps` keeps out single wrong stamps that are ahead.
+        A pose that is late or repeated is refused. The first poses after the clock was set back look late, too. A single
+        wrong stamp ahead of the others does not get here: `stamp_leaps` refuses it.
         """
         time = stamp + self.shift
         if time > self.newest:

@@ -126,7 +126,7 @@ def _may_have_several(solution: Solution, settings: Settings) -> bool:
 def _whole_path(log: Log, stamps: Floats, map_T_base: Floats) -> Trajectory:
     """Return the recorded path at its full rate, corrected by keyframes at `stamps` (K,) with map_T_base (K, 4, 4).
 
-    The path between keyframes is that of the odometry, if there is one, because the localisation jitters.
+    Between keyframes, the path follows the odometry, if there is one, because the localisation jitters.
     """
     way = log.odometry or log.localization
     assert way is not None  # There is no keyframe without a path.

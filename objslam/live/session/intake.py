@@ -185,7 +185,7 @@ class Intake:
             return self._take(path, given, checked, alone=True)
 
     def _take(self, stream: str, stamp: float, message: _Checked, alone: bool = False) -> bool:
-        """Deliver a message of a stream, and those that it confirms, and return whether it is accepted. stamp: s.
+        """Deliver a message of a stream and the messages that it confirms. Return whether it is accepted. stamp: s.
 
         The path that sets the clock confirms the stamps of all other streams. The stamps of this path are confirmed only by
         its own next poses. alone: as in `StampLeaps.take`.

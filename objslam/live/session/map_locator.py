@@ -25,10 +25,10 @@ from objslam.live.session.landmark_description import describe_landmark
 from objslam.mapping.localization import PriorMap, at_ray_points, moved_object
 
 _EVERY, _AT = 10, 9
-"""The period of the search in keyframes, and the keyframe in each period. A longer period finds the map later. The keyframe
-differs from those of the maintenance, to spread the delay."""
+"""A search is due every `_EVERY` keyframes, at the keyframe `_AT` of each period. A longer period finds the map later. `_AT`
+differs from the keyframes of the maintenance, so that the two do not delay the same frame."""
 _MOST = 40
-"""A search compares at most this many landmarks, those seen last. A larger number delays the next frame for longer: 40
+"""A search compares at most this many landmarks: the ones seen last. A larger number delays the next frame for longer: 40
 landmarks in a map of 1,000 objects take 0.1 s."""
 _GROWTH = 1.2
 """A search with the same landmarks is repeated when the number of keyframes has grown by this factor, because the landmarks

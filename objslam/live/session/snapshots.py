@@ -119,8 +119,8 @@ def _path(m: MapState) -> Trajectory:
 
 
 def _map_T_odom(m: MapState) -> Floats | None:
-    """Return `Snapshot.map_T_odom` (4, 4) for the odometry as it was received, because tf has this one. None in a gap of the
-    odometry."""
+    """Return `Snapshot.map_T_odom` (4, 4) for the odometry as it was received, because tf has the received odometry. None in
+    a gap of the odometry."""
     k, driven = m.keyframes, m.course.driven
     if not len(k) or not len(driven):
         return None

@@ -29,7 +29,8 @@ T = TypeVar("T")
 
 @dataclass
 class _Stream(Generic[T]):
-    """The newest stamp, the last steps between stamps, s, and the messages that wait, with their stamps, as they came."""
+    """One stream of messages: its newest stamp, the last steps (s) between its stamps, and the waiting messages with their
+    stamps."""
 
     last: float | None = None
     steps: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
@@ -85,11 +86,11 @@ class StampLeaps(Generic[T]):
         self._streams: dict[str, _Stream[T]] = {}
 
     def take(self, stream: str, stamp: float, clock: float, message: T, alone: bool) -> tuple[list[T], list[T]]:
-        """Take the next message of a stream. Return the messages that pass, in order, and those that are refuted.
+        """Take the next message of a stream. Return the messages that pass, in order, and the refuted messages.
 
-        clock: the newest stamp, s, of another stream, which confirms stamps that are not far ahead of it. -inf if there is
-        none. alone: whether the stream may confirm a leap beyond `_APART` itself, as a path may. If not, such a leap waits
-        for the clock.
+        clock: the newest stamp, s, of another stream, -inf if there is none. It confirms stamps that are not far ahead of
+        it. alone: whether the stream itself may confirm a leap of more than `_APART`, as a path may. If not, such a leap
+        waits for the clock.
         """
         s = self._streams.setdefault(stream, _Stream())
         before = s.last

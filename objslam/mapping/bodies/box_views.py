@@ -62,8 +62,8 @@ class BoxViews:
         return replace(self, rays=self.rays.take(boxes), body=self.body[boxes], bound=self.bound[boxes])
 
     def contacts(self, touched: Floats) -> Floats:
-        """Return where (B, 4), px, the edges touch the images of bodies. touched: (B, 4, P, 3) m, the points where they may
-        touch."""
+        """Return the points (B, 4), px, where edges touch the images of bodies. touched: (B, 4, P, 3) m, the points of the
+        bodies that may be there."""
         found, poses = np.zeros((len(self.body), 4)), self.poses
         for i in np.unique(self.camera):
             mine = np.flatnonzero(self.camera == i)
@@ -71,8 +71,11 @@ class BoxViews:
         return found
 
     def edges(self, touched: Floats | None = None) -> BoxEdges:
-        """Return the planes through the edges of the boxes. touched: (B, 4, P, 3) m, the points where the bodies may touch
-        the planes. Without them, each plane is the one at the middle of its edge."""
+        """Return the planes through the edges of the boxes.
+
+        touched: (B, 4, P, 3) m, the points where the bodies may touch the planes. Without them, each plane is taken at the
+        middle of its edge.
+        """
         return self._at_middles if touched is None else self._edges(touched)
 
     @cached_property

@@ -1,7 +1,8 @@
 """Bearings and ranges to the centres of bodies, for the joint mode.
 
 The centre of a box is not the image of the centre of the object. For large objects nearby, this error bends the estimated
-path. A range ends on the surface of the object. A body that was seen from many sides tells how far its centre is behind.
+path. A range ends on the surface of the object. A body that was seen from many sides shows how far its centre is behind its
+surface.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     """Return the estimate from bearings and ranges to the centres of bodies, and the shift of the rays.
 
     A ray that the solve rejects is not shifted. If an object would be lost, its bearings stay at the centres of its boxes.
-    If an object would be lost even so, or if no body shifts its bearings or ranges enough, the estimate does not change and
+    If an object would still be lost, or if no body shifts its bearings or ranges enough, the estimate does not change and
     the second value is None. The bodies are not fitted again at the new poses. In 24 simulated drives between large objects,
     this would change the path by 1 mm, and the objects by less than their noise.
     """
@@ -96,7 +97,7 @@ def _solve(
 ) -> Estimate:
     """Solve poses and objects once more, from the estimate, with the measured rays turned by `shift`.
 
-    keyframes, rays: those of the state, with the shared errors of the estimate removed.
+    keyframes, rays: from the state, with the shared errors of the estimate removed.
     """
     from objslam.graph import batch_solver
 

@@ -42,9 +42,9 @@ off by 1 to 4 % of half the height (tools/bench_shapes.py). A larger share makes
 def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> Solution:
     """Return a solution with a body for each object whose boxes show one. The points and their covariances do not change.
 
-    The covariance of a centre contains the noise of the boxes and the errors that they share, also those of a thing that has
-    not exactly the shape of its body. The covariance of the point may be larger than the noise of its rays explains, because
-    solved poses have noise, or because errors of given poses last. This excess is added too.
+    The covariance of a centre contains the noise of the boxes, and the errors that they share: also the error of a thing
+    that has not exactly the shape of its body. The covariance of the point may be larger than the noise of its rays
+    explains, because solved poses have noise, or because errors of given poses last. This excess is added too.
     """
     if not settings.bodies.use or up_axis(solution.keyframes) != "z":  # Bodies stand upright along z.
         return solution
@@ -166,8 +166,8 @@ def _behind_things(found: Bodies, views: _Views) -> Bools:
 def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
     """Return the noise (B,), rad, that hidden edges of boxes add to the directions to the centres of bodies.
 
-    The centre of a box is the mean of two edges. If one is hidden, the other tells the centre, with the noise of one edge
-    and of half the size of the body. If both are hidden, the centre may be anywhere in the box.
+    The centre of a box is the mean of two edges. If one is hidden, the centre comes from the other edge and half the size of
+    the body, with the noise of both. If both are hidden, the centre may be anywhere in the box.
     """
     edges, rays, half = boxes.edges(), boxes.rays, found.axes[:, [3, 5]]
     half = half * np.sqrt(found.covariance[:, [3, 6], [3, 6]])  # From the noise of logarithms.
@@ -179,7 +179,7 @@ def _noise_of_hidden(found: Bodies, boxes: BoxViews) -> Floats:
 
 
 def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Floats:
-    """Return what the covariance of each point (n, 3, 3) has beyond the noise of its rays at known poses, m^2.
+    """Return the part of each point's covariance (n, 3, 3), m^2, that the noise of its rays does not explain.
 
     At given poses, this is `error_covariance`: the errors that were added to the covariance. The rest of the covariance is
     no error of the body. It is wider because the rays of a large thing miss the point. It also contains a bias of Eq. 1
@@ -222,9 +222,9 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
 
 
 def repeated_error(share: float, half: Floats) -> float:
-    """Return the standard deviation, m, of the error of a centre that repeats from all sides, along each axis.
+    """Return the standard deviation, m, along each axis, of the error of a body's centre that repeats from all sides.
 
-    A detector may draw all boxes of an object too large or beside it, and the object has another shape than its body. share:
-    of `Bodies.share`, that of shifts. half: (3,) half axes, m.
+    Such an error has two causes: a detector draws all boxes too large or to one side, or the object has another shape than
+    its body. share: the part of `Bodies.share` for shifts. half: (3,) half axes, m.
     """
     return float(max(share, _UNLIKE) * half.mean())

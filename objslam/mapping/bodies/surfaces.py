@@ -1,7 +1,5 @@
-"""How far the centres of bodies are behind the surfaces on which ranges end.
-
-The widths of boxes tell a share that all things have in common. A body that was seen from many sides tells its own.
-"""
+"""How far the centres of bodies are behind the surfaces on which ranges end. The widths of boxes give one share for all
+things. A body that was seen from many sides gives its own share."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ bodies correct the ranges of fewer logs."""
 def range_shift(found: Bodies, views: BoxViews, ray: Ints, count: int, settings: Settings, common: float) -> RangeShift:
     """Return the corrections of `count` rays that make their ranges end at the centres of bodies.
 
-    Two estimates tell how far the centre is behind the surface: the body, and the width of the box. They are weighted by
+    Two estimates show how far the centre is behind the surface: the body, and the width of the box. They are weighted by
     their variances, and all rays of an object have the same weights. If `depth.centre` is 0, ranges end at centres. ray:
     (B,) the ray of each box. common: the standard deviation of the share that all things of a log have in common, 0 if this
     share is estimated.

@@ -134,7 +134,7 @@ class _Measured:
 def agreement(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] | None = None) -> Agreement | None:
     """Return how well the boxes of a log agree. `log` has the frames of the part. None if no frame has a pose.
 
-    window: for each camera, the windows of its frames, if they are not those of the part.
+    window: for each camera, the windows of its frames, if they differ from the windows of the part.
     """
     return next(agreements(part, (log,), settings, window))
 

@@ -30,9 +30,9 @@ _LOOSE = 9.0
 robots have up to 8.1. If the multiple is larger, the fault is often not in the odometry: a camera that turns on the robot
 looks the same. A larger value gives fewer warnings."""
 _NAMED = 3.0
-"""From this multiple of the noise in the settings on, an assessment names the noise of the odometry. Nine tenths of its
-variance are then not in the settings. The cause may be wheels that slip, or a path that was bent to make one object of two
-things. A larger value names it less often."""
+"""An assessment names the noise of the odometry if it is at least this multiple of the settings. Nine tenths of its variance
+are then not in the settings. The cause may be wheels that slip, or a path that was bent to make one object of two things. A
+larger value names it less often."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
 gives more warnings."""
@@ -52,13 +52,13 @@ class Evidence:
     boxes that miss their object so far that they do not count. misses: the median residual as a multiple of its expected
     noise, NaN without objects. odometry_frame: whether the map has the frame of the odometry. fixed: whether the run kept
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
-    frames, late: the camera frames of a log or session, and those that a live session dropped because they came too late.
-    journal: the file with all messages of a live session, "" without one. doubted: the labels that may name one object or
-    several. unsettled: the objects that the last round of association still changed. uncalibrated: whether the estimation of
-    the shared errors failed. odometry: the largest factor on a noise of the odometry that the log shows. scale: the standard
-    deviation of the scale of the odometry, as a share. None if the log tells the scale. part: the limits of a log that is a
-    part of a recording, as in `Log`. odometry_unused: whether the mode was left to the log, and a `fixed` run did not use
-    its odometry.
+    frames, late: the camera frames of a log or session, and the frames that a live session dropped because they came too
+    late. journal: the file with all messages of a live session, "" without one. doubted: the labels that may name one object
+    or several. unsettled: the objects that the last round of association still changed. uncalibrated: whether the estimation
+    of the shared errors failed. odometry: the largest factor on a noise of the odometry that the log shows. scale: the
+    standard deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log
+    that is a part of a recording, as in `Log`. odometry_unused: whether the mode was left to the log, and a `fixed` run did
+    not use its odometry.
     """
 
     resolved: int
@@ -164,8 +164,8 @@ def _about(e: Evidence) -> list[str]:
         )
     if e.scale is not None:
         found.append(
-            "The log does not tell the scale of the odometry: all distances may be too long or too short by one factor, "
-            f"with a sigma of {100 * e.scale:.2g} %. Depths tell it, or fiducials of known size."
+            "The log does not show the scale of the odometry: all distances may be too long or too short by one factor, "
+            f"with a sigma of {100 * e.scale:.2g} %. Depths or fiducials of known size would show it."
         )
     return found
 
@@ -187,7 +187,7 @@ def _check(e: Evidence) -> list[str]:
     found = []
     if e.fixed and e.odometry_frame:
         # Drift splits an object into parts, and the rays of each part fit it well. So the residuals do not show drift.
-        found.append("The poses are those of the odometry, so its drift is in the map: --mode joint takes it out.")
+        found.append("The poses are those of the odometry, so the map has its drift: --mode joint corrects it.")
     errors = [name for name in e.findings if name != NOISIER]
     if NOISIER in e.findings:
         found.append("The poses or depths are far noisier than the settings say, and the warnings say how noisy.")
@@ -196,7 +196,7 @@ def _check(e: Evidence) -> list[str]:
     elif not e.findings and e.misses > _MISSES:
         found.append(
             f"The rays miss their objects {e.misses:.1f} times as far as the settings say, so poses, clock, calibration or "
-            "boxes are worse than that."
+            "boxes are worse than the settings."
         )
     elif e.odometry >= _LOOSE:
         found.append(

@@ -50,8 +50,9 @@ def check_depth_axis(
         remedy = "give them as the sensor measured them"
     return Finding(
         "depth axis",
-        f"the depths of boxes look like {what}: at the edge of the image they are too {wrong}, by the cosine of the angle "
-        f"to the power of {abs(power):.2f} +- {sigma:.2f}. A depth is the distance along the optical axis; {remedy}",
+        f"the depths of boxes look like {what}: near the edge of the image they are too {wrong}, by the cosine of the "
+        f"angle from the optical axis (to the power {abs(power):.2f} +- {sigma:.2f}). A depth is the distance along the "
+        f"optical axis; {remedy}",
         spoils=False,
     )
 

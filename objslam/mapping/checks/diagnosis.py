@@ -57,8 +57,8 @@ the run does not estimate. A larger value reports fewer errors."""
 class Diagnosis:
     """The faults of a log. trials: the tried hypotheses. The first trial is the unchanged log. Empty if none were tried.
 
-    errors: small errors of the calibration that a run does not correct, None if there are none. jumps: those of the
-    localisation, which a run takes out, None if there are none.
+    errors: small errors of the calibration that a run does not correct, None if there are none. jumps: of the localisation.
+    A run takes them out. None if there are none.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -169,7 +169,7 @@ def _misfits(part: Part, found: Agreement | None, settings: Settings) -> bool:
 def _corrected(part: Part, found: Agreement | None, settings: Settings) -> tuple[float, str]:
     """Return the score of a log without small errors, and the errors, in words, that are too large for a usual camera.
 
-    The small errors are those that a run in this mode estimates from given poses. If there are none, the score is 0.
+    The small errors are the errors that a run in this mode estimates from given poses. If there are none, the score is 0.
     """
     estimated = _estimated(part, settings)
     if found is None or part.drifts or settings.mode == "joint" or not estimated:

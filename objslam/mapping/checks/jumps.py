@@ -39,7 +39,7 @@ def corrected_jumps(jumps: Jumps) -> Finding:
     return Finding(
         JUMPS,
         f"the localisation jumps {len(jumps)} time{'' if len(jumps) == 1 else 's'} (first by {way:.2f} m and "
-        f"{angle:.0f} deg at stamp {jumps.stamps[0]:.3f}): the run moves the poses on both sides together. It does not know "
+        f"{angle:.0f} deg at stamp {jumps.stamps[0]:.3f}): the run joins the path at each jump. It does not know "
         f"which side was right, so the whole map may be off by {jumps.sigma:.2f} m, and its sigmas contain this",
         spoils=False,
     )

@@ -22,8 +22,8 @@ _FEWEST = 4
 _LEAST_ANGLE = np.radians(4.0)
 """The least angle between the rays of a point (rad). Rays with a smaller angle agree even if the input is wrong."""
 _NARROW = 0.9
-"""The remaining rays of a label show nothing if this share of them lies within `_LEAST_ANGLE` of their mean direction. With
-a smaller share, false rays are excused too."""
+"""The remaining rays of a label are nearly parallel, and so neither meet nor miss, if this share of them lies within
+`_LEAST_ANGLE` of their mean direction. With a smaller share, false rays count as nearly parallel too."""
 _NEAREST = 0.25
 """The least distance (m) of a point from a camera. Rays of a turning camera meet in the camera itself. A larger distance
 loses points near a camera."""
@@ -52,10 +52,9 @@ class Meeting:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The rays of L labels, a label a row. number: (L, N) the index of each ray. real: (L, N), False for an empty place.
-
-    origins, directions: (L, N, 3) m from the middle (L, 3) of the origins. tolerance: (L, N) rad. place: m.
-    """
+    """The rays of L labels, one label a row. number: (L, N) the index of each ray. real: (L, N), False for an empty place.
+    origins, directions: (L, N, 3) m from the middle (L, 3) of the origins. tolerance: (L, N) rad. place: m, as in
+    `fit_points`."""
 
     number: Ints
     real: Bools
@@ -103,10 +102,10 @@ class _Rows:
 
 
 def fit_points(origins: Floats, directions: Floats, tolerance: Floats, place: float, label: Ints, seed: int) -> Meeting:
-    """Fit points to the rays of each label.
+    """Fit points to the rays of each label. The labels do not affect each other.
 
-    tolerance: (R,) rad. place: m. A ray fits up to its tolerance times the distance, plus place, added in quadrature. The
-    labels do not affect each other.
+    tolerance: (R,) rad. place: m. A ray fits a point within its tolerance times the distance, plus `place`, added in
+    quadrature.
     """
     rng = np.random.default_rng(seed)
     rays = (origins, directions, tolerance)
@@ -167,7 +166,7 @@ def _tables(left: Ints, owner: Ints, rays: tuple[Floats, Floats, Floats], place:
 
 
 def _tried(rays: Ints) -> Ints:
-    """Return the numbers of tried pairs of labels, from their numbers of rays."""
+    """Return how many pairs of rays are tried for each label. rays: the number of rays of each label."""
     return np.minimum(_PAIRS, rays * (rays - 1) // 2)
 
 
@@ -198,7 +197,7 @@ def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
 
 
 def _nearly_parallel(rows: _Rows) -> Bools:
-    """Return the labels (L,) whose rays are so close to parallel that they tell no point."""
+    """Return the labels (L,) whose rays are so close to parallel that they do not determine a point."""
     mean = (rows.directions * rows.real[:, :, None]).sum(axis=1)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     near = (np.einsum("lni,li->ln", rows.directions, mean) >= np.cos(_LEAST_ANGLE)) & rows.real

@@ -1,4 +1,5 @@
-"""Objects whose rays do not agree: they miss their object by more than their noise, and than the rays of other objects."""
+"""Objects whose rays do not agree. Such rays miss their object by more than their noise, and by more than the rays of other
+objects."""
 
 from __future__ import annotations
 
@@ -77,8 +78,8 @@ def find_misfits(
 
 
 def with_misfits(objects: ObjectMap, misfits: Misfits) -> ObjectMap:
-    """Return the objects, with larger covariances where the rays do not agree: times chi-squared per degree of freedom (the
-    ratio of Birge 1932)."""
+    """Return the objects with larger covariances where the rays do not agree. The factor is chi-squared per degree of
+    freedom (the ratio of Birge 1932)."""
     changed = [
         replace(one, covariance=one.covariance * misfits.times[j] ** 2)
         if misfits.odd[j] and one.covariance is not None

@@ -42,7 +42,7 @@ _TIMES_ODD = 3.5
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
 deviations. A larger number warns less often."""
 _FEWEST_STEPS = 20
-"""The fewest steps of a path that are judged. Fewer steps tell nothing about a robot."""
+"""The fewest steps of a path that are judged. A larger number judges fewer paths."""
 _STILL = 1e-4
 """The robot stands still if two poses differ by less than this distance (m) and turn (rad). A larger value takes slow motion
 for a stop."""
@@ -195,8 +195,8 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
 def _oddness(path: Trajectory) -> Floats:
     """Return by how much (N-1,), m, the steps of a path differ from the steps beside them, which is the size of a jump.
 
-    A step is as odd as it is with the times as given, or, if this is less, with times that are not shorter than usual
-    (`usual_seconds`).
+    The difference is found with the times as given, and with times that are not shorter than usual (`usual_seconds`). The
+    smaller difference counts.
     """
     seconds, way = np.diff(path.stamps), np.diff(path.poses[:, :3, 3], axis=0)
     return np.asarray(np.min([_beside(way / t[:, None]) * t for t in (seconds, usual_seconds(seconds))], axis=0))
@@ -205,7 +205,7 @@ def _oddness(path: Trajectory) -> Floats:
 def _pulses(path: Trajectory, odd: Floats, moving: Bools) -> Bools:
     """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
 
-    odd: (N-1,) as from `_oddness`. moving: (N-1,) the steps that tell what is usual. Some localisations repeat each pose
+    odd: (N-1,) as from `_oddness`. moving: (N-1,) the steps that show what is usual. Some localisations repeat each pose
     until the next one is known.
     """
     seconds = np.diff(path.stamps)

@@ -14,8 +14,8 @@ from objslam.graph.fixed_pose_triangulation import noise_of_poses, pose_noise
 from objslam.mapping.checks.finding import Finding
 
 _MOST = np.sqrt(2.0)
-"""A run warns if the residuals exceed this multiple of the noise in the settings. From this value on, at least half of their
-variance has a cause that the settings do not contain. A larger value warns less often."""
+"""A run warns if the residuals exceed this multiple of the noise in the settings. From this value on, the settings explain
+at most half of the variance. A larger value warns less often."""
 _SIGMAS = 3.0
 """A run warns if the multiple of the noise exceeds `_MOST` by at least this many standard deviations of the multiple. With a
 larger number, a log must be longer before it can cause a warning."""
@@ -54,10 +54,10 @@ def promised_noise(
 def check_pose_noise(
     objects: ObjectMap, keyframes: Keyframes, rays: Rays, association: Association, settings: Settings, *, calibrated: bool
 ) -> Finding | None:
-    """Return a finding if the log shows so much noise of the poses that most rays are far noisier than the settings say.
+    """Return a finding if most rays are far noisier than the settings say, because the poses err.
 
-    The covariances of the map contain this noise, so they are right. With better poses, the map would be more exact.
-    calibrated: whether the cameras were calibrated against the poses.
+    The covariances of the map contain this noise, so they are right. Better poses would make the map more exact. calibrated:
+    whether the cameras were calibrated against the poses.
     """
     if keyframes.pose_noise == (1.0, 1.0) or not held_rays(objects, association).any():
         return None
@@ -116,6 +116,6 @@ def check_residuals(
     return Finding(
         "rays miss",
         f"the rays miss their objects by {np.degrees(np.median(residual[held])):.2f} deg, {times:.1f} times what "
-        f"rays.pixel_sigma, rays.box_sigma and localization.* promise: {worse} worse than that; try {remedy}",
+        f"rays.pixel_sigma, rays.box_sigma and localization.* say: {worse} worse than the settings; try {remedy}",
         spoils=False,
     )

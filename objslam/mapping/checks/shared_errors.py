@@ -13,10 +13,10 @@ MOST_SIGMAS = 3.0
 """A shared error of more than this many standard deviations of its prior causes a warning. A larger value warns less
 often."""
 _WIDENED, _PART = 1.5, 0.25
-"""Of some errors, the log shows only a sum. Each such error has a factor by which its prior was widened
-(`Calibration.prior_factor`). They cause a warning if the largest factor exceeds `_WIDENED`. The factor is 1.5 for a sum that
-is 2.3 standard deviations from its prior. The warning names an error if its variance grew by at least the share `_PART` of
-the largest growth. Larger values warn less often, and name fewer errors."""
+"""Of some errors, the log shows only a sum. If the sum is large, their priors are widened by factors
+(`Calibration.prior_factor`). A warning follows if the largest factor exceeds `_WIDENED`. The factor is 1.5 for a sum that is
+2.3 standard deviations from its prior. The warning names an error if its variance grew by at least the share `_PART` of the
+largest growth. Larger values warn less often, and name fewer errors."""
 
 _CAUSES = {
     "clock": "do the stamps of the camera and of the poses use the same clock?",
@@ -84,7 +84,7 @@ def _warn_of_sums(calibration: Calibration, ledger: Ledger) -> None:
     said = ", ".join(f"{name} {calibration.values[i]:+.2g}" for i, name in zip(some, names, strict=True))
     causes = ", or: ".join(dict.fromkeys(_CAUSES[kind(name)] for name in names))
     ledger.warn(
-        f"some shared errors are larger than usual, and the log does not tell which ({said}), so their sigmas grow: {causes}"
+        f"some shared errors are larger than usual, and the log does not show which ({said}), so their sigmas grow: {causes}"
     )
 
 

@@ -27,7 +27,7 @@ _ROUNDS = 4
 too small errors. More rounds are more exact and take longer."""
 _SETTLED = 0.5
 """Rounds end when no error changes by more than this number of its standard deviations. A smaller value is more exact and
-takes longer. The score is no measure of this: it may grow only when nearly all rays fit."""
+takes longer. The score cannot decide this, because it may grow only when nearly all rays fit."""
 
 
 def without_usual_errors(

@@ -25,8 +25,8 @@ _AROUND = 4.0
 """The surroundings of a place reach to this multiple of the largest distance at which a ray passes the place. A larger
 multiple gives a surer estimate of how many rays pass by chance, from a larger area."""
 _FLAT = 0.5
-"""The largest angle (rad) of the surroundings, seen from a camera. Wider surroundings are not flat, so their area does not
-tell how many rays pass by chance. A larger angle counts places nearer to the path."""
+"""The largest angle (rad) of the surroundings, seen from a camera. Wider surroundings are not flat, so the number of rays
+that pass by chance does not follow from their area. A larger angle counts places nearer to the path."""
 _PAIRS = 3000
 """The number of pairs of rays that are tried for a label. More pairs find groups of fewer rays, and take longer."""
 _NEXT = 30

@@ -27,7 +27,7 @@ _PAIRS = 1000
 """The number of pairs of boxes whose crossings are tried as the place of a thing. More pairs give a better place."""
 _PARALLAX = np.sin(np.radians(5.0)) ** 2
 """The least squared sine of the angle between two axes that are crossed. Axes of cut off boxes point beside their thing, so
-narrower crossings tell no distance. With a larger value, fewer places are tried."""
+narrower crossings give no distance. With a larger value, fewer places are tried."""
 _NEAR, _FAR = 0.2, 3.0
 """The least distance of a place from a camera, m, and its greatest distance, as a multiple of the greatest distance at which
 an object was seen. Larger values suit larger places."""
@@ -80,7 +80,7 @@ class _Cones:
 
 
 def cut_things(result: RunResult) -> list[CutThing]:
-    """Return the things of which a result has only cut off boxes. The one with the most boxes comes first.
+    """Return the things that have only cut off boxes in a result. The one with the most boxes comes first.
 
     A cut off box belongs to an object if the object, with its size and 3 sigma, reaches into the cone around the box. The
     other boxes of a label show a thing where their cones meet, if most frames with this place in the image show it.

@@ -24,7 +24,7 @@ def misfits_of(result: RunResult) -> Misfits:
 
 
 def disagreeing(result: RunResult, misfits: Misfits) -> list[Doubt]:
-    """Return a doubt for each object whose rays do not agree, those that agree least first."""
+    """Return a doubt for each object whose rays do not agree, the worst first."""
     odd = np.flatnonzero(misfits.odd)
     found = []
     for j in odd[np.argsort(-misfits.times[odd], kind="stable")].tolist():

@@ -102,7 +102,7 @@ def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -
 
 
 def _unnamed(found: list[Doubt], earlier: tuple[Doubt, ...]) -> list[Doubt]:
-    """Return the first doubt about each object that no earlier doubt calls two."""
+    """Return the first of the doubts `found` about each object. Objects that `earlier` already calls two are left out."""
     called = {one.objects for one in earlier if one.kind == "split"}
     first: dict[tuple[int, ...], Doubt] = {}
     for one in found:

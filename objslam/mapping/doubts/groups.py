@@ -45,8 +45,8 @@ _RANGE_SIGMAS = 3.0
 """The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger
 number, fewer groups have this reason."""
 _FITTED = 6
-"""A point that moves has six parameters: its place and its velocity. It explains as many of the measured coordinates, two
-for each ray, in any case. With a larger number, fewer groups of few rays are said to move."""
+"""A point that moves has six parameters: its place and its velocity. It explains six measured coordinates in any case. Each
+ray has two. With a larger number, fewer groups of few rays are said to move."""
 _MOVES = np.log(20.0)
 """The least log odds of a motion over rest for a group that is said to move. Boxes of a thing at rest, seen
 under little parallax, reach 2.5 if they share an error. With larger odds, fewer groups are said to move."""
@@ -96,7 +96,8 @@ class BoxGroups:
 def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
     """Return the groups of boxes without an object, each with the reason why it is no object.
 
-    A box belongs to the first group that takes it. The reasons at a place are those of the association itself, in its order.
+    A box belongs to the first group that takes it. The association itself has the same reasons at a place, in the same
+    order.
     """
     left = np.flatnonzero(evidence.left)
     # A rejected ray shows another thing than its object, so it is no box of this object.
@@ -122,7 +123,8 @@ def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
 
 
 def described_group(evidence: Evidence, rays: Ints, settings: Settings) -> BoxGroups:
-    """Return one group of given rays (n,) of one label, none of which belongs to an object, with the reason why."""
+    """Return rays (n,) of one label as a group, with the reason why it is no object. None of the rays may belong to an
+    object."""
     free = replace(evidence.state, matched=np.where(evidence.left, -1, evidence.state.matched))
     mine = np.flatnonzero(np.isin(evidence.ray, rays))
     return _described(replace(evidence, state=free), [mine], np.array([_OPEN]), np.array([-1]), settings)

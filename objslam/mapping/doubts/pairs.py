@@ -28,7 +28,7 @@ one thing hides another, or because a detector suppresses boxes that overlap. It
 share, a frame without both is stronger evidence for one object."""
 _BESIDES = 0.2
 """The number of frames that show both by chance, in both explanations. It keeps the odds of few frames finite. With a larger
-number, few frames tell less."""
+number, a few frames count less."""
 _PAD = 1.0
 """The margin (m) around the objects in which other objects of their label may lie. With a larger margin, fewer pairs are
 expected to be close by chance."""

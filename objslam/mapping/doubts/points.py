@@ -59,7 +59,7 @@ def fit_points(evidence: Evidence, groups: list[Ints], start: Floats | None = No
 
 
 def as_landmarks(evidence: Evidence, points: Points) -> State:
-    """Return the state with the points as additional landmarks, behind those of the objects."""
+    """Return the state with the points as additional landmarks, behind the landmarks of the objects."""
     state = evidence.state
     first = np.searchsorted(points.group, np.arange(len(points.position)))
     label = state.obs.label[points.ray[first]]

@@ -12,9 +12,10 @@ from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
 from objslam.frontend.up import up_axis, up_vector
 
 _FEWEST = 10
-"""The fewest boxes of an object that tell how far its size scatters. A larger number finds fewer mixed objects."""
+"""The fewest boxes of an object from which the scatter of its size is measured. A larger number finds fewer mixed
+objects."""
 _OTHERS = 5
-"""The fewest objects that tell which scatter is usual. A larger number judges fewer maps."""
+"""The fewest objects from which the usual scatter is measured. A larger number judges fewer maps."""
 _TIMES = 3.0
 """The least scatter of a doubted object, as a multiple of the median of all objects. The objects of a recorded room, with
 the boxes of a detector, have up to 2.4. Mixed objects of simulated halls have 5 and more. A larger value finds fewer."""
@@ -29,9 +30,9 @@ thing changes by 6 %. A larger angle judges more objects of cameras that are not
 
 
 def mixed_sizes(result: RunResult) -> list[Doubt]:
-    """Return a doubt for each object whose boxes show sizes that scatter much more than those of other objects.
+    """Return a doubt for each object whose boxes show sizes that scatter much more than the sizes of other objects.
 
-    A box and the distance to its object tell the size of the thing in the box. The size of one thing stays the same. At
+    A box and the distance to its object give the size of the thing in the box. The size of one thing stays the same. At
     least its height stays the same in boxes that show the vertical in the same direction, such as the boxes of a level
     camera. So only such boxes count. The scatter of the widths and the scatter of the heights are computed, and the smaller
     one counts. It must exceed the scatter of other objects, and the scatter that the noise of the boxes explains. Boxes of
@@ -108,7 +109,7 @@ def _doubt(result: RunResult, j: int, mine: Ints, scatter: float, usual: float) 
         "split",
         "sizes",
         o.label,
-        f"{o.label} #{o.id} may be several things, or elsewhere: the sizes in its boxes scatter by a factor of "
+        f"{o.label} #{o.id} may be several things, or at a wrong place: the sizes in its boxes scatter by a factor of "
         f"{np.exp(scatter):.2f}, and those of other objects by {np.exp(usual):.2f}.",
         (o.id,),
         o.position,

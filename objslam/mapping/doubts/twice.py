@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _FEWEST = 4
 """The fewest objects of each part. Three common objects are never evidence enough for a registration. A larger number saves
-time, and misses losses among few objects."""
+time, and misses more losses if there are few objects."""
 _SPANNING = 0.5
 """The largest share of objects that both parts of the drive show. After a loss, an object is in both parts only if another
 object is at its place by chance. A larger share searches more maps."""
@@ -26,8 +26,8 @@ common. A larger share finds fewer losses."""
 
 @dataclass(frozen=True)
 class Twice:
-    """A place that is twice in a map. stamp: s, when it was lost. first, second: the numbers of objects in both parts.
-    registration: of the first part to the second."""
+    """A place that is twice in a map. stamp: s, when the place was lost. first, second: the numbers of objects in both
+    parts. registration: of the first part to the second."""
 
     stamp: float
     first: int

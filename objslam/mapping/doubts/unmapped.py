@@ -84,7 +84,7 @@ def _why(result: RunResult, evidence: Evidence, mine: Ints, parallax: float, cut
         also = f", and {edge} {cut} more" if cut else ""
         return "few", f"only {len(mine)} of its boxes can be used (association.min_rays {least}){also}", None
     if parallax < settings.triangulation.min_parallax_deg:
-        return "no parallax", f"its {len(mine)} rays span {parallax:.1f} deg, too little to tell a distance", None
+        return "no parallax", f"its {len(mine)} rays span {parallax:.1f} deg, too little to measure a distance", None
     group = described_group(evidence, mine, settings)
     reason, place = REASONS[group.reason[0]], group.position[0]
     also = f"; {edge} {cut} more boxes" if cut else ""

@@ -181,7 +181,7 @@ def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> s
             least = result.settings.association.min_rays
             return f": too few rays for an object (association.min_rays {least})"
         case "no parallax":
-            return f": their rays span {np.degrees(groups.parallax[g]):.1f} deg, too little to tell a distance"
+            return f": their rays span {np.degrees(groups.parallax[g]):.1f} deg, too little to measure a distance"
         case "apart":
             return f": their rays miss a common point by {miss}, and 3 sigma are {sigmas}"
         case "range":

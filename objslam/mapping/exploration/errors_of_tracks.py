@@ -21,9 +21,9 @@ _ROUNDS = 2
 the first round corrected. More rounds change the errors by less than their sigmas."""
 _APART = 0.15
 """In each span of this time (s), one image of each camera is solved. A track needs no more images to be linked, and more of
-them tell little more. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
+them would add little. A larger time makes the solve of a video faster, and loses tracks while the robot turns fast."""
 _MOST = 3000
-"""About the largest number of rays that are solved. The errors of more rays would be known better than an exploration needs,
+"""About the largest number of rays that are solved. More rays would give the errors more exactly than an exploration needs,
 and would take longer."""
 _BLOCK = 50
 """If more rays are left, this number of consecutive keyframes is solved at a time, and the next ones are left out. A track
@@ -38,8 +38,8 @@ def with_errors_of_tracks(state: JointState) -> tuple[JointState, Floats]:
 
     A track is a chain of boxes in images that follow each other (`frontend.tracks`). Nobody needs to know which tracks show
     the same thing: at the right clocks, turns and rotations of cameras, the rays of each track meet in one point. So the
-    tracks are solved as landmarks, with the odometry and the priors of all errors. With ranges, the noise stays that of
-    the settings. Short tracks leave the noise of distances open: in simulated videos, it was found twenty times too large.
+    tracks are solved as landmarks, with the odometry and the priors of all errors. With ranges, the noise of the settings
+    stays. Short tracks leave the noise of distances open: in simulated videos, it was found twenty times too large.
 
     The first association of a drive takes these errors as given. With a gyroscope that turns by 0.2 degrees a second too
     much, the rays of one minute meet nowhere.
@@ -93,7 +93,7 @@ def _excerpt(state: JointState) -> JointState:
 
 
 def _apart(stamps: Floats, camera: Ints) -> Bools:
-    """Return a mask (K,) of keyframes of which each camera has one in each span of `_APART`. stamps: (K,) s."""
+    """Return a mask (K,) that keeps one keyframe of each camera in each span of `_APART`. stamps: (K,) s."""
     span = np.stack([camera, np.floor((stamps - stamps.min()) / _APART).astype(np.int64)])
     _, first = np.unique(span, axis=1, return_index=True)
     keep = np.zeros(len(stamps), dtype=bool)

@@ -22,7 +22,7 @@ factor explores fewer logs twice."""
 _CLEAR = 0.95
 """If at least this share of the rays agrees, much noise is no reason to explore a log again. The exception is a log that the
 filter for ranges is sure of. A larger share explores more logs twice. In simulation, maps that show objects twice explained
-at most 0.93 of the rays, but up to 0.96 with ranges. A good map can explain as few."""
+at most 0.93 of the rays, but up to 0.96 with ranges. A good map sometimes explains no more."""
 _SAME = 0.01
 """If a second exploration gives at most this share of the rays to other objects than the map does, it is not continued. Two
 explorations of one drive always assign a few rays between neighbours in different ways. With a larger share, more second
@@ -38,8 +38,8 @@ factor suits worse odometry, and loses more objects of good odometry."""
 def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = False) -> JointState | None:
     """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
 
-    There is no attempt, but None, in three cases. The noise and the shared errors are about as the first exploration assumed
-    them. The settings fix the noise. Nearly all rays agree.
+    The result is None in three cases. The noise and the shared errors are about as the first exploration assumed them. The
+    settings fix the noise. Nearly all rays agree.
 
     Noise and shared errors are known only after a solve, but an exploration needs them before. A wrong map can hide the
     noise of the odometry in the noise of the rays.
@@ -79,7 +79,7 @@ def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = 
 
 
 def _at_least_nominal(noise: NoiseFactors) -> NoiseFactors:
-    """Return the noise of an exploration: no noise of rays or odometry below that of the settings, and no shrinkage."""
+    """Return the noise of an exploration: no noise of rays or odometry below the settings, and no shrinkage."""
     odometry = {name: max(getattr(noise, name), 1.0) for name in ("along", "across", "turning")}
     return replace(noise, rays=max(noise.rays, 1.0), shrinkage=0.0, **odometry)
 

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from objslam.graph.calibration.fixed_pose_calibration import FixedCalibration
 
 _NARROWER = (0.3, 0.0)
-"""If a log fits poorly, narrower first associations are tried. Each of these shares gives one, which allows for this share
-of the uncertainty of the shared errors. Each further share takes the time of one association."""
+"""If a log fits poorly, narrower first associations are tried, one for each of these shares. It allows for this share of the
+uncertainty of the shared errors. More shares take longer: each takes the time of one association."""
 _FITS = 2.0
 """If the mean squared miss of a ray, in variances of its noise, is at most this, the widest association is taken, and no
 other is tried. Rays with the noise of the settings have 2, because they have two axes. With a larger value, fewer logs take
@@ -179,7 +179,7 @@ class _Trial:
     trace: Trace | None
 
     def left(self) -> tuple[float, float]:
-        """Return what the calibration leaves (`_left`), infinities without a calibration."""
+        """Return the misfit that the calibration leaves (`_left`). It is infinite without a calibration."""
         if self.found is None:
             return float("inf"), float("inf")
         return _left(self.corrected, self.association, self.moved)
@@ -223,11 +223,12 @@ def _first_trial(
 ) -> tuple[_Trial, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
-    An association that allows for the uncertainty of ray directions because of the errors is right if things are far apart.
-    In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong distance. Then a
-    narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the associations are compared
-    by how likely the rays are after a calibration. A narrower one has to be clearly better than the widest. The widest
-    association with an object is taken at once if it fits. Also return whether a narrower one is taken.
+    The widest association allows for all the uncertainty that the errors give to ray directions. It is right if things are
+    far apart. In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong
+    distance. Then a narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the
+    associations are compared by how likely the rays are after a calibration. A narrower one has to be clearly better than
+    the widest. The widest association with an object is taken at once if it fits. Also return whether a narrower one is
+    taken.
 
     at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
     of the errors.
@@ -253,7 +254,7 @@ def _first_trial(
 
 
 def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:
-    """Return the squared miss, in variances, and -2 ln of the probability, up to a constant, of a mean ray.
+    """Return two means over the rays: the squared miss, in variances, and -2 ln of the probability, up to a constant.
 
     More noise than the settings say counts as a miss, as in the normal distribution. If there are more objects of a label,
     its rays can belong to more of them, and each is less likely. An object costs as in the Bayesian information criterion

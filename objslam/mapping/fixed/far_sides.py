@@ -24,10 +24,10 @@ infinity. With a larger share, objects whose place the rays hardly determine bec
 def with_far_sides(solution: Solution) -> Solution:
     """Return the solution with covariances that reach to the far end of the depths that the rays allow.
 
-    The standard deviation s along the mean ray of an object at the depth d is that of the inverse depth, s / d^2. The far
-    end, at `_SIGMAS` of them, is at d / (1 - `_SIGMAS` s / d), so s becomes s / (1 - `_SIGMAS` s / d). Objects with a
-    measured range keep their covariance, because a range errs as much to both sides. Objects that were seen from many sides
-    nearly keep it too, because their s is a small share of d.
+    An object at the depth d has the standard deviation s along its mean ray. Its inverse depth has the standard deviation s
+    / d^2. The far end, `_SIGMAS` of them away, is at d / (1 - `_SIGMAS` s / d), so s becomes s / (1 - `_SIGMAS` s / d).
+    Objects with a measured range keep their covariance, because a range errs as much to both sides. Objects that were seen
+    from many sides nearly keep it too, because their s is a small share of d.
     """
     rays, estimate = solution.rays, solution.estimate
     index, covariance = solution.association.object, estimate.covariance

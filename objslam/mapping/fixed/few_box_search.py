@@ -117,7 +117,7 @@ def search_objects(log: Log, settings: Settings, noise: SparseNoise, *, correct_
 
 
 def middle(log: Log) -> Log:
-    """Return the log with the frames of its middle only, of at most `_MOST_BOXES` boxes."""
+    """Return the log with only the frames in its middle. They have at most `_MOST_BOXES` boxes."""
     found = [one.detections for one in log.cameras if one.detections is not None]
     stamps = np.sort(np.concatenate([one.frame_stamps[one.frame] for one in found]))
     if len(stamps) <= _MOST_BOXES:

@@ -96,10 +96,11 @@ class FixedPoses:
         parameters: Parameters | None = None,
         more: Floats | float = 0.0,
     ) -> tuple[Association, Estimate]:
-        """Return the association and the estimate with the objects that can be found from few rays, and without those of
+        """Return the association and the estimate with the objects that can be found from few rays, and without objects of
         things that move. Both stay the same if nothing changes.
 
-        more: as in `associate`. parameters: as in `solve`."""
+        more: as in `associate`. parameters: as in `solve`.
+        """
         from objslam.association.few_rays.additional_objects import add_few_ray_objects
 
         placed = placed_objects(estimate)

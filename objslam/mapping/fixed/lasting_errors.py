@@ -37,14 +37,14 @@ _LARGE = 1.0
 `localization`. At 1, the lasting errors alone are as large as all errors together should be. A larger value warns less
 often."""
 _LARGE_WITH_ODOMETRY = 0.75
-"""The same multiple if the odometry also says that the poses err for seconds. Two witnesses need less each: false objects
-take up a part of the errors, so the boxes show too small errors. A larger value warns less often."""
+"""The multiple `_LARGE` if the odometry also says that the poses err for seconds. With two witnesses, each needs to show
+less: false objects take up a part of the errors, so the boxes show too small errors. A larger value warns less often."""
 _FEWEST = 3
 """A run warns of lasting errors only if at least this number of objects show them. All boxes of one object may lie beside
-the object in the same way for seconds, so one object tells little of the poses. A larger number warns less often."""
+the object in the same way for seconds, so one object says little about the poses. A larger number warns less often."""
 _SMALL = 0.2
-"""The errors are estimated again with the boxes around the centres of bodies, if they are above this multiple of the noise
-`localization`. A larger value takes less time, and blames the poses for boxes of large things."""
+"""If the errors are above this multiple of the noise `localization`, they are estimated again, with the boxes moved to the
+centres of bodies. A larger value takes less time, and blames the poses for boxes of large things."""
 LASTING = "lasting localisation errors"
 """The name of the finding that given poses err for seconds."""
 _POOLED = 20.0
@@ -61,13 +61,13 @@ def with_lasting_errors(
     A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
     poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. On uneven ground, planar
     poses turn rays up and down by `planar` times a factor of its own, and ground whose tilt lasts also rises (`rise_of`).
-    The size of the errors is `localization` times a factor with a half-normal prior of 1. Their correlation falls
-    exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood (Patterson
-    and Thompson 1971), and averaged over their posterior.
+    The size of the errors is `localization` times a factor, whose prior is half-normal with the scale 1. Their correlation
+    falls exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood
+    (Patterson and Thompson 1971), and averaged over their posterior.
 
-    The centre of the box of a large thing nearby lies beside the image of its centre, for as long as the robot drives by.
-    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was needed, the
-    returned solution has them.
+    If a large thing is near, the centre of its box is not at the image of its centre, for as long as the robot drives by.
+    with_bodies: finds the bodies, so that the boxes can count as if they had been around the centres. If it was called, the
+    returned solution has the bodies.
     """
     if not solution.keyframes.localized_every:
         return solution, None
@@ -212,7 +212,7 @@ def _by_cell(
 
 
 def _joined(one: Cells, other: Cells) -> Cells:
-    """Return the cells of both, in the order of objects."""
+    """Return the cells of `one` and of `other`, in the order of objects."""
     both = Cells(*(np.concatenate(pair) for pair in zip(vars(one).values(), vars(other).values(), strict=True)))
     return both.take(np.argsort(both.owner, kind="stable"))
 

@@ -62,7 +62,7 @@ class Cells:
         return np.asarray(np.exp(-np.abs(self.times[:, None] - self.times) / time))
 
     def covariances(self, variances: Floats) -> tuple[Ints, Floats]:
-        """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 of each by errors that last.
+        """Return the objects (N,) that have cells, and the covariance (N, 3, 3) m^2 that lasting errors cause in each.
 
         variances: (2, T) as in `lasting_variances`.
         """
@@ -103,9 +103,9 @@ def lasting_variances(cells: Cells) -> Floats:
     """Return the expected squared factors (2, T) of the errors of rotations and of places that last for each of `TIMES`.
     Their sums over these times are the squared factors of all errors.
 
-    The factor has a half-normal prior of 1. Its likelihood is restricted (Patterson and Thompson 1971): the errors of the
-    positions of all objects are integrated out. The mixture, the factor and the correlation time are averaged over their
-    posterior. SolveError if the likelihood is not finite.
+    The prior of the factor is half-normal, with the scale 1. Its likelihood is restricted (Patterson and Thompson 1971): the
+    errors of the positions of all objects are integrated out. The mixture, the factor and the correlation time are averaged
+    over their posterior. SolveError if the likelihood is not finite.
     """
     cells = cells.take(_counted(cells.times))
     from scipy.linalg.lapack import dpotrf, dsygst, dtrtrs  # Here, so that `load_libraries` comes first.
@@ -155,7 +155,7 @@ def _misfits(covariance: Floats, mean: Floats, factors: Floats) -> Floats:
 
 
 def _counted(times: Floats) -> Ints:
-    """Return the cells that count, ascending: all, or those of stretches that are spread evenly over the time."""
+    """Return the cells that count, ascending: all cells, or the cells of stretches that are spread evenly over the time."""
     if len(times) <= _MOST:
         return np.arange(len(times))
     stretches = np.array_split(np.argsort(times, kind="stable"), -(-len(times) // _TOGETHER))

@@ -1,7 +1,7 @@
 """The noise of given poses, from the errors that all rays of a frame share.
 
 A wrong heading of a pose turns all rays of its frame to one side, and a wrong place shifts them to one side. The noise of
-boxes does neither. So frames that show several objects tell the noise of the poses, even if the noise of boxes is unknown.
+boxes does neither. So frames that show several objects reveal the noise of the poses, even if the noise of boxes is unknown.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ _MOST_POSES = 500
 """The most poses that count, spread evenly. They determine a factor to 3 %. More poses are more exact and slower."""
 _BOUNDS = np.log([[0.4, 1.0, 1.0], [5.0, MOST_NOISE, MOST_NOISE]])
 """The logarithms of the least and largest factors on the noise of rays, headings and places. The noise of poses never falls
-below the settings: a few frames with small errors do not promise small errors of the other frames. Wider bounds allow
+below the settings: a few frames with small errors say nothing about the errors of the other frames. Wider bounds allow
 noisier poses."""
 _STEPS = (0.8, 0.4, 0.2, 0.1, 0.05, 0.025)
 """The steps of the search, as logarithms of factors. A smaller last step is more exact and slower."""
@@ -40,7 +40,7 @@ _STRAY = 3.0
 """The deviation of a stray ray, in standard deviations of all noise together. A larger number lets false boxes raise the
 noise. A smaller number lowers the noise of true boxes: the number 3 lowers it by 1.3 %."""
 _ROUNDS = 4
-"""The most rounds in which stray rays are told from noisy poses. More rounds hardly change a factor."""
+"""The most rounds in which stray rays are separated from noisy poses. More rounds hardly change a factor."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +78,9 @@ def noise_in_frames(
 
     A variance component model (Searle, Casella and McCulloch 1992): seen from above, the miss of a ray is a sum of three
     errors: the noise of the ray, the error of the heading of its pose, and the error of the place of its pose, as seen from
-    the object. The sizes of the three errors are those of the largest posterior density. Both factors are 1 unless the rays
-    refute the settings. Only poses with rays to two objects and more count, because a single ray does not tell which of the
-    three errors it has.
+    the object. The sizes of the three errors have the largest posterior density. Both factors are 1 unless the rays refute
+    the settings. Only poses with rays to two objects and more count, because a single ray does not show which of the three
+    errors it has.
 
     positions: (N, 3) m, NaN for an object without a position.
     """

@@ -14,8 +14,8 @@ from objslam.mapping.fixed.few_box_search import Searched, SparseNoise
 from objslam.mapping.fixed.pose_noise import least_cost
 
 _FAR = 10.0
-"""The prior standard deviation of an object's place, as a multiple of the largest distance of a ray. So the place of an
-object with one ray has a variance. The number hardly matters if it is large."""
+"""The prior standard deviation of an object's place, as a multiple of the largest distance of a ray. It gives a variance to
+the place of an object with a single ray. The number hardly matters if it is large."""
 _OUTLIER = 3.0
 """The deviation from which a residual does not count, after the first round. With a smaller limit, the noise becomes too
 small. With a larger one, wrong depths count."""

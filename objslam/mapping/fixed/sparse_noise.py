@@ -32,13 +32,13 @@ _PLACES = (1.0, 2.0, 6.0, 20.0, 60.0, 200.0)
 _RANGES = (1.0, 3.0, 8.0)
 """The factors on the noise of depths that are tried first."""
 _RAYS = (1.0, 4.0)
-"""The factors on the noise of rays that are tried first. A street hardly tells this noise from that of the places."""
+"""The factors on the noise of rays that are tried first. On a street, noisy rays look almost like noisy places."""
 _TURN = 15
 """The steps (degrees) of the tried turns of all cameras about the vertical axis. A larger step misses more wrong mounts."""
 _LEAD = 15.0
 """The least lead, in log odds, of the log as it is over the log with turned cameras. On streets the lead is 18 and more.
-With cameras turned by 15 degrees and more, it is below 0, and mostly in rooms with turned cameras too. With a larger lead,
-fewer streets are mapped. With a smaller one, wrong mounts are taken for noise."""
+With cameras turned by 15 degrees and more, it is below 0 on streets, and mostly in rooms too. With a larger lead, fewer
+streets are mapped. With a smaller one, wrong mounts are taken for noise."""
 _SURE = 60.0
 """From this lead on, the boxes agree, even if they seem to disagree because each thing has only few boxes. With a larger
 lead, more right streets with few boxes are called wrong."""
@@ -52,12 +52,12 @@ taken for noisy places."""
 _FEWEST = 20
 """The fewest boxes of a log that is searched. Fewer boxes agree with any noise by chance."""
 _NEAR = 30.0
-"""A noise is tried as a start if its log odds are at most this below those of the likeliest noise. With a larger number,
-more starts are tried, and each takes about a second."""
+"""A noise is tried as a start if its log odds are at most this far below the log odds of the likeliest noise. With a larger
+number, more starts are tried, and each takes about a second."""
 _NOISY = 3.0
 """Places count as noisy from this factor on `localization.xy` on. If any start leads to noisy places, results with more
-exact places are left out. Large errors of boxes would explain few boxes as well, but they are rare, and the sigmas would
-then be too small. With a larger factor, a good GPS is taken for a bad detector."""
+exact places are left out. They explain the boxes by large errors of the boxes instead. Such errors are rare, and the sigmas
+would be too small. With a larger factor, a good GPS is taken for a bad detector."""
 _SETTLED = 2
 """How often the objects are searched with the noise of their residuals. A third time gave the same objects on 15 simulated
 streets. A larger number takes longer."""

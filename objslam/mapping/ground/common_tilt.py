@@ -2,7 +2,7 @@
 
 If the robot pitches, all rays of its pose go up or down. If it rolls, the rays on one side go up, and the rays on the other
 side go down. If it stands higher than its pose says, near rays go down more than far ones. The noise of boxes does not move
-rays together. So poses that show several things tell how uneven the ground is.
+rays together. So poses that show several things reveal how uneven the ground is.
 """
 
 from collections.abc import Callable
@@ -38,8 +38,8 @@ _STRAY = 3.5
 """The deviation of a stray ray, in standard deviations of the noise that remains. A larger number lets false boxes raise the
 tilt."""
 _MOST_LASTING, _RUN = 150, 10
-"""The most poses that tell how long the tilt lasts, and how many of them follow each other. More poses are more exact, and
-the time grows with their cube. Longer runs see shorter times less often."""
+"""The most poses from which it is estimated how long the tilt lasts, and how many of them follow each other. More poses are
+more exact, and the time grows with their cube. Longer runs see shorter times less often."""
 _TIMES = tuple(0.25 * 2.0**k for k in range(9))
 """The tried times (s) for which tilt lasts. The shortest fits a bump, the longest a slope. More are finer and slower."""
 _LARGER = (1.0, 1.5, 2.25)
@@ -100,8 +100,9 @@ class _Poses:
     def solve(self, logarithms: Floats, alike: Floats | None = None) -> tuple[float, Floats, Floats]:
         """Return -2 ln of the restricted likelihood, the effects (P,), and the errors of the poses (K, n).
 
-        logarithms: (3,) of the factor on the noise of rays, of the tilt, rad, and of the height, m. alike: (K, K) the
-        correlation of the errors of two poses, None if they are independent. SolveError if the system is not finite.
+        logarithms: (3,) those of three numbers: the factor on the noise of rays, the tilt, rad, and the height, m. alike:
+        (K, K) the correlation of the errors of two poses, None if they are independent. SolveError if the system is not
+        finite.
         """
         factor, tilt, height = np.exp(logarithms)
         sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[: self.pulled.shape[1]] / factor
@@ -137,9 +138,9 @@ class _Poses:
 class Uneven:
     """How uneven the ground is.
 
-    tilt: rad, the standard deviation of roll and of pitch. height: m, that of the height. seconds: s, the time after which
-    the correlation of both is 1/e, 0 if both are new in each pose. share: the noise of a usual ray by tilt and height, as a
-    multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
+    tilt: rad, the standard deviation of roll and of pitch. height: m, the standard deviation of the height. seconds: s, the
+    time after which the correlation of both is 1/e, 0 if both are new in each pose. share: the noise that tilt and height
+    add to a usual ray, as a multiple of its other noise. gain: by how much both lower -2 ln of the restricted likelihood.
     """
 
     tilt: float
@@ -167,7 +168,7 @@ class CommonTilt:
     prior: float
 
     def lasting(self) -> Uneven:
-        """Return the ground with the time for which its tilt lasts, and with the size of the tilt if it lasts that long.
+        """Return the ground with the most likely time for which its tilt lasts, and with the size that the tilt then has.
 
         A tilt that lasts moves all rays of a thing up or down together, so the rays still meet. They show only a part of the
         tilt, and the tilt is larger than this part.

@@ -20,14 +20,14 @@ each other."""
 _ROUNDS = 5
 """The most estimates. More rounds are more exact and take longer."""
 _SAME = 0.05
-"""The rounds end if the noise by the ground changes by at most this share. A larger share ends sooner."""
+"""The rounds end if the noise that the ground adds changes by at most this share. A larger share ends sooner."""
 _FEWEST = 60
 """The fewest boxes of a log from which the ground is estimated. Fewer boxes agree by chance."""
 _CROWD = 5.0
 """In a larger crowd (`Part.crowd`), rays meet anywhere, and show nothing. A larger value examines more logs."""
 _LEAST = 0.5
-"""The least noise of rays by the ground, as a multiple of their other noise. Less hardly changes a map. A larger number
-allows for uneven ground less often."""
+"""The least noise that the ground must add to rays, as a multiple of their other noise. Less noise hardly changes a map. A
+larger number allows for uneven ground less often."""
 _EXPLAINED = 0.4
 """The least share of the boxes that must fit a point on the ground that was found. With wrong input, fewer fit, and what
 their poses share is not the ground. A larger share finds uneven ground in fewer logs."""

@@ -1,8 +1,8 @@
 """Doubt whether each label names a single object, and compare with a map that has several objects for a label.
 
 A map with one object for two things bends the path, so that both things lie in one place. A solve that estimates the noise
-explains the bend by noise of the odometry, and then all rays agree. So the rays do not tell that the label has two objects.
-Only a comparison of the evidence for both maps, at the same noise, tells it.
+explains the bend by noise of the odometry, and then all rays agree. So the rays do not show that the label has two objects.
+Only a comparison of the evidence for both maps, at the same noise, shows it.
 """
 
 from __future__ import annotations
@@ -138,12 +138,12 @@ def unchecked_labels(rays: Rays, keyframes: Keyframes) -> Ints:
 def evidence_against(named: JointState, other: JointState) -> float:
     """Return the log of the odds for the association of the map `other`, against the association of the map `named`.
 
-    Both maps are compared at the noise of the odometry that `named` found. This noise suits `named` best. At the noise of
-    the settings, `named` would lose even if it is right, in a log of a robot with worse odometry: a second object costs less
-    than the error of the path. The noise of boxes and depths shows in each view, whatever the objects are. So if `other`
-    found much less of this noise, both maps have at most `_NOISIER` times what `other` found. A second box around one thing
-    has no object in `named`, so here it has none in `other`. Each map keeps its own shared errors, which count by their
-    prior.
+    Both maps are compared at the noise of the odometry that `named` found, which suits `named` best. At the noise of the
+    settings, `named` would lose even if it is right, in a log of a robot with worse odometry: a second object costs less
+    than the error of the path. The noise of boxes and depths shows in each view, whatever the objects are. If `other` found
+    much less of it than `named`, both maps are compared at `_NOISIER` times the noise of `other`. A second box around one
+    thing has no object in `named`, so here it has none in `other`. Each map keeps its own shared errors, which count by
+    their prior.
 
     Args:
         named: solved, with one object for each label.

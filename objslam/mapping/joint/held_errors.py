@@ -2,8 +2,8 @@
 
 With odometry alone, the place and the focal length of a camera are held, because a path that is free to bend fits usual
 errors of them too. A gross error bends the path, and the objects move by many of their sigmas. So it is estimated after all.
-A usual error of a focal length stays, and the sigmas contain what it does.
-A camera that somebody turned during the drive cannot be corrected, because no box tells when that was.
+A usual error of a focal length stays, and the sigmas contain what it does. A camera that somebody turned during the drive
+cannot be corrected, because no box shows when that was.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ from objslam.mapping.checks.parts.moved_camera import (
 from objslam.mapping.solution import Solution
 
 _SETTING = {"x": "translation", "y": "translation", "focal": "focal"}
-"""The setting of each kind of held error. The height of a camera is none of them, because it only lifts the map."""
+"""The setting of each kind of held error. The height of a camera is no held error, because it only lifts the map."""
 _USUAL = {"translation": USUAL_PLACE, "focal": USUAL_FOCAL}
 _BENDS = "focal"
 """The setting of the held errors that the covariances contain. In ten recorded drives with focal lengths 4 % too long, 135
@@ -60,8 +60,9 @@ class Solved:
 def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | None:
     """Return the shared errors with held errors that are gross, to be estimated too, None if no held error is gross.
 
-    errors: those of the solve, as measured. The settings of the returned errors have the prior of the new errors. A setting
-    that is not `auto` is kept. An error of calibration.file is kept too, because the log is already corrected by it.
+    errors: the shared errors of the solve, as measured. The settings of the returned errors have the prior of the new
+    errors. A setting that is not `auto` is kept. An error of calibration.file is kept too, because the log is already
+    corrected by it.
     """
     held = _held(errors)
     if not held or not _can_tell(errors):
@@ -84,7 +85,7 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
 def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -> Solution:
     """Return the solution with covariances that contain the usual errors of focal lengths that it held.
 
-    errors: those of the solve, as measured. The ledger gets a warning if these errors cannot be computed.
+    errors: the shared errors of the solve, as measured. The ledger gets a warning if these errors cannot be computed.
     """
     if errors.keyframes.localized_every or _BENDS not in _held(errors) or not _can_tell(errors):
         return solution
@@ -107,7 +108,7 @@ def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -
 
 
 def _held(errors: SharedErrors) -> list[str]:
-    """Return the settings of the errors that a solve held because the log may hardly tell them."""
+    """Return the settings of the errors that a solve held because the log may hardly determine them."""
     of, file = errors.settings.calibration, known_errors(errors.settings)
     told = set(errors.names) if file is None else {*errors.names, *file.names}
     known = {_SETTING.get(kind(name)) for name in told}
@@ -115,7 +116,7 @@ def _held(errors: SharedErrors) -> list[str]:
 
 
 def _freed(errors: SharedErrors, names: list[str]) -> SharedErrors:
-    """Return the errors with those of these settings, to be estimated too."""
+    """Return the errors, with the held errors of these settings added. They are estimated too."""
     more = errors.settings.calibration.model_copy(update={name: _USUAL[name] for name in names})
     settings = errors.settings.model_copy(update={"calibration": more})
     other = shared_errors(errors.log, errors.keyframes, errors.rays, settings)
@@ -184,7 +185,7 @@ def _like(errors: SharedErrors, solved: Solved) -> SharedErrors:
 
 
 def _values(errors: SharedErrors, solved: Solved) -> Floats:
-    """Return the values (P,) of the errors after the solve. A held error has its mean."""
+    """Return the values (P,) of the errors after the solve. A held error has the mean of its prior."""
     found = solved.estimate.calibration
     known = {} if found is None else dict(zip(found.names, found.values.tolist(), strict=True))
     means = zip(errors.names, errors.mean.tolist(), strict=True)

@@ -102,7 +102,7 @@ class JointState:
         return replace(state, errors=errors, theta=theta, keyframes=keyframes, rays=rays)
 
     def counted(self, found: Association) -> Self:
-        """Return the state with one more round that found an association."""
+        """Return the state after one more round, which found the association `found`."""
         changed = len(self.rays) if self.association is None else rays_moved(self.association.object, found.object)
         return replace(self, rounds=(*self.rounds, {"objects": found.count, "rays_changed": changed}))
 
@@ -173,7 +173,7 @@ class JointState:
         return replace(self.replaced(again), rounds=self.rounds, unsettled=0) if again.explained > self.explained else self
 
     def changed_since(self, before: Self) -> int:
-        """Return the number of objects that differ from those of an earlier state (`objects_changed`)."""
+        """Return the number of objects that differ from an earlier state (`objects_changed`)."""
         if before is self:
             return 0
         assert self.association is not None
@@ -261,7 +261,7 @@ class JointState:
         return self if self._has_rays_of(attempt) else self.better(attempt)
 
     def _has_rays_of(self, other: Self) -> bool:
-        """Return whether the objects have the same rays as those of another state."""
+        """Return whether the objects have the same rays as in another state."""
         assert self.association is not None
         assert other.association is not None
         return rays_moved(self.association.object, other.association.object) == 0

@@ -1,4 +1,4 @@
-"""Judge whether each label names a single object. Then the labels alone tell which rays belong together."""
+"""Judge whether each label names a single object. Then the labels alone decide which rays belong together."""
 
 from collections.abc import Callable
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from objslam.mapping.joint.joint_alternation import JointState
 
 _TRIED = 4
-"""The most loops that are tried before the search ends, those with the most evidence first. Each takes a solve. A larger
-number closes more loops, and takes longer on maps that have missed none."""
+"""The most loops that are tried before the search ends. Loops with more evidence are tried first. Each takes a solve. A
+larger number closes more loops, and takes longer on maps that have missed none."""
 
 
 def with_missed_loops(state: JointState) -> JointState:
@@ -26,7 +26,7 @@ def with_missed_loops(state: JointState) -> JointState:
 
     An unlikely slip, or one landmark that was taken for another, bends the path by more than the exploration allows for. All
     later visits then have landmarks of their own, all rays agree, and no round of association and solve brings the visits
-    together. The copies of the landmarks still have the relative positions of the first ones, which tell the loop.
+    together. The copies of the landmarks still have the relative positions of the first ones, which reveal the loop.
 
     A closure joins landmarks and is solved at once, at held shared errors. The rounds of association follow after the last
     closure. Earlier rounds would give the rays of visits that are not closed yet to wrong landmarks. state: without a

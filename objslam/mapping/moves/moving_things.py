@@ -26,11 +26,11 @@ around had 0.2 to 0.75 in simulations. A larger share drops more objects."""
 _SCATTER = 1.5
 """The things of a label move only if the root mean square of its rays is more than this multiple of the usual one. Tracks
 also pass from one thing to the next where equal things stand close together, but their rays fit. Single real landmarks in
-groups had 0.8 to 2.0. All objects of people together had 3 and more, and those of carts 1.9 to 2.4. A larger multiple drops
-fewer objects."""
+groups had 0.8 to 2.0. All objects of people together had 3 and more, and all objects of carts together had 1.9 to 2.4. A
+larger multiple drops fewer objects."""
 _USUAL = 3
-"""The fewest objects that tell the usual scatter: those whose tracks have hardly any other rays, and whose label does not
-seem to move. With a larger number, fewer maps are asked."""
+"""The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
+label does not seem to move. With a larger number, fewer maps are judged."""
 
 
 def without_moving_things(state: JointState) -> JointState:
@@ -51,8 +51,8 @@ def things_at_rest(
     The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
     association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
     passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
-    because tracks of a few things at rest also pass on to equal things beside them. If all things have one label, nothing
-    tells the usual scatter, and all objects stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
+    because tracks of a few things at rest also pass on to equal things beside them. If all things have one label, the usual
+    scatter is unknown, and all objects stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
     """
     moving = _moving(keyframes, rays, association, estimate, map_T_camera)
     if not moving.any():
@@ -70,7 +70,7 @@ def things_at_rest(
 
 
 def _moving(keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats) -> Bools:
-    """Return which objects (N,) are of things that move. The parameters are those of `things_at_rest`."""
+    """Return which objects (N,) are of things that move. The parameters are as in `things_at_rest`."""
     owner = np.where(estimate.weight > 0, association.object, -1)
     track, length = tracks_of_rays(keyframes, rays, map_T_camera)
     told = np.flatnonzero((owner >= 0) & (length[track] >= FEWEST))

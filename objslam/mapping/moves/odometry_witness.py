@@ -35,7 +35,7 @@ def odometry_contradicts(log: Log, settings: Settings) -> bool:
 
 def lasting_by_odometry(errors: SharedErrors | None) -> tuple[float, float]:
     """Return the factors on `localization.yaw` and `localization.xy` of lasting errors that the odometry shows, 0 without
-    odometry, or if the noise of the localisation is known. errors: of all frames, because also those without a box tell."""
+    odometry, or if the noise of the localisation is known. errors: of all frames, because frames without a box count too."""
     if errors is None or "localization" not in errors.unknown_noise or errors.keyframes.odom_T_base is None:
         return 0.0, 0.0
     from objslam.graph.calibration.paths_alone import noise_of_paths  # It imports scipy.sparse. Few runs need it.

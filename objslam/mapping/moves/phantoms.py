@@ -40,8 +40,8 @@ From this value on, nine tenths of the variance are not in the settings. A large
 UNTOLD = "errors of poses that the solve does not show"
 """The name of the finding that a map at the given poses shows large errors of the poses, and the solved map shows none."""
 _MOST = 60
-"""The most objects that are tried as phantoms, those that are least likely to exist first. Each takes a search of the path
-and a solve. A larger number finds more phantoms in large maps, and takes longer."""
+"""The most objects that are tried as phantoms. The least likely objects are tried first. Each takes a search of the path and
+a solve. A larger number finds more phantoms in large maps, and takes longer."""
 
 
 def has_lasting_errors(state: JointState) -> bool:
@@ -151,7 +151,7 @@ def without_phantoms(state: JointState) -> JointState:
 
 
 def _candidates(state: JointState) -> Ints:
-    """Return the objects that may be phantoms, the least likely first: those of labels with several objects."""
+    """Return the objects that may be phantoms, the least likely first. Only labels with several objects have any."""
     association, estimate = state.association, state.estimate
     assert association is not None
     assert estimate is not None

@@ -50,7 +50,7 @@ def after_session(tracks: list[Track], found: Bools, looks: Ints, seen: list[Map
 
     found: (N,) whether the session found each object. looks: (N,) in how many frames of the session each should have been
     detected. seen: each object as the session has it, None if not found. when: the time of the session, s. A track without a
-    life begins here.
+    life gets its first one.
     """
     old = [t.life for t in tracks]
     before = np.array([UNPROVEN if life is None else life.probability for life in old])

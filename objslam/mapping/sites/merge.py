@@ -1,7 +1,7 @@
 """Join many sessions, each in a frame of its own, to one map of the site.
 
 An island is a group of sessions that share objects. A track is one object over the sessions of an island. The life of an
-object tells what became of it (`Life`).
+object says what became of it (`Life`).
 """
 
 from __future__ import annotations

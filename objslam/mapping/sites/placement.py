@@ -31,7 +31,7 @@ Seen = tuple[int, MapObject]
 class Part:
     """Sessions that share objects, as one map.
 
-    objects: the map, in the frame of one of the sessions. Its objects are those of `tracks`, in the same order: first all
+    objects: the map, in the frame of one of the sessions. It has the objects of `tracks`, in the same order: first all
     objects that are present in a session, then the gone objects. tracks: each object as its sessions have it.
     site_T_session: how each session lies in this frame. log_odds: the log odds of the registration that tied each session to
     the others, NaN for the session that gives the frame.
@@ -118,8 +118,8 @@ def _pairs(ours: list[MapObject], theirs: list[MapObject], a_T_b: Floats) -> lis
 
 
 def _with_labels_of(ours: MapObject, theirs: MapObject, often: Sequence[int]) -> MapObject:
-    """Return `ours` with the mean label shares of both, and the label that these shares tell. often: how many sessions saw
-    each."""
+    """Return `ours` with the mean label shares of both, and the label that follows from these shares. often: how many
+    sessions saw each."""
     shares = mean_labels([ours, theirs], often)
     return ours if shares is None else replace(ours, labels=shares, label=next(iter(shares)))
 

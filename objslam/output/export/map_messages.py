@@ -72,8 +72,8 @@ class MapMessages:
     def detections(self, stamp: float, objects: tuple[MapObject, ...]) -> Any:
         """Make a vision_msgs/Detection3DArray with the labels, positions and covariances of objects.
 
-        The score of a label is its share of the object's boxes. The 3D box is that of the body, turned by its yaw. Without a
-        body, the depth of a 3D box equals its width. A 3D box of unknown size has size 0.
+        The score of a label is its share of the object's boxes. The 3D box is the box of the body, turned by its yaw.
+        Without a body, the depth of a 3D box equals its width. A 3D box of unknown size has size 0.
         """
         return self.make("vision_msgs/Detection3DArray", self.header(stamp), [self._detection(stamp, o) for o in objects])
 

@@ -76,9 +76,9 @@ Shape = Segments | Line | Marks | Area
 class Figure:
     """A picture of a map from above.
 
-    axes: the names of the axes to the right and up. low, high: (2,) m, the corners of the shown area. scale: px/m.
-    shapes: what is drawn, the lowest first. legend: more entries, besides those of the shapes with a name. note: a remark at
-    the upper right. warning: why the map should not be trusted, under the title.
+    axes: the names of the axes to the right and up. low, high: (2,) m, the corners of the shown area. scale: px/m. shapes:
+    what is drawn, the lowest first. legend: more entries. Each shape with a name has one anyway. note: a remark at the upper
+    right. warning: why the map should not be trusted, under the title.
     """
 
     title: str

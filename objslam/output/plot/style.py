@@ -37,9 +37,10 @@ on each side. A picture shows objects up to `_AROUND` times the box's diagonal a
 far objects. A larger `_AROUND` hides fewer."""
 _KNOWN_HEADING, _LONGER = np.radians(15), 2.0
 """A picture shows the corners of a cuboid under two conditions. The standard deviation of its yaw is below `_KNOWN_HEADING`
-(rad). Its length exceeds its width by more than `_LONGER` standard deviations of their difference. With 15 degrees, three
-sigmas turn the corners of a square to the middles of its sides. Without the second condition, a bottle of TUM fr3_office was
-a square. A larger `_KNOWN_HEADING` and a smaller `_LONGER` draw more round things as turned squares."""
+(rad). Its length exceeds its width by more than `_LONGER` standard deviations of their difference. With 15 degrees, an error
+of three sigmas turns a square by 45 degrees, so that its corners are where the middles of its sides were. Without the second
+condition, a bottle of TUM fr3_office was a square. A larger `_KNOWN_HEADING` and a smaller `_LONGER` draw more round things
+as turned squares."""
 _OUTLINE_POINTS = 96  # An ellipse is drawn with this many points, which labels avoid. With fewer, labels get between them.
 _MOST, _FENCE = 0.9, (2.0, 0.15, 1.0)
 """A picture shows an object if its distance from the path is at most the largest of three distances. The first is

@@ -45,7 +45,7 @@ def scene_data(
 
     The rays, the path and the true path are float32 arrays in base64. A site has neither rays nor a path. "axes" are the
     map's axes in the frame of the view. truth: the ground truth in the frame of the map. up: the axis of the map that points
-    up. colours: of the objects, those of their labels by default.
+    up. colours: of the objects. The default is the colours of their labels.
     """
     turn = upright(up)
     names, of_label = captions(objects), label_colours(objects)
@@ -93,7 +93,7 @@ def _half_axes(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
 
 
 def _body(objects: ObjectMap, i: int, turn: Floats) -> list[list[float]]:
-    """Return half the length, the width and the height of the body of object i, as vectors like those of `_half_axes`.
+    """Return half the length, the width and the height of the body of object i, as vectors like in `_half_axes`.
 
     There are none if the object is a point.
     """

@@ -49,7 +49,7 @@ class Event:
 
 
 def drive_events(result: RunResult) -> list[Event]:
-    """Return the events of a drive: first those of the whole run, then those of objects in the order of time."""
+    """Return the events of a drive: first events of the whole run, then events of objects in the order of time."""
     start = float(result.keyframes.stamps[0])
     resolved = len(result.map.resolved())
     objects = f"{resolved} objects, {len(result.map) - resolved} unresolved"
@@ -80,8 +80,8 @@ def drive_events(result: RunResult) -> list[Event]:
 def _enough_parallax(result: RunResult) -> Floats:
     """Return the stamp (N,), s, at which each object first has enough parallax.
 
-    The stamp is that of its first used ray at an angle of at least `triangulation.min_parallax_deg` to its earliest used
-    ray. NaN if there is none.
+    At this stamp, a used ray first has an angle of at least `triangulation.min_parallax_deg` to the earliest used ray. NaN
+    if there is none.
     """
     stamps = np.full(len(result.map), np.nan)
     used = np.flatnonzero(ray_kinds(result)["used"])

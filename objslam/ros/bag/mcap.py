@@ -134,7 +134,7 @@ def _record(op: int, data: bytes, reading: _Reading) -> Messages:
                 reading.connections[key] = channel
         elif op == _MESSAGE:
             if len(data) < _MESSAGE_HEAD.size:
-                raise CorruptDataError("a message without its head")
+                raise CorruptDataError("the header of a message is incomplete")
             yield from _records(_RECORD.pack(op, len(data)) + data, reading)
     except (struct.error, CorruptDataError):
         reading.report.damage("a broken schema, channel or message")
@@ -156,7 +156,7 @@ def _unpack_chunk(data: bytes, cut: bool = False) -> bytes:
         _, _, size, crc = _CHUNK_HEAD.unpack_from(data)
         (method,) = _strings(data, _CHUNK_HEAD.size, 1)
     except struct.error as error:
-        raise CorruptDataError("it has no head") from error
+        raise CorruptDataError("its header is incomplete") from error
     start = _CHUNK_HEAD.size + 4 + len(method.encode()) + 8
     if cut:
         return unpack(data[start:], method, cut=True)

@@ -3,8 +3,8 @@
 New journals have format 2. Its header has four parts: `OBJSLAM2`, 8 bytes that identify the journal, the number of this
 segment from 1 on, and a CRC-32 of these three parts. A record is a mark, the length of its content, a CRC-32 of length and
 content, and the content. The mark lets a reader find the next record behind a damaged one. Format 1 is only read, and
-appended to. Its header is `OBJSLAM1`. Its records have no mark, and their CRC-32 is that of the content alone. All numbers
-are little endian and have 4 bytes.
+appended to. Its header is `OBJSLAM1`. Its records have no mark, and their CRC-32 covers the content alone. All numbers are
+little endian and have 4 bytes.
 """
 
 import struct

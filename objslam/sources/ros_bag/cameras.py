@@ -42,9 +42,9 @@ def find_cameras(
 
     The recording decides what counts as a camera:
 
-    - With calibrations from a file, each calibration is a camera. Its topics are those whose name or frame_id has the
-      camera's name as a part. A single calibration without such topics takes all topics. One of several calibrations without
-      such topics is left out with a warning.
+    - With calibrations from a file, each calibration is a camera. Its topics have the camera's name as a part of their name
+      or frame_id. A single calibration without such topics takes all topics. One of several calibrations without such topics
+      is left out with a warning.
     - Otherwise, each frame_id of detections is a camera.
     - Without detections, each frame_id that colour images share with a CameraInfo is a camera. A single topic of colour
       images is a camera too.
@@ -130,9 +130,9 @@ def _gather(
 ) -> CameraTopics:
     """Find all topics of a camera. seeds: the topics of detections or images that define the camera.
 
-    Its other images are those with the frame_id `frame`. The only camera (`alone`) also gets images with another frame_id,
-    if the user chose these images or if the camera has no frame_id. Its CameraInfo has the same frame_id. Without such a
-    CameraInfo, one with a similar name is taken, or any if no name is similar.
+    Its other images have the frame_id `frame`. The only camera (`alone`) also gets images with another frame_id, if the user
+    chose these images or if the camera has no frame_id. Its CameraInfo has the same frame_id. Without such a CameraInfo, one
+    with a similar name is taken, or any if no name is similar.
     """
 
     def mine(role: str) -> list[Topic]:

@@ -65,10 +65,10 @@ def read_bag(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions |
     """Read a ROS 1 bag, a ROS 2 bag (sqlite3 or MCAP, file or folder), or several files of one recording.
 
     The first pass reads everything except the images. The second pass reads the images, unless `options.with_images` is
-    False. Stamps are those of the headers, or the times of recording if the headers have none. Damaged files are read as far
-    as possible and never changed. The ledger counts the lost messages.
-    Raises LogError if the robot's path or every camera is missing, and ConfigError for options that do not fit the bag. The
-    LogError is a NoCamera if the bag has a path, but neither images nor detections.
+    False. Stamps are from the headers, or the times of recording if the headers have none. Damaged files are read as far as
+    possible and never changed. The ledger counts the lost messages. Raises LogError if the robot's path or every camera is
+    missing, and ConfigError for options that do not fit the bag. The LogError is a NoCamera if the bag has a path, but
+    neither images nor detections.
     """
     options = options or BagOptions()
     assembly = assemble(paths, ledger, options)

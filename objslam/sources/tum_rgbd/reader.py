@@ -58,7 +58,7 @@ def read_numbered(path: Path, ledger: Ledger, options: TumOptions = TumOptions()
     """Read the numbered layout.
 
     A file whose name begins with the number n belongs to pose line n. Pose lines are counted from 0, and comments are not
-    counted. Without camera.yaml, the calibration is that of freiburg3. Files without a pose, and further files with the same
+    counted. Without camera.yaml, the calibration is of freiburg3. Files without a pose, and further files with the same
     number, are dropped and counted. Raises LogError if the poses or the boxes are unusable.
     """
     with reading(path):

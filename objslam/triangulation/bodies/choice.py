@@ -18,7 +18,7 @@ _EQUAL = 1.0
 things of a log say less about the shape of one."""
 _MOST = 6.0
 """The other things of a label count as at most this number of things, and so do the other things of a log. If their true
-shape is not among the tried shapes, all of them have the same error, so a hundred tell little more than a few. With a larger
+shape is not among the tried shapes, all of them have the same error, so a hundred say little more than a few. With a larger
 number, the shape of one thing is surer."""
 _REPEATS = 20
 """How often `with_shares_of_shapes` repeats its expectation. More are slower and change little."""
@@ -50,10 +50,10 @@ def log_evidence(
 def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
     """Return the logarithm of the evidence (S, N), plus the logarithm of the share of each shape among the other things.
 
-    The boxes of one thing often hardly tell whether it is an ellipsoid or a cylinder. But things of one label are alike, and
-    so are the things of a room. The shares of the shapes are those of the other things of the label. Their prior is the
-    shares in the whole log, whose own prior is that all are equal. Each is the expectation over what the other things may be
-    (CVB0; Asuncion et al. 2009). evidence: (S, N) of each shape. label: (N,).
+    The boxes of one thing often hardly show whether it is an ellipsoid or a cylinder. But things of one label are alike, and
+    so are the things of a room. The shares of the shapes come from the other things of the label. Their prior is the shares
+    in the whole log, whose own prior is that all are equal. Each is the expectation over what the other things may be (CVB0;
+    Asuncion et al. 2009). evidence: (S, N) of each shape. label: (N,).
     """
     shapes, things = evidence.shape
     own = np.unique(label, return_inverse=True)[1].ravel()
@@ -78,8 +78,9 @@ def shapes_disagree(evidence: Floats, axes: Floats, chosen: Ints) -> Floats:
     the chosen bodies.
 
     evidence: (S, N) the logarithm of the evidence of each shape. axes: (S, N, A) centres and half axes, m, of the bodies of
-    each shape, NaN for what a shape does not tell. chosen: (N,). The result is the second moment about the chosen shape: a
-    mixture's covariance has it beside the covariances of its parts (Hoeting et al. 1999, Bayesian model averaging).
+    each shape, NaN for what a shape does not have. chosen: (N,). The result is the second moment about the chosen shape. The
+    covariance of a mixture contains it, besides the covariances of its parts (Hoeting et al. 1999, Bayesian model
+    averaging).
     """
     chance = np.exp(evidence - evidence.max(axis=0))
     chance /= chance.sum(axis=0)

@@ -15,15 +15,15 @@ from objslam.triangulation.bodies.residuals import Residuals
 from objslam.triangulation.bodies.shapes import CUBOID, ELLIPSOID
 
 _TURNS = np.radians([0.0, 22.5, 45.0, 67.5])
-"""The headings (rad) at which square cuboids are fitted, from that of the best one so far. A square repeats after a quarter
-turn. In simulations of things seen over 30 degrees, four headings always found the best cuboid, and two missed it for one
-thing in 20. More headings are slower."""
+"""The headings (rad) at which square cuboids are fitted, relative to the best cuboid so far. A square repeats after a
+quarter turn. In simulations of things seen over 30 degrees, four headings always found the best cuboid, and two missed it
+for one thing in 20. More headings are slower."""
 _ONE_SIDE = np.radians(35.0)
 """A thing was seen from one side if no view is farther (rad) from the mean view. In simulations, cuboids seen over 60
 degrees and more had one clear heading. A larger angle searches at more things."""
 _RIVAL = 15.0
-"""Other headings of a cuboid are tried unless another shape has more evidence by more than this (ln). Another heading has
-raised the evidence by up to 11. A larger number searches at more things."""
+"""Other headings of a cuboid are tried, unless the evidence (ln) of another shape is higher by more than this. Another
+heading has raised the evidence by up to 11. A larger number searches at more things."""
 _SAME = 0.005
 """Two cuboids are one if no centre and no half axis differs by more than this (m). A larger length merges more of them."""
 
@@ -101,7 +101,7 @@ def all_headings(
     Args:
         found: the fits of the cuboids so far.
         evidence: (N,) the logarithm of their evidence.
-        rival: (N,) that of the best other shape.
+        rival: (N,) the logarithm of the evidence of the best other shape.
         prior: the prior of ellipsoids.
         side: (B,) as in `log_evidence`.
 
@@ -133,7 +133,7 @@ def all_headings(
 
 
 def _repeated(others: OtherCuboids, chosen: Ints) -> Bools:
-    """Return which cuboids (M, N) are the chosen one, or the same as the chosen one or an earlier one."""
+    """Return which cuboids (M, N) equal the chosen cuboid or an earlier one."""
     axes = others.axes
     same = np.abs(axes[:, None] - axes[None]).max(axis=3) < _SAME  # (M, M, N)
     repeated = np.array([same[at, :at].any(axis=0) for at in range(len(axes))])
@@ -141,7 +141,7 @@ def _repeated(others: OtherCuboids, chosen: Ints) -> Bools:
 
 
 def mixed_fit(which: Bools, body: Ints, first: Fit, second: Fit) -> Fit:
-    """Return the first fit for some bodies (N,), and the second for the others."""
+    """Return a fit with the bodies `which` (N,) of the first fit, and the other bodies of the second."""
     boxes = which[body]
     found = Residuals(
         *(_rows(boxes, a, b) for a, b in zip(vars(first.found).values(), vars(second.found).values(), strict=True))

@@ -55,7 +55,7 @@ class BoxEdges:
         return replace(self, **selected)
 
     def joined(self, other: BoxEdges) -> BoxEdges:
-        """Return these boxes, and then those of `other`."""
+        """Return these boxes, and then the boxes of `other`."""
         both: dict[str, Any] = {name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()}
         return replace(self, **both)
 

@@ -114,7 +114,7 @@ def heading(values: Floats) -> Floats:
 def axes_jacobian(values: Floats) -> Floats:
     """Return the derivatives (N, 7, 7) of centre, half axes and yaw by the parameters of ellipsoids (N, 7).
 
-    A round section has no yaw. Its derivatives are those of an aspect of 1e-3.
+    A round section has no yaw. Its derivatives are computed at an aspect of 1e-3.
     """
     half, twice = half_axes(values), 2 * heading(values)
     aspect = np.maximum(np.hypot(values[:, 4], values[:, 5]), _ROUND)

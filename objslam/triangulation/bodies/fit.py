@@ -50,8 +50,8 @@ class Weights:
     """How much the residuals of boxes count.
 
     spread: (B, 5) the standard deviation of a residual. variance: (B, 5) the variance with which it counts. This is larger
-    than spread^2 if residuals share an error, so that they count as few. robust: whether residuals far beyond their spread
-    count less (Cauchy's weight).
+    than spread^2 if residuals share an error, so that many of them count as few. robust: whether residuals far beyond their
+    spread count less (Cauchy's weight).
     """
 
     variance: Floats

@@ -33,8 +33,8 @@ _TURNS = 5
 
 @dataclass(frozen=True)
 class Hidden:
-    """The hidden edges of N bodies. edges: (B, 4) which are hidden. between: (N, 6, 6) the second moment of centre and half
-    axes, m, between the bodies with and without hidden edges, about the likelier one."""
+    """The hidden edges of N bodies. edges: (B, 4) which are hidden. between: (N, 6, 6) how uncertain centre and half axes
+    (m) are because it is unknown whether edges are hidden. It is their second moment about the likelier body."""
 
     edges: Bools
     between: Floats
@@ -56,7 +56,7 @@ class Noise:
 
 
 def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
-    """Return the edges, of which those in the mask `hidden` (B, 4) are bounds too."""
+    """Return the edges. Those in the mask `hidden` (B, 4) become bounds, too."""
     return replace(edges, bound=edges.bound | hidden)
 
 

@@ -116,7 +116,7 @@ def cuboid_prior(prior: Prior, start: Floats) -> Prior:
 
 
 def dot_prior(prior: Prior) -> Prior:
-    """Return the prior of points: that of ellipsoids with half axes of `_DOT` m."""
+    """Return the prior of points. They are ellipsoids with half axes of `_DOT` m."""
     mean, information = prior.mean.copy(), prior.information.copy()
     mean[:, 3:] = np.log(_DOT), 0.0, 0.0, np.log(_DOT)
     information[:, 3:, 3:] = _TIE**-4 * np.eye(4)

@@ -32,8 +32,8 @@ class Residuals:
 
     value: (B, 5), predicted minus measured: the shift in x and y (px), half of the width and of the height (px), and the
     range (m). If an edge of an axis is a bound, the two edges of this axis replace its shift and its size. by: (B, 5, 7)
-    derivatives of `value` by the parameters of the bodies. rows: (B, 5, 8) both, the derivatives first. use: (B, 5) whether
-    a residual counts. An edge that is a bound counts only while the body does not reach it.
+    derivatives of `value` by the parameters of the bodies. rows: (B, 5, 8) the derivatives, then the value. use: (B, 5)
+    whether a residual counts. An edge that is a bound counts only while the body does not reach it.
     """
 
     rows: Floats
@@ -164,7 +164,7 @@ def on_shift_and_size(edges: BoxEdges, rows: Floats) -> Floats:
 
 
 def whole_axes(edges: BoxEdges) -> Bools:
-    """Return which of the residuals (B, 4) of boxes are shifts and sizes: those of an axis without a bound."""
+    """Return which of the residuals (B, 4) of boxes are shifts and sizes: an axis has them if it has no bound."""
     return np.tile((edges.bound[:, :2] == 0) & (edges.bound[:, 2:] == 0), 2)
 
 

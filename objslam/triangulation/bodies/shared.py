@@ -28,15 +28,16 @@ WITHIN = 0.7
 mean error of a side has this share of the variance of a single error. With a larger share, smaller errors are found."""
 UNLIKE = 0.04
 """No thing has exactly the shape of its body, so the boxes of one side share an error. This is its least standard deviation,
-as a share of half the size. The outline of a hexagonal prism differs by 4 % from that of the best cylinder. Things that were
-seen from one side do not show this error, because their bodies bend to it. A larger share makes their depths less sure."""
+as a share of half the size. The outlines of a hexagonal prism and of the best cylinder differ by 4 %. Things that were seen
+from one side do not show this error, because their bodies bend to it. A larger share makes their depths less sure."""
 _ALONG = 1.0
 """The error of a side changes with the distance. This is the standard deviation of the change from a distance to e times
-this distance, in standard deviations of the error. With a larger change, the growth of boxes tells less about the
+this distance, in standard deviations of the error. With a larger change, the growth of boxes says less about the
 distance."""
 _BEYOND = 0.5
-"""The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. It is that of
-lengths between 0 and 0.9 of the size. A larger share makes objects that something hides less sure."""
+"""The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. Lengths that
+are evenly spread between 0 and 0.9 of the size have this value. A larger share makes objects that something hides less
+sure."""
 _SHARES = 41
 """The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
@@ -215,7 +216,7 @@ def covariance_of(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, shar
 def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Floats, share: Floats) -> tuple[Floats, Floats]:
     """Return `covariance_of`, and what is added to it because no thing has exactly the shape of its body (`UNLIKE`).
 
-    The error of a side also changes with the distance. Otherwise the growth of boxes on the way to a thing would tell its
+    The error of a side also changes with the distance. Otherwise the growth of boxes on the way to a thing would give its
     distance exactly, however wrong its outline is.
     """
     count = len(fit.values)
@@ -248,8 +249,8 @@ def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Flo
 def _weights_of_bounds(edges: BoxEdges, found: Residuals) -> Floats:
     """Return the weights (B, 4), 1/px^2, with which bounds count in a covariance, 0 for residuals that are no bounds.
 
-    A body that just reaches a bound may go on beyond it. So a bound is a measurement of the edge with the error of the
-    hidden length, at least `_BEYOND`. All boxes of a body share this error, so they count as one.
+    A body that just reaches a bound may go on beyond it. So a bound counts as a measured edge, whose error is the hidden
+    length: at least `_BEYOND`. All boxes of a body share this error, so they count as one.
     """
     length = np.hypot(_BEYOND * np.maximum(edges.size, 1.0)[:, None], np.maximum(found.value[:, : ROWS - 1], 0.0))
     number = np.bincount(edges.body)[edges.body, None]
@@ -257,7 +258,7 @@ def _weights_of_bounds(edges: BoxEdges, found: Residuals) -> Floats:
 
 
 def _ln_distances(edges: BoxEdges, fit: Fit) -> Floats:
-    """Return ln of the distance (B,) of each box's camera from its body, less the mean over the boxes of the body."""
+    """Return ln of the distance (B,) of each box's camera from its body, minus the mean over the boxes of the body."""
     away = np.linalg.norm(fit.values[edges.body, :3] - edges.origin, axis=1)
     found = np.log(np.maximum(away, 1e-9))
     number = np.maximum(np.bincount(edges.body, minlength=len(fit.values)), 1)

@@ -32,7 +32,7 @@ from objslam.triangulation.bodies.to_centre import directions_to_centres, shifts
 Measure = Callable[[Floats | None], BoxEdges]
 """The edges of the boxes, given points (B, 4, P, 3) in map at which bodies may touch them. None means unknown points."""
 More = Callable[["Bodies"], "BoxEdges | None"]
-"""More edges that can only be found with the bodies, such as those of cut off boxes. None if there are none."""
+"""More edges that can only be found with the bodies, such as the edges of cut off boxes. None if there are none."""
 
 _POINT, _SPHERE, _ELLIPSOID, _CUBOID, _CYLINDER = range(5)
 _SOLID = (_ELLIPSOID, _CUBOID, _CYLINDER)
@@ -54,11 +54,11 @@ class Bodies:
     ellipsoid, 3 cuboid, 4 cylinder. evidence: (5, N) the logarithm of the evidence of each shape, plus the logarithm of how
     usual the shape is (`with_shares_of_shapes`). weight: (B,) the robust weight of each box. share: (2,) the standard
     deviations of the errors of shift and size that boxes of one side share, as shares of half their size. factors: (2,) on
-    the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus that to the
-    centre of its predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on each axis, as in
-    `hidden_edges`. between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes, about the chosen
-    one. It is not in `covariance`. unlike: (N, 7, 7) what is added to `covariance` because no thing has exactly the shape of
-    its body.
+    the nominal noise of shifts and sizes. to_centre: (B, 3) unit direction to the centre of each body, minus the unit
+    direction to the centre of its predicted box, in map. It is 0 for a point. hidden: (B, 2) the number of hidden edges on
+    each axis, as in `hidden_edges`. between_shapes: (N, 6, 6) the second moment of centre and half axes, m, over the shapes,
+    about the chosen one. It is not in `covariance`. unlike: (N, 7, 7) what is added to `covariance` because no thing has
+    exactly the shape of its body.
     """
 
     values: Floats
@@ -279,7 +279,7 @@ def _finished(edges: BoxEdges, sides: Sides, now: _State, between: Floats) -> Bo
 
 
 def _axes_of_shapes(now: _State) -> Floats:
-    """Return centres and half axes (5, N, 6), m, of the bodies of each shape. A point tells no half axes."""
+    """Return centres and half axes (5, N, 6), m, of the bodies of each shape. A point has no half axes."""
     axes = np.stack(
         [np.column_stack([v[:, :3], kind.half_axes(v)]) for v, kind in zip(now.fitted, KINDS, strict=True)],
     )
@@ -293,7 +293,8 @@ def _of_shapes(fitted: tuple[Floats, ...], shape: Ints) -> Floats:
 
 
 def _dots(edges: BoxEdges, now: _State, weights: Weights, side: Floats) -> tuple[Floats, Floats]:
-    """Return points (N, 7), which do not explain the sides of boxes, and the logarithm of their evidence (N,)."""
+    """Return the objects as points (N, 7), and the logarithm of their evidence (N,). Points do not explain the sizes of
+    boxes."""
     prior, variance, spread = dot_prior(now.prior), weights.variance.copy(), weights.spread.copy()
     free_rows = ~whole_axes(edges)
     free_rows[:, 2:] = True  # The size of a box is free, and the place of one edge of it too.

@@ -12,7 +12,7 @@ from objslam.triangulation.bodies.residuals import Residuals, whole_axes
 def shifts_of(edges: BoxEdges, found: Residuals) -> Floats:
     """Return by how much predicted boxes lie to the right of the measured ones and below them (B, 2), px.
 
-    If one edge of an axis is a bound, the other edge tells the shift. Two bounds tell no shift, so it is 0.
+    If one edge of an axis is a bound, the other edge gives the shift. Two bounds give no shift, so it is 0.
     """
     low, high, both = edges.bound[:, :2], edges.bound[:, 2:], found.value[:, :4]
     by_one_edge = np.where(high, np.where(low, 0.0, -both[:, :2]), both[:, 2:])
@@ -23,7 +23,7 @@ def directions_to_centres(edges: BoxEdges, centre: Floats, shift: Floats) -> Flo
     """Return unit directions (B, 3) to the centres (N, 3), m, of bodies, minus the unit directions to the centres of
     predicted boxes.
 
-    gap: (B, 2) px, by how much the predicted box lies to the right of the detected one, and below it.
+    shift: (B, 2) px, by how much the predicted box lies to the right of the detected one, and below it.
     """
     ray = edges.direction
     predicted = ray.copy()

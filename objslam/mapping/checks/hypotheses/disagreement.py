@@ -33,9 +33,9 @@ _TRIED = 64  # The most directions that are tried for a distant thing. A larger 
 def disagree(found: Agreement, trials: list[Trial], part: Part) -> Finding | None:
     """Return a finding if the boxes agree with the poses only by chance, although they would show parallax.
 
-    found: the agreement after a correction of the usual errors of the cameras, from `without_usual_errors`. trials: those
-    with turned mounts show the score by chance in this log. Things that are too far for parallax give no point, but each has
-    one direction.
+    found: the agreement after a correction of the usual errors of the cameras, from `without_usual_errors`. trials: of all
+    hypotheses. Turned mounts among them show the score by chance in this log. Things that are too far for parallax give no
+    point, but each has one direction.
     """
     by_chance = chance(trials)
     if by_chance is None or found.score >= min(_BAD_SCORE, max(_TIMES * by_chance, _HARDLY)):

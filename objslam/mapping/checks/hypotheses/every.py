@@ -38,7 +38,7 @@ def hypotheses(log: Log) -> Iterator[Hypothesis]:
 
 
 def coarse_hypotheses(log: Log) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about mounts, paths and images. Each moves most rays far, if it is wrong."""
+    """Yield the hypotheses about mounts, paths and images. A wrong one moves most rays by far."""
     yield from mounts(log)
     yield from _paths(log)
     yield from _images()
@@ -121,8 +121,8 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
 
 
 def _squares(edges: set[int]) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about boxes in px of a detector's square. edges: (px), as returned by `_clipped_edges`. A square
-    of another side does not explain boxes that end there."""
+    """Yield the hypotheses about boxes in px of a detector's square. edges: (px), as returned by `_clipped_edges`. If boxes
+    end at another edge than the side of a square, this square is left out."""
     for side in _SQUARES:
         if edges - {side}:
             continue

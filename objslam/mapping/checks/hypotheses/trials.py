@@ -28,8 +28,8 @@ _CROOKED, _STRAIGHT = 0.62, 0.85
 logs, hand-held cameras have 0.68 and more, wheels 0.94, and wrong axes at most 0.59. A larger first value suspects more
 paths. A larger second value accepts fewer corrections."""
 _NOT_WORSE = 0.8
-"""A hypothesis about the axes of a path must keep this share of the score. Boxes of sparse logs show little about axes. A
-larger share accepts fewer corrections."""
+"""A hypothesis about the axes of a path must keep this share of the score. In sparse logs, boxes hardly depend on the axes.
+A larger share accepts fewer corrections."""
 _EQUAL = 0.95
 """Another hypothesis is as good as the best if it has this share of the best score. A larger share names fewer
 alternatives."""
@@ -48,11 +48,12 @@ _CHANCE = 90.0
 """The percentage of all turned mounts that have at most the score of chance. With a larger percentage, more agreement counts
 as chance."""
 _LEFT, _TIMES_CHANCE = 0.62, 1.5
-"""At poses of a localisation, a hypothesis must leave at most the share `_LEFT` of the misfit (1 - score) that turned mounts
-leave by chance, or have at least `_TIMES_CHANCE` times their score. Noisy poses spoil what really fits, but hardly what fits
-by chance, so a wrong hypothesis may fit better than the unchanged log. In 80 logs of 16 simulated robots with a mistake, the
-right hypothesis leaves at most 0.57. In noisy logs without a mistake, the best hypothesis leaves at least 0.68, and has at
-most 1.36 times the score. A larger share and a smaller multiple name more causes."""
+"""At poses of a localisation, a hypothesis must pass one of two tests against turned mounts, which fit by chance. Its misfit
+(1 - score) is at most the share `_LEFT` of theirs, or its score is at least `_TIMES_CHANCE` times theirs. Noisy poses spoil
+what really fits, but hardly what fits by chance, so a wrong hypothesis may fit better than the unchanged log. In 80 logs of
+16 simulated robots with a mistake, the right hypothesis leaves at most 0.57. In noisy logs without a mistake, the best
+hypothesis leaves at least 0.68, and has at most 1.36 times the score. A larger share and a smaller multiple name more
+causes."""
 _BEYOND, _FAR_BETTER = 1.3, 1.5
 """A mount is clear if its score is at least `_BEYOND` times the score by chance, and at least `_FAR_BETTER` times the score
 of the unchanged log. Logs of five kinds of simulated robots and of three real robots were tried, with odometry alone and a
@@ -152,7 +153,7 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
         fit += ", and the robot drives where it heads"
     message = f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}"
     if taken:
-        message += f". The run takes this error for {unusual}, and corrects that"
+        message += f". The run takes this error for {unusual}, and corrects it"
     return Finding(best.hypothesis.name, message, spoils=not taken, basis="log" if _is_crooked(first) else "boxes")
 
 

@@ -33,8 +33,8 @@ def seen_in_both(late: Bools, fits: Bools, owner: Ints) -> float:
     """Return the share of a half's fitting rays whose objects the other half sees too. The half with the larger share
     counts.
 
-    A robot that drives on to new places no longer sees most of the old objects, so the smaller share tells less.
-    late, fits: as in `check_halves`. owner: (R,) the object of each ray, -1 for none.
+    A robot that drives on to new places no longer sees most of the old objects, so the smaller share says less. late, fits:
+    as in `check_halves`. owner: (R,) the object of each ray, -1 for none.
     """
     count = int(owner.max(initial=-1)) + 1
     seen = np.stack([np.bincount(owner[fits & mask], minlength=count) for mask in (~late, late)])

@@ -6,7 +6,7 @@ while the robot turns left, and to the other side while it turns right.
 
 The errors of poses last for seconds, and many boxes share them. The covariance of an estimate takes each box as new, so it
 is too small at the poses of a particle filter. So the estimate is repeated without each eighth of the boxes. How much it
-changes tells its real error (jackknife with blocks, Kuensch 1989). A turn must be far larger than this error.
+changes shows its real error (jackknife with blocks, Kuensch 1989). A turn must be far larger than this error.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,8 +37,8 @@ MOVED = 0.05
 """If a camera's rotation differs by more than this (rad) between the halves of a log, it was moved. A larger value warns
 less often."""
 SIGMAS = 5.0
-"""A camera was moved only if its rotation differs between the halves by more than this number of standard deviations. Both
-the standard deviation of the estimate and that of the jackknife count. A larger number warns less often."""
+"""A camera was moved only if its rotation differs between the halves by more than this number of standard deviations. The
+standard deviations of the estimate and of the jackknife both count. A larger number warns less often."""
 _SUSPECT, _SUSPECT_SIGMAS = 0.5, 2.0
 """The least difference for which another round of the estimation follows: as a multiple of `MOVED`, and in standard
 deviations. In the first round, only the rays fit that show a small difference. Larger values take less time, and find fewer
@@ -92,7 +92,7 @@ def finding_of_turns(moved: Mapping[str, float]) -> list[Finding]:
 
 
 def in_halves(cameras: Sequence[CameraLog]) -> tuple[CameraLog, ...]:
-    """Return two cameras in place of each one: first those of the first half, then those of the second half.
+    """Return two cameras in place of each one: first the cameras of the first half, then the cameras of the second half.
 
     All of them have the boxes of both halves.
     """
@@ -157,7 +157,7 @@ def _halves(part: Part, middle: float) -> Part:
 def one_rotation_each(errors: SharedErrors, turn: float = _TURN) -> Floats:
     """Return a prior covariance (P, P) that lets only the rotations of a camera differ between the halves.
 
-    errors: those of the cameras of two halves. turn: rad, the standard deviation of the difference. With 0, nothing differs.
+    errors: of the cameras of two halves. turn: rad, the standard deviation of the difference. With 0, nothing differs.
     """
     sigma = np.sqrt(np.diagonal(errors.prior))
     prior = np.diag(sigma**2)

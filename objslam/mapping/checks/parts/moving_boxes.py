@@ -6,10 +6,10 @@ from objslam.core.arrays import Bools
 from objslam.core.types import Detections, Log
 
 _NEAR = 12.0
-"""Two boxes lie at one place of the image if their centres are nearer than this (px). It exceeds the noise of boxes, and
-things that a moving camera passes move farther within `_LATER`. A larger distance takes slow motion for a stop."""
+"""Two boxes lie at one place of the image if their centres are nearer than this (px). It exceeds the noise of boxes. Things
+that a moving camera passes move farther than this within `_LATER`. A larger distance takes slow motion for a stop."""
 _NEAR_SHARE = 0.1
-"""The same, as a share of the mean of a box's width and height, because the noise of a box grows with its size."""
+"""The same distance as a share of the mean of a box's width and height, because the noise of a box grows with its size."""
 _LATER = 2.0
 """The time (s) after which a box shows whether it moved. A longer time shows slower motions, and needs longer stops."""
 _STAYS = 0.25
@@ -49,7 +49,7 @@ def boxes_move(log: Log, start: float, end: float) -> bool:
 
 
 def _stays_and_moves(boxes: Detections, step: float) -> tuple[Bools, Bools]:
-    """Return which boxes of one label (A,) stay, and which of them move. At most `_ASKED` boxes are asked.
+    """Return which boxes of one label (A,) stay, and which of them move. At most `_ASKED` boxes are judged.
 
     step: px, the farthest way of a box from one frame to the next.
     """

@@ -17,7 +17,7 @@ _FORMULA = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
 
 
 def _dump(content: Content) -> bytes:
-    """Return the objects as UTF-8 text, with those that are gone last. Numbers have all digits of their floats. An unknown
+    """Return the objects as UTF-8 text. Objects that are gone come last. Numbers have all digits of their floats. An unknown
     value is empty.
 
     A label that a spreadsheet would take for a formula gets an apostrophe in front, as OWASP advises against CSV injection.
