@@ -39,8 +39,8 @@ _GROWN = 0.05
 no solve follows. In 170 random parts of real drives, 85 graphs were in a known minimum, and no solve from them ended
 elsewhere. A larger share saves more solves."""
 _CLEARLY = 3.0
-"""Another start is better than the first one if its misfit is smaller by this number, as twice a logarithm of odds. A larger
-value changes the start more rarely."""
+"""Another start is better than the first one if its misfit, which is twice a logarithm of odds, is smaller by this number. A
+larger value changes the start more rarely."""
 
 
 @dataclass(frozen=True)

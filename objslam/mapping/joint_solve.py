@@ -180,8 +180,8 @@ def _from_tracks(begin: JointState) -> JointState:
 
 
 def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
-    """Return the state from another start if it explains the log better, else the given state. A start from which nothing
-    can be solved changes nothing."""
+    """Return the state from another start if it explains the log better, else the given state. If nothing can be solved from
+    that start, the given state is returned."""
     try:
         attempt = _searched(start())
     except SolveError:  # The map of the state is there, whatever is wrong with the other start.
