@@ -51,6 +51,7 @@ class Estimate:
     error_covariance: Floats | None = None
 
     def with_errors(self, more: Floats) -> Self:
-        """Return the estimate with the covariances (N, 3, 3), m^2, that errors cause beside the noise of the rays."""
+        """Return the estimate with the covariances (N, 3, 3), m^2, that errors cause in addition to the noise of the
+        rays."""
         before = np.zeros(more.shape) if self.error_covariance is None else self.error_covariance
         return replace(self, covariance=self.covariance + more, error_covariance=before + more)

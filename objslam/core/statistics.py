@@ -221,5 +221,5 @@ def log_beta(a: Floats, b: Floats) -> Floats:
 
 
 def _log_gamma(values: Floats) -> Floats:
-    """Return the logarithms (...) of the gamma function of few positive numbers (...)."""
+    """Return the logarithms (...) of the gamma function of a few positive numbers (...)."""
     return np.array([math.lgamma(value) for value in values.ravel().tolist()]).reshape(values.shape)

@@ -33,7 +33,7 @@ def embed_log(log: Log, encoder: Encoder, ledger: Ledger, progress: Progress = l
         found, images = camera_log.detections, camera_log.rgb
         if found is not None and images is not None and len(found):
             if found.features is not None:
-                ledger.warn(f"{spoken_name(camera_log.camera.name)}: the encoder's vectors replace those of the log")
+                ledger.warn(f"{spoken_name(camera_log.camera.name)}: the encoder's vectors replace the vectors of the log")
             found = _embedded(found, images, camera_log.camera, encoder, ledger, progress)
             seen += found.features is not None
         cameras.append(replace(camera_log, detections=found))

@@ -134,7 +134,7 @@ def _features(boxes: Detections, before: list[Floats32 | None], camera: Camera, 
     length = next((one.shape[1] for one in before if one is not None), boxes.features.shape[1])
     if boxes.features.shape[1] == length:
         return boxes.features
-    reason = "features of another length than those of the first camera (these boxes get none)"
+    reason = "features of another length than in the first camera (these boxes get none)"
     ledger.drop(reason, int((~np.isnan(boxes.features[:, 0])).sum()), spoken_name(camera.name))
     return None
 

@@ -72,8 +72,8 @@ def _densities(step: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats, F
     """Return the squared changes of velocity from a step to the next (n-1, 6) and to the next but one (n-2, 6). Also return
     two noise densities (n-1, 6) by the changes to the next step: if the velocity is white noise, and if it is a random walk.
 
-    step: (n, 6) twists. seconds: (n, 1) the time of each step. With two steps, no step has a next but one, and the first
-    changes count in both places.
+    step: (n, 6) twists. seconds: (n, 1) the time of each step. If there are only two steps, the changes to the next step are
+    returned for both.
     """
     velocity = step / seconds
     once = np.diff(velocity, axis=0) ** 2

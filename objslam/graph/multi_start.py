@@ -25,9 +25,9 @@ bearings only, the first graph led to landmarks that were 1 to 2 m off. All thre
 two with twice the parallax. Two of the three graphs may end in one wrong minimum, so both values count. More values take
 longer."""
 _FEW_RAYS = 1500
-"""In logs with more rays, the first start that ends in a known minimum is the last one. In some random parts of real drives,
-the second start ended in the minimum of the first. With fewer rays than this, the third start then had a better minimum in 7
-of 59 parts, and with more rays in 2 of 71. A larger number makes logs of some minutes slower."""
+"""In logs with more rays, no further start is tried after one that ends in a known minimum. In some random parts of real
+drives, the second start ended in the minimum of the first. With fewer rays than this, the third start then had a better
+minimum in 7 of 59 parts, and with more rays in 2 of 71. A larger number makes logs of some minutes slower."""
 _SAME = 0.1
 """Two solutions are in one minimum if no landmark differs by more than this share of the size of the map. In wrong minima of
 real drives, some landmark differs by a third of it or more. A larger share compares fewer solutions."""
@@ -39,8 +39,8 @@ _GROWN = 0.05
 no solve follows. In 170 random parts of real drives, 85 graphs were in a known minimum, and no solve from them ended
 elsewhere. A larger share saves more solves."""
 _CLEARLY = 3.0
-"""Another start is better than the first one if its misfit is smaller by this number, as twice a logarithm of odds. A larger
-value changes the start more rarely."""
+"""Another start is better than the first one if its misfit, which is twice a logarithm of odds, is smaller by this number. A
+larger value changes the start more rarely."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class MultiStart:
 
         Ranges determine a position at once. So if at least half of the objects have one, or if there are fiducials, the
         first solution is returned. It is also returned for a log with many rays (`_MOST_RAYS`). In a log with more than few
-        rays (`_FEW_RAYS`), the first start that ends in a known minimum is the last one.
+        rays (`_FEW_RAYS`), no further start is tried after one that ends in a known minimum.
         """
         rays, object_ = self.measured.rays, self.association.object
         ranged = np.unique(object_[np.isfinite(rays.range) & (object_ >= 0)])
@@ -94,7 +94,8 @@ class MultiStart:
 
 
 def _among(solutions: list[JointSolution], positions: Floats, share: float) -> bool:
-    """Return whether a solution has the same landmarks, at positions (N, 3) that differ by at most a share of its size."""
+    """Return whether one of the solutions has the same landmarks as `positions` (N, 3), in places that differ by at most a
+    share of its size."""
     return any(_in_one_minimum(one.positions, positions, share) for one in solutions)
 
 

@@ -105,7 +105,7 @@ class BoxCollector:
         corners = np.full((len(self.boxes), 4, 2), np.nan)
         corners[list(self.corners)] = np.array(list(self.corners.values()), dtype=np.float64)
         wrong = np.isin(np.arange(len(corners)), list(self.corners)) & ~valid_corners(corners)
-        reason = "corners that are not those of a square (taken as unknown)"
+        reason = "corners that do not form a square (taken as unknown)"
         drop_rows(reason, good & wrong, self.box_places, ledger)
         corners[wrong] = np.nan
         return corners

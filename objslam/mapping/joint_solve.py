@@ -106,8 +106,8 @@ def _with_gross_errors(begin: JointState, found: JointState) -> JointState | Non
 
 
 def _with_several_a_label(state: JointState, named: JointState) -> JointState:
-    """Return the state with several objects a label if there is clear evidence for it, else the state `named`, which has one
-    object for each label. state: before the solve by labels.
+    """Return the state with several objects per label if there is clear evidence for it, else the state `named`, which has
+    one object for each label. state: before the solve by labels.
 
     A short drive may show too little for an exploration, which then finds fewer objects than there are labels, or parts of
     one object. So labels count as names unless the other map has objects for all of them, and is far more likely.
@@ -180,8 +180,8 @@ def _from_tracks(begin: JointState) -> JointState:
 
 
 def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
-    """Return the state from another start if it explains the log better, else the given state. A start from which nothing
-    can be solved changes nothing."""
+    """Return the state from another start if it explains the log better, else the given state. If nothing can be solved from
+    that start, the given state is returned."""
     try:
         attempt = _searched(start())
     except SolveError:  # The map of the state is there, whatever is wrong with the other start.

@@ -30,7 +30,7 @@ def doubts_of(camera: Camera) -> list[str]:
     doubts = []
     if _has_no_rotation(camera):
         doubts.append(
-            f"{spoken_name(camera.name)}: base_T_camera has no rotation. That is right if the poses are those of the "
+            f"{spoken_name(camera.name)}: base_T_camera has no rotation. That is right if the poses are poses of the "
             "camera's optical frame (z forward). On a robot, a camera that looks ahead has "
             "rotation_xyzw [-0.5, 0.5, -0.5, 0.5]"
         )

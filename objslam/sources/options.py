@@ -25,7 +25,7 @@ class Option:
 
 WithRange = Annotated[bool, Option("--without-range", "MRCLAM, TUM, ROS bags: boxes without depths (bearings only).")]
 Label = Annotated[str | None, Option("--label", "Label of boxes that have no class.")]
-DETECTOR = Option("--detector", "ONNX model that finds boxes in the rgb images. Its boxes replace those of the log.")
+DETECTOR = Option("--detector", "ONNX model that finds boxes in the rgb images. Its boxes replace the boxes of the log.")
 """The option that chooses the detector, in `objslam run` and in live sessions."""
 
 

@@ -102,7 +102,7 @@ def test_vectors_of_another_length_are_named_or_left_out() -> None:
     objects = ObjectMap(tuple(replace(thing, id=i, features=vector) for i, vector in enumerate(vectors)))
     assert [o.id for o, _ in objects.search([1.0, 0.0])] == [0]
     assert [o.id for o, _ in objects.search([1.0, 0.0, 0.0])] == [1]
-    with pytest.raises(ValueError, match="the vector has 4 numbers, but those of the objects have 2"):
+    with pytest.raises(ValueError, match="the vector has 4 numbers, but the vectors of the objects have 2"):
         objects.search(np.ones(4))
 
 

@@ -93,7 +93,7 @@ def test_corners_are_read_back_and_those_of_no_square_are_unknown(tmp_path):
     frame = {"stamp": 1.0, "boxes": [[0, 0, 9, 9]] * 4, "labels": ["tag_1"] * 4, "scores": [1, 1, 1, 1]}
     corners = [square, None, bow_tie, square[::-1]]
     detections, ledger, _ = _read(tmp_path, frame | {"corners": corners})
-    assert ledger.dropped == {"corners that are not those of a square (taken as unknown)": 1}
+    assert ledger.dropped == {"corners that do not form a square (taken as unknown)": 1}
     assert np.isnan(detections.corners[1:3]).all()
     assert detections.corners[0].tolist() == square
     assert detections.corners[3].tolist() == square[::-1]

@@ -57,7 +57,7 @@ def test_a_usual_result_is_good() -> None:
         ({"unexplained": 220, "rejected": 10}, "check", "24 % of the used boxes belong to no object, and 1 % miss their"),
         ({"odometry": 10.8}, "check", "The boxes agree only if the odometry is 11 times as noisy as the settings say"),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
-        ({"fixed": True, "odometry_frame": True}, "check", "The poses are those of the odometry, so the map has"),
+        ({"fixed": True, "odometry_frame": True}, "check", "The poses come from the odometry, so the map has"),
         (
             {"rays": 20, "unexplained": 0, "rejected": 0},
             "check",

@@ -106,7 +106,8 @@ def near(problem: Problem, moved: Floats) -> tuple[Ints, Ints]:
 
 
 def _assigned(problem: Problem, moved: Floats, own: Floats) -> Ints:
-    """Return the best pairs (P, 2), one to one, of objects of a, at (N, 3) m with own errors (N, 3, 3) m^2, and of b."""
+    """Return the best pairs (P, 2) of objects of a and of b, one to one. moved, own: (N, 3) m, (N, 3, 3) m^2, places and own
+    errors of the objects of a."""
     one, two = near(problem, moved)
     miss = problem.b.position[two] - moved[one]
     squared = (miss * np.linalg.solve(own[one] + problem.b.own[two], miss[..., None])[..., 0]).sum(axis=1)

@@ -99,6 +99,6 @@ def ranked(vectors: Sequence[Floats32], query: ArrayLike, count: int) -> list[tu
         raise ValueError("the vector is zero or not finite")
     alike = [i for i, vector in enumerate(vectors) if len(vector) == len(given)]
     if len(vectors) and not alike:
-        raise ValueError(f"the vector has {len(given)} numbers, but those of the objects have {len(vectors[0])}")
+        raise ValueError(f"the vector has {len(given)} numbers, but the vectors of the objects have {len(vectors[0])}")
     cosine = np.array([vectors[i] for i in alike], dtype=np.float64).reshape(-1, len(given)) @ unit.astype(np.float64)
     return [(alike[i], float(cosine[i])) for i in np.argsort(-cosine, kind="stable")[: max(count, 0)].tolist()]

@@ -44,7 +44,7 @@ def raised_covariances(covariances: Floats, scale: float) -> Floats:
 def noise_of_ground(settings: Settings) -> tuple[float, float]:
     """Return the standard deviations of roll and of pitch, rad, and of the height, m, that planar poses lack.
 
-    Both are 0 on a floor as the defaults of `planar` describe it, which hardly moves a ray.
+    Both are 0 if `planar` has its defaults. They describe a floor, which hardly moves a ray.
     """
     of = settings.planar
     return (0.0, 0.0) if of == type(of)() else (of.tilt, of.z)

@@ -101,5 +101,5 @@ def _roughness(motions: Floats, seconds: Floats) -> float:
 
 
 def _energy(rows: Floats) -> float:
-    """Return the mean over the columns of the squared sums of the rows (6 n, D) of each motion."""
+    """Return the sum over the motions of the squared sums of their 6 rows (6 n, D), as a mean over the D columns."""
     return float((rows.reshape(-1, 6, rows.shape[1]).sum(axis=1) ** 2).sum()) / rows.shape[1]

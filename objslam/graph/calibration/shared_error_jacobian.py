@@ -231,8 +231,8 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
         return np.asarray(range_root * (lengths(to_landmark) - measured) / (measured / range_))
 
     def turned(keyframes: Keyframes) -> Floats:
-        """Return the poses (P, 4, 4) that the cameras have on another mount, in the frames of the cameras on the present
-        mount."""
+        """Return the poses (P, 4, 4) of the cameras on the mounts of `keyframes`, in the frames of the cameras on the
+        present mounts."""
         return inverse(mounts) @ keyframes.base_T_camera
 
     def off(measured: Floats, moved: Floats, turned: Floats) -> Floats:

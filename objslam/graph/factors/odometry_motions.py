@@ -2,10 +2,10 @@
 
 Between two poses of the odometry, a keyframe has an interpolated pose. Such errors are not independent, because the odometry
 knows the whole step: a robot that turned late in one motion turned more in the next. So the motions inside a step get the
-loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact. Let the
-motions take the shares d of a step. Their noise is D diag(d) from the odometry, plus the bridge W (diag(d) - d d'). Then
-their information is a sum: the information of independent motions with the noise (D + W) d, plus the information 1 / D - 1 /
-(D + W) of a tie.
+loose noise of a random walk, and a tie across the step measures their sum. For a linear system this is exact. Let d be the
+shares of a step that its motions cover. The noise of the motions is D diag(d) from the odometry, plus the bridge W (diag(d)
+- d d'). Then their information is a sum: the information of independent motions with the noise (D + W) d, plus the
+information 1 / D - 1 / (D + W) of a tie.
 """
 
 from dataclasses import dataclass, replace

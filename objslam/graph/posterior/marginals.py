@@ -84,7 +84,7 @@ class SolvedMeasurements:
 
     @property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """The same as a graph of GTSAM, which names a variable that is not determined."""
+        """The solved graph as a graph of GTSAM, which names a variable that is not determined."""
         return self._whole[0]
 
     @property

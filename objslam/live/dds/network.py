@@ -105,7 +105,7 @@ def _join(domain: int, interface: str | None) -> Network:
 def _leave(entity: Any) -> None:
     """Leave a domain with all its entities, before the interpreter ends.
 
-    Threads of the DDS library release Python's types. A thread that asks for the interpreter while it ends is stopped for
+    Threads of the DDS library release Python's types. A thread that asks for the interpreter during its end is stopped for
     ever. The library would wait for this thread, and so the process would never end. The domain is left while the thread of
     `_listen` still reads the log of the library. Later nobody would read it. A flood of malformed packets would fill the
     pipe, and the library would wait.

@@ -168,7 +168,7 @@ def _built(log: Log, settings: Settings, before: tuple[Log, Keyframes, Rays] | N
 
 
 def _differ_in_mounts(one: Log, other: Log) -> bool:
-    """Return whether two logs share all their data but base_T_camera. No camera moves on the robot."""
+    """Return whether two logs share all their data but base_T_camera. False if a camera moves on the robot."""
     if one.localization is not other.localization or one.odometry is not other.odometry:
         return False
     parts = [f.name for f in fields(Camera) if f.name != "base_T_camera"]

@@ -187,7 +187,7 @@ def _check(e: Evidence) -> list[str]:
     found = []
     if e.fixed and e.odometry_frame:
         # Drift splits an object into parts, and the rays of each part fit it well. So the residuals do not show drift.
-        found.append("The poses are those of the odometry, so the map has its drift: --mode joint corrects it.")
+        found.append("The poses come from the odometry, so the map has its drift: --mode joint corrects it.")
     errors = [name for name in e.findings if name != NOISIER]
     if NOISIER in e.findings:
         found.append("The poses or depths are far noisier than the settings say, and the warnings say how noisy.")

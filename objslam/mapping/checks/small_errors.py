@@ -40,7 +40,7 @@ _CLOCK_SIGMA = 0.05
 certain."""
 
 CAUSES = {
-    "clock": "the clock of the camera and that of the poses differ",
+    "clock": "the clocks of the camera and of the poses differ",
     "yaw": "base_T_camera is turned about the vertical axis",
     "tilt": "base_T_camera is tilted up or down",
     "roll": "base_T_camera is rolled",

@@ -35,7 +35,7 @@ def disagreeing(result: RunResult, misfits: Misfits) -> list[Doubt]:
                 "rays disagree",
                 o.label,
                 f"{o.label} #{o.id} may be several things, or its boxes show parts of it: its rays miss it by {times:.1f} "
-                f"times their noise, and those of most objects by {misfits.usual:.1f} times. Its sigma allows for this.",
+                f"times their noise, and the rays of most objects by {misfits.usual:.1f} times. Its sigma allows for this.",
                 (o.id,),
                 o.position,
                 np.flatnonzero(result.association.object == j),

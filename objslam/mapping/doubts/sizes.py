@@ -110,7 +110,7 @@ def _doubt(result: RunResult, j: int, mine: Ints, scatter: float, usual: float) 
         "sizes",
         o.label,
         f"{o.label} #{o.id} may be several things, or at a wrong place: the sizes in its boxes scatter by a factor of "
-        f"{np.exp(scatter):.2f}, and those of other objects by {np.exp(usual):.2f}.",
+        f"{np.exp(scatter):.2f}, and the sizes of other objects by {np.exp(usual):.2f}.",
         (o.id,),
         o.position,
         mine[result.association.object[mine] == j],

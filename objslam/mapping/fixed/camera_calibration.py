@@ -256,9 +256,9 @@ def _first_trial(
 def _left(at: FixedPoses, association: Association, positions: Floats) -> tuple[float, float]:
     """Return two means over the rays: the squared miss, in variances, and -2 ln of the probability, up to a constant.
 
-    More noise than the settings say counts as a miss, as in the normal distribution. If there are more objects of a label,
-    its rays can belong to more of them, and each is less likely. An object costs as in the Bayesian information criterion
-    (Schwarz 1978). at: with the noise of the poses. positions: (N, 3) m, NaN for an object without a position.
+    Noise above the settings adds 4 ln of its factor to the miss, as in the normal distribution. If there are more objects of
+    a label, its rays can belong to more of them, and each is less likely. An object costs as in the Bayesian information
+    criterion (Schwarz 1978). at: with the noise of the poses. positions: (N, 3) m, NaN for an object without a position.
     """
     from objslam.graph.fixed_pose_triangulation import pose_noise
 

@@ -112,11 +112,11 @@ def with_sparse_noise(
 def sparse_noise(log: Log, settings: Settings, progress: Progress) -> tuple[tuple[SparseNoise, ...], float]:
     """Return the noise of a log's places, depths and boxes with which its boxes show objects at the given poses.
 
-    Also return the lead, in log odds, of the log as it is over the log with turned cameras. The first noise has the noisiest
-    places of all that are about as likely as the likeliest one. After it come the others, from the likeliest on. There is
-    none if no noise explains most of the boxes, far better than chance and than the noise in the settings. Only noise that
-    the settings let a run estimate is changed. Without depths, the noise in the settings is the only one: with noisy places,
-    bearings meet anywhere.
+    Also return the lead, in log odds, of the log as it is over the log with turned cameras. Several noises may be about as
+    likely as the likeliest one. Of these, the one with the noisiest places comes first. The others follow, from the
+    likeliest on. The list is empty if no noise explains most of the boxes, far better than chance and than the noise in the
+    settings. Only noise that the settings let a run estimate is changed. Without depths, the noise in the settings is the
+    only one: with noisy places, bearings meet anywhere.
     """
     part = middle(log)
     places, depths, boxes = _unknown(part, settings)

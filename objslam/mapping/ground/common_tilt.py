@@ -100,9 +100,8 @@ class _Poses:
     def solve(self, logarithms: Floats, alike: Floats | None = None) -> tuple[float, Floats, Floats]:
         """Return -2 ln of the restricted likelihood, the effects (P,), and the errors of the poses (K, n).
 
-        logarithms: (3,) those of three numbers: the factor on the noise of rays, the tilt, rad, and the height, m. alike:
-        (K, K) the correlation of the errors of two poses, None if they are independent. SolveError if the system is not
-        finite.
+        logarithms: (3,) of three numbers: the factor on the noise of rays, the tilt, rad, and the height, m. alike: (K, K)
+        the correlation of the errors of two poses, None if they are independent. SolveError if the system is not finite.
         """
         factor, tilt, height = np.exp(logarithms)
         sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[: self.pulled.shape[1]] / factor

@@ -37,7 +37,7 @@ with one thing for each label, and a simulated drive with two labels of two thin
 labels, and a smaller factor explores more logs without need."""
 _REJECTED = 0.1
 """A label is doubted if at least `MANY` of its rays, and at least this share, are rejected. A larger share doubts fewer
-labels. In a smaller share, a second object cannot be told from wrong names and false boxes."""
+labels. In a smaller share, a second object cannot be distinguished from wrong names and false boxes."""
 _NOISIER = 1.5
 """A map with one object for each label may need this multiple of the noise of boxes or depths that a map with several
 objects needs. A larger factor favours one object for each label."""

@@ -179,7 +179,7 @@ def _add_boxes(connection: Connection, topic: Topic, decode: _Decoder, label: st
     try:
         found = list(find_boxes(connection.type, decode(data)))
     except WRONG_LAYOUT as error:
-        raise DecodeError(f"the fields are not those of detections ({error})") from error
+        raise DecodeError(f"the fields do not fit detections ({error})") from error
     _note_header(connection, topic, data)
     place = f"{topic.name} at {logged / 1e9:.3f} s"
     topic.boxes.add_frame(logged / 1e9, place)

@@ -138,7 +138,7 @@ def _clocks() -> Iterator[Hypothesis]:
         yield Hypothesis(
             f"clock {offset:+.1f} s",
             f"the stamps of the frames {abs(offset):g} s {sign}",
-            f"the clock of the camera is about {abs(offset):g} s {'behind' if offset > 0 else 'ahead of'} that of the poses",
+            f"the clock of the camera is about {abs(offset):g} s {'behind' if offset > 0 else 'ahead of'} the poses",
             partial(later, offset=offset),
             clock=offset,
         )

@@ -59,11 +59,11 @@ def _usual(log: Log) -> Iterator[Hypothesis]:
             yield _mount(
                 f"mount unset, {side}",
                 f"a camera that looks {side}",
-                "base_T_camera is not set, or its axes are those of a body and not of an optical frame",
+                "base_T_camera is not set, or it has the axes of a body and not of an optical frame",
                 partial(_turned_in_camera, turn=turn @ _OPTICAL),
             )
         return
-    cause = "base_T_camera probably has the axes of a body (x forward) instead of those of an optical frame (z forward)"
+    cause = "base_T_camera probably has the axes of a body (x forward) instead of the axes of an optical frame (z forward)"
     to_optical = partial(_turned_in_camera, turn=_OPTICAL)
     yield _mount("mount axes", "the axes of an optical frame in base_T_camera", cause, to_optical)
     cause = "the quaternion of base_T_camera is probably w x y z instead of x y z w"

@@ -20,7 +20,7 @@ _CROWD = 1.4
 """In a larger crowd (`Part.crowd`) than this, rays meet by chance. The unnamed posts of the MRCLAM robots have 1.9. With a
 larger value, fewer logs need the larger limits below."""
 _CROWD_TIMES, _CROWD_MORE = 2.0, 0.25
-"""In a crowd, these values replace `_TIMES` and `_MORE`. Larger values name fewer causes."""
+"""In a crowd (above `_CROWD`), these values replace `_TIMES` and `_MORE`. Larger values name fewer causes."""
 _MORE_BOXES = 25
 """The least number of additional boxes that must fit. A larger number needs longer logs."""
 _CROOKED, _STRAIGHT = 0.62, 0.85

@@ -109,7 +109,7 @@ def _spreads(halves: Part, turned: Calibration, settings: Settings) -> dict[str,
     """Return the standard deviation (rad) of each turn between the halves, by the jackknife.
 
     turned: the errors of the whole log. Each estimate without a block starts from them, because fewer rays fit without them.
-    A block without which nothing can be estimated changes nothing.
+    If nothing can be estimated without a block, the block counts as no change.
     """
     stamps = [np.zeros(0) if one.detections is None else one.detections.frame_stamps for one in halves.log.cameras]
     every = np.sort(np.concatenate([one.detections.stamps for one in halves.log.cameras if one.detections is not None]))
