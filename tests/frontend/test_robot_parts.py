@@ -6,52 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robot_arm import ARM, with_arm
 from turning_drive import BASE_T_CAMERA, drive
 
+from objslam.association.observations import overlap
 from objslam.config import load_settings
-from objslam.core.camera import Camera, project
+from objslam.core.camera import Camera, project, undistort
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import inverse, lift_se2, make_pose
+from objslam.core.geometry import interpolate, inverse, lift_se2, make_pose
 from objslam.core.types import CameraLog, Detections, Log, Trajectory
 from objslam.evaluation.evaluate import evaluate
+from objslam.frontend.boxes.part_finder import RobotPartFinder
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS, without_robot_parts
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
 
 SETTINGS = load_settings(None, ("output.recording=false",))
-ARM = np.array([210.0, 330.0, 290.0, 400.0])
-
-
-def with_boxes(log: Log, label: str, boxes: np.ndarray, frames: np.ndarray) -> Log:
-    """The log with more boxes (M, 4) of a label in these frames (M,) of its only camera."""
-    found = log.cameras[0].detections
-    assert found is not None
-    names = found.label_names if label in found.label_names else (*found.label_names, label)
-    order = np.argsort(np.concatenate([found.frame, frames]), kind="stable")
-
-    def joined(one: np.ndarray, more: object) -> np.ndarray:
-        return np.concatenate([one, np.broadcast_to(more, (len(frames), *one.shape[1:]))])[order]
-
-    more = replace(
-        found,
-        frame=joined(found.frame, frames),
-        boxes=joined(found.boxes, boxes),
-        label=joined(found.label, names.index(label)),
-        scores=joined(found.scores, 0.9),
-        depths=joined(found.depths, np.nan),
-        track_ids=joined(found.track_ids, -1),
-        label_names=names,
-    )
-    return replace(log, cameras=(replace(log.cameras[0], detections=more),))
-
-
-def with_arm(log: Log, label: str, share: float = 0.5) -> Log:
-    """The log with boxes of the robot's arm, in this share of the frames, with 1.5 px of noise."""
-    rng = np.random.default_rng(1)
-    found = log.cameras[0].detections
-    assert found is not None
-    frames = np.flatnonzero(rng.random(len(found.frame_stamps)) < share)
-    return with_boxes(log, label, ARM + rng.normal(0, 1.5, (len(frames), 4)), frames)
 
 
 def dropped(log: Log, settings=SETTINGS) -> tuple[Log, int]:
@@ -103,32 +73,100 @@ def test_a_camera_on_an_arm_keeps_its_boxes():
     assert dropped(replace(log, cameras=(moving,)))[1] == 0
 
 
-def test_a_thing_in_the_middle_of_a_circle_stays():
-    """The camera looks at it all the time, so it stays at one place of the image, but its rays meet."""
+def circling() -> Log:
+    """The camera looks at a thing in the middle of a circle all the time."""
     turn = np.linspace(0, 4 * np.pi, 300)
     circle = np.column_stack([2 * np.cos(turn), 2 * np.sin(turn), turn + np.pi])
-    log = looking(circle, 60.0, np.array([[0.0, 0.0, 0.5]]))
+    return looking(circle, 60.0, np.array([[0.0, 0.0, 0.5]]))
+
+
+def after_a_wait() -> Log:
+    """A robot waits before a thing, and then turns on the spot."""
+    still = np.zeros((100, 3))
+    still[:, 2] = np.random.default_rng(0).normal(0, 0.01, 100)
+    turn = np.linspace(0, 4 * np.pi, 80)
+    return looking(np.concatenate([still, np.column_stack([0 * turn, 0 * turn, turn])]), 60.0, np.array([[2.0, 0.0, 0.5]]))
+
+
+def past_a_row() -> Log:
+    """A robot passes a dense row of equal things to and fro."""
+    row = np.column_stack([np.arange(-4, 4, 0.35), np.full(23, 2.0), np.full(23, 0.5)])
+    turn = np.linspace(0, 60, 400)
+    path = np.column_stack([1.5 * np.sin(0.2 * turn), 0.3 * np.cos(0.3 * turn), np.pi / 2 + 0.5 * np.sin(0.7 * turn)])
+    return looking(path, 60.0, row)
+
+
+def test_a_thing_in_the_middle_of_a_circle_stays():
+    """It stays at one place of the image, but its rays meet."""
+    log = circling()
     assert len(log.cameras[0].detections.boxes) > 290
     assert np.ptp(log.cameras[0].detections.boxes, axis=0).max() < 15
     assert dropped(log)[1] == 0
 
 
 def test_a_thing_before_a_robot_that_waits_stays():
-    still = np.zeros((100, 3))
-    still[:, 2] = np.random.default_rng(0).normal(0, 0.01, 100)
-    turn = np.linspace(0, 4 * np.pi, 80)
-    log = looking(np.concatenate([still, np.column_stack([0 * turn, 0 * turn, turn])]), 60.0, np.array([[2.0, 0.0, 0.5]]))
-    assert dropped(log)[1] == 0
+    assert dropped(after_a_wait())[1] == 0
 
 
 def test_a_row_of_equal_things_stays():
     """Some of the boxes are at each place of the image in nearly each frame, but as many are beside it."""
-    row = np.column_stack([np.arange(-4, 4, 0.35), np.full(23, 2.0), np.full(23, 0.5)])
-    turn = np.linspace(0, 60, 400)
-    path = np.column_stack([1.5 * np.sin(0.2 * turn), 0.3 * np.cos(0.3 * turn), np.pi / 2 + 0.5 * np.sin(0.7 * turn)])
-    log = looking(path, 60.0, row)
+    log = past_a_row()
     assert len(log.cameras[0].detections.boxes) > 2000
     assert dropped(log)[1] == 0
+
+
+def found_online(log: Log) -> tuple[np.ndarray, RobotPartFinder]:
+    """Which boxes of a log a session would drop, and its finder."""
+    found, camera = log.cameras[0].detections, log.cameras[0].camera
+    assert found is not None
+    path = log.odometry
+    poses = interpolate(path.stamps, path.poses, found.frame_stamps, 10.0)[0] @ camera.base_T_camera
+    direction = undistort(camera, (found.boxes[:, :2] + found.boxes[:, 2:]) / 2)[0]
+    finder, part = RobotPartFinder(), []
+    for frame, pose in enumerate(poses):
+        mine = found.frame == frame
+        part.append(finder.add(found.boxes[mine], found.label[mine], pose, direction[mine]))
+    return np.concatenate(part), finder
+
+
+def test_a_session_finds_the_arm_while_it_drives():
+    clean = drive()
+    log = with_arm(clean, "thing_3")
+    found = log.cameras[0].detections
+    assert found is not None
+    _, left = dropped(log)
+    arm = overlap(ARM, found.boxes) > 0.7
+    assert arm.sum() == left  # None of the things has a box there.
+    part, finder = found_online(log)
+    assert (part <= arm).all()
+    first = int(np.flatnonzero(part)[0])
+    assert found.stamps[first] - found.stamps[0] < 20
+    assert part[first:].sum() > 0.98 * arm[first:].sum()  # A noisy box of the arm may overlap by less than 0.7.
+    np.testing.assert_array_equal(
+        finder.are_parts(found.boxes, found.label) & arm, finder.are_parts(found.boxes, found.label)
+    )
+    assert finder.are_parts(found.boxes, found.label).sum() > 0.95 * arm.sum()
+    assert not found_online(clean)[0].any()
+
+
+def test_a_session_forgets_an_arm_that_has_moved_away():
+    log = with_arm(drive(), "arm")
+    found, (_, finder) = log.cameras[0].detections, found_online(log)
+    assert found is not None
+    arm = found.label_names.index("arm")
+    box, label, ahead = ARM[None], np.array([arm]), np.array([[0.0, 0.0, 1.0]])
+    assert finder.are_parts(box, label).all()
+    elsewhere = ARM[None] - 150.0
+    for _ in range(502):
+        assert not finder.add(elsewhere, label, np.eye(4), ahead).any()
+    assert not finder.add(box, label, np.eye(4), ahead).any()
+
+
+@pytest.mark.parametrize("log", [circling(), past_a_row(), after_a_wait()], ids=["circle", "row", "wait"])
+def test_a_session_keeps_boxes_of_things_at_rest(log):
+    part, finder = found_online(log)
+    assert not part.any()
+    assert not finder.are_parts(log.cameras[0].detections.boxes, log.cameras[0].detections.label).any()
 
 
 def test_a_run_without_the_boxes_of_an_arm_has_the_map_of_the_drive():

@@ -18,8 +18,9 @@ from objslam.core.geometry import lift_se2
 from objslam.core.types import Log, Trajectory
 from objslam.errors import LogError
 from objslam.mapping import pipeline
-from objslam.mapping.checks.agreement import bounded_part
+from objslam.mapping.checks.agreement import agreement, bounded_part
 from objslam.mapping.checks.diagnosis import diagnose
+from objslam.mapping.checks.hypotheses.disagreement import disagree
 from objslam.mapping.checks.hypotheses.every import hypotheses, with_frame_stamps, with_poses
 from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis, with_cameras
 from objslam.mapping.checks.hypotheses.trials import Trial, verdict
@@ -397,6 +398,22 @@ def test_a_mount_that_no_usual_mistake_explains_is_said_to_be_wrong():
     """The nearest right angle is 45 degrees away, about no axis."""
     found = findings(remounted(drive("fixed", 3), lambda turn: degrees("xyz", 40, 35, 45) @ turn), "fixed")
     assert [one.name for one in found if one.spoils] == ["boxes disagree"]
+
+
+@pytest.mark.parametrize(("cut", "accused"), [(0.0, True), (1.2, False)])
+def test_boxes_without_a_ray_are_no_sign_of_wrong_poses(cut, accused):
+    """A simulated robot among people had 0.31 of its boxes, and 0.67 of its rays. Turned mounts had 0.22 of the boxes."""
+    settings = load_settings(None, ("mode=fixed",))
+    part = bounded_part(drive("fixed"), settings)
+    found = agreement(part, part.log, settings)
+    mount = Hypothesis("mount turned", "the camera turned", "the camera is turned", lambda log: log, of_mount=True)
+    trials = [Trial(None, 0.31, 0.44, 1.0), *[Trial(mount, 0.22, 0.3, 1.0)] * 20]
+    boxes = int((1 + cut) * len(found.rays))
+    point = np.where(np.arange(len(found.rays)) < 0.44 * boxes, 0, -1)
+    found = replace(found, score=0.31, share=0.44, boxes=boxes, point=point)
+    finding = disagree(found, trials, part)
+    assert (finding is not None) == accused
+    assert finding is None or "only 44 % of the boxes" in finding.message
 
 
 def test_boxes_of_distant_things_agree_with_the_poses():

@@ -18,12 +18,12 @@ from objslam.core.types import CameraLog, Detections, Log, Trajectory
 
 ROBOT_PARTS = "boxes that stay at one place of the image while the camera turns (a part of the robot; rays.robot_parts)"
 """The reason to drop such boxes."""
-_FEWEST = 20
+FEWEST = 20
 """The fewest boxes at one place of the image that may show a part of the robot. A larger number drops fewer boxes."""
-_SAME_BOX, _LIKE_BOX = 0.7, 0.3
+SAME_BOX, LIKE_BOX = 0.7, 0.3
 """Boxes are at one place of the image if their intersection over union with one box is above the first value. Boxes above
 the second value are near that place. With a larger first value, only steadier boxes are found."""
-_STEADY = 0.5
+STEADY = 0.5
 """At least this share of the boxes near a place must be at the place. Random boxes have 0.03 to 0.1 there (the share
 ((1 - 0.7) / (1 - 0.3))^4 of boxes in four coordinates, and more if the boxes have similar sizes), and a part of the robot
 has 0.9 and more. A larger share drops fewer boxes."""
@@ -35,7 +35,7 @@ _OFTEN = 0.1
 larger share drops fewer boxes."""
 _TRIED = 64
 """The most boxes of a label and camera around which boxes are counted. A larger number finds rarer boxes."""
-_TURN = np.radians(30.0)
+TURN = np.radians(30.0)
 """The angle (rad) by which the camera turns in a window. Odometry is good over such a turn, and a thing at rest moves by
 much of the image. A larger angle needs more turning."""
 _MISSED = np.radians(5.0)
@@ -45,7 +45,7 @@ turns in its place (30 degrees / sqrt(12)). A larger angle drops fewer boxes."""
 _BEHIND = 0.2
 """A window also shows this if the nearest point is behind the camera for more than this share of its rays. A larger share
 drops fewer boxes."""
-_WINDOWS, _AGREE = 3, 0.8
+WINDOWS, AGREE = 3, 0.8
 """At least so many windows must show it, and at least this share of all windows. Larger values drop fewer boxes."""
 
 
@@ -62,7 +62,7 @@ def without_robot_parts(log: Log, settings: Settings, ledger: Ledger) -> Log:
 
 def _cleaned(one: CameraLog, path: Trajectory, settings: Settings, ledger: Ledger) -> CameraLog:
     found = one.detections
-    if found is None or one.mount is not None or len(found) < _FEWEST:
+    if found is None or one.mount is not None or len(found) < FEWEST:
         return one
     poses, known = interpolate(path.stamps, path.poses, found.frame_stamps, settings.poses.max_gap)
     part = np.zeros(len(found), dtype=bool)
@@ -82,18 +82,18 @@ def _steady(found: Detections, usable: Bools) -> Iterator[Ints]:
     often = _OFTEN * np.bincount(tenth, minlength=10)
     for label in np.unique(found.label[usable]).tolist():
         mine = np.flatnonzero(usable & (found.label == label))
-        while len(mine) >= _FEWEST:
+        while len(mine) >= FEWEST:
             some = mine[np.linspace(0, len(mine) - 1, min(_TRIED, len(mine))).astype(np.int64)]
-            there = overlap(found.boxes[some][:, None], found.boxes[mine][None]) >= _SAME_BOX
+            there = overlap(found.boxes[some][:, None], found.boxes[mine][None]) >= SAME_BOX
             best = there[there.sum(axis=1).argmax()]
             alike = overlap(np.median(found.boxes[mine[best]], axis=0), found.boxes[mine])
-            group = mine[alike >= _SAME_BOX]
+            group = mine[alike >= SAME_BOX]
             seen = np.bincount(tenth[np.unique(found.frame[group])], minlength=10)
-            if len(group) < _FEWEST or (seen >= often).sum() < _TENTHS:
+            if len(group) < FEWEST or (seen >= often).sum() < _TENTHS:
                 break
-            if len(group) >= _STEADY * (alike >= _LIKE_BOX).sum():
+            if len(group) >= STEADY * (alike >= LIKE_BOX).sum():
                 yield group
-            mine = mine[(alike < _SAME_BOX) & ~best]
+            mine = mine[(alike < SAME_BOX) & ~best]
 
 
 def _never_rests(found: Detections, group: Ints, map_T_camera: Floats, camera: Camera) -> bool:
@@ -102,15 +102,15 @@ def _never_rests(found: Detections, group: Ints, map_T_camera: Floats, camera: C
     direction, valid = undistort(camera, middle)
     poses = map_T_camera[found.frame[group[valid]]]
     direction, origin = np.einsum("mij,mj->mi", poses[:, :3, :3], direction[valid]), poses[:, :3, 3]
-    missed = [_misses(origin[window], direction[window]) for window in _windows(poses[:, :3, 2])]
-    return sum(missed) >= max(_WINDOWS, _AGREE * len(missed))
+    missed = [misses(origin[window], direction[window]) for window in _windows(poses[:, :3, 2])]
+    return sum(missed) >= max(WINDOWS, AGREE * len(missed))
 
 
 def _windows(ahead: Floats) -> Iterator[slice]:
-    """Yield windows of boxes, in each of which the camera turns by `_TURN`. ahead: (M, 3) its direction at each box."""
+    """Yield windows of boxes, in each of which the camera turns by `TURN`. ahead: (M, 3) its direction at each box."""
     first = 0
     while first < len(ahead):
-        turned = np.flatnonzero(ahead[first:] @ ahead[first] < np.cos(_TURN))
+        turned = np.flatnonzero(ahead[first:] @ ahead[first] < np.cos(TURN))
         if not len(turned):
             return
         last = first + int(turned[0])
@@ -119,7 +119,7 @@ def _windows(ahead: Floats) -> Iterator[slice]:
         first = last
 
 
-def _misses(origin: Floats, direction: Floats) -> bool:
+def misses(origin: Floats, direction: Floats) -> bool:
     """Return whether no point explains rays (M, 3)."""
     across = np.eye(3) - direction[:, :, None] * direction[:, None]
     point = np.linalg.lstsq(across.sum(axis=0), np.einsum("mij,mj->i", across, origin), rcond=None)[0]

@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.noise import range_noise
 from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
 from objslam.errors import ObjslamError
+from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.known_errors import shared_errors
 from objslam.frontend.shared_errors import SharedErrors
@@ -59,6 +60,10 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
     owner, label, place = _owners(m)
     at = number[r.keyframe]
     rows = np.flatnonzero(at >= 0)
+    part = _of_robot_parts(m, rows)
+    if count_dropped and part.any():
+        m.counters.drop(ROBOT_PARTS, f"stamp {k.stamp[order[at[rows[part]].min()]]:.3f}", int(part.sum()))
+    rows = rows[~part]
     rows = rows[np.argsort(at[rows], kind="stable")]
     poses = m.graph.poses(k.id[order])
     kept = np.unique(at[rows])
@@ -77,6 +82,15 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
         errors = None if errors is None else replace(errors, log=log, keyframes=keyframes, rays=rays)
     theta = None if errors is None else corrections(m, errors)
     return Collected(keyframes, rays, association, objects, poses[kept], place[objects], log, errors, theta)
+
+
+def _of_robot_parts(m: MapState, rows: Ints) -> Bools:
+    """Return which rays in these rows (R,) are of parts of the robot, which the session found only later."""
+    part, camera = np.zeros(len(rows), dtype=bool), m.camera_of_rays(rows)
+    for number, finder in m.robot_parts.items():
+        mine = np.flatnonzero(camera == number)
+        part[mine] = finder.are_parts(m.rays.box[rows[mine]], m.rays.label[rows[mine]])
+    return part
 
 
 def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> SharedErrors | None:

@@ -55,6 +55,10 @@ class BearingExtractor:
         """Add a mount: a pose of a camera on the robot, valid from its stamp until the next mount."""
         self._mounts.setdefault(message.camera, HeldMounts(_MOUNTS)).add(message)
 
+    def moves(self, camera: str) -> bool:
+        """Return whether a camera, by its name, moves on the robot."""
+        return camera in self._mounts
+
     def extract(self, frame: FrameMessage, stamp: float) -> FrameView:
         """Return the bearings of a frame. Count the dropped boxes. stamp: s, corrected for the camera's clock offset."""
         number, settings, errors = self._camera_number[frame.camera], self._settings, self._map.errors

@@ -3,6 +3,7 @@
 The map depends on the messages and their order only, never on the clock, so a replayed journal gives the same map.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,9 @@ import numpy as np
 from objslam.association.landmarks import PredictedLandmarks
 from objslam.config import Settings
 from objslam.core.arrays import Floats
+from objslam.core.camera import spoken_name
+from objslam.frontend.boxes.part_finder import RobotPartFinder
+from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
 from objslam.frontend.corrected_log import OdometryCorrection
 from objslam.frontend.known_errors import known_errors
 from objslam.frontend.odometry_drift import scaled_noise
@@ -90,7 +94,9 @@ class Mapper:
             return None
         view = self._extractor.extract(frame, stamp)
         m.frames[view.camera] += 1
-        start_T_camera, shown = placed.start_T_base @ view.base_T_camera, set(view.rays.label.tolist())
+        start_T_camera = placed.start_T_base @ view.base_T_camera
+        view = self._without_robot_parts(view, start_T_camera, frame)
+        shown = set(view.rays.label.tolist())
         if not self._is_wanted(frame, view.camera, start_T_camera, shown, before):
             return None
         prediction = self._predictor.predict(before, stamp, placed, view.base_T_camera, start_T_camera)
@@ -117,6 +123,18 @@ class Mapper:
             self._predicted = predict_landmarks(m.landmarks, m.tracks)
         if m.keyframes.by_odometry[-1]:
             self._predictor.covariance_of(int(m.keyframes.id[-1]))
+
+    def _without_robot_parts(self, view: FrameView, start_T_camera: Floats, frame: FrameMessage) -> FrameView:
+        """Return the view without boxes of parts of the robot. A camera that moves on the robot keeps all boxes."""
+        m = self.state
+        if not m.given.rays.robot_parts or self._extractor.moves(frame.camera):
+            return view
+        finder = m.robot_parts.setdefault(view.camera, RobotPartFinder())
+        part = finder.add(view.rays.box, view.rays.label, start_T_camera, view.rays.direction)
+        if not part.any():
+            return view
+        m.counters.drop(ROBOT_PARTS, f"{spoken_name(frame.camera)}, stamp {frame.stamp:.3f}", int(part.sum()))
+        return replace(view, rays=view.rays.take(np.flatnonzero(~part)))
 
     def _is_wanted(
         self, frame: FrameMessage, camera: int, start_T_camera: Floats, shown: set[int], before: int | None

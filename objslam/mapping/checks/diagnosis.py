@@ -141,6 +141,7 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
         return Diagnosis(tuple(findings), tuple(trials))
     if found is not None and part.boxes >= _FEWEST:
         doubted = bool(trials) and not part.drifts and not any(one.spoils for one in findings)
+        doubted &= len(found.rays) >= _FEWEST
         none_fits = doubted and disagree(without_usual_errors(part, found, settings)[0], trials, part)
         # Where boxes agree only by chance, they say nothing about single frames, about halves, or about how a camera is
         # turned.

@@ -1,0 +1,118 @@
+"""Find boxes of parts of the robot while a session runs, with bounded memory. The rules are those of `robot_parts`."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from objslam.association.observations import overlap
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.frontend.boxes.robot_parts import AGREE, FEWEST, LIKE_BOX, SAME_BOX, STEADY, TURN, WINDOWS, misses
+
+_PLACES = 16
+"""The most places of the image that are followed for each label. A place stays among them if more than one in 17 boxes of
+the label is there (Misra and Gries 1982). A larger number finds rarer boxes and takes longer."""
+_OF_WINDOW = 32
+"""The most rays of a window that are kept. They are spread evenly. A larger number takes more memory."""
+_MOVED = np.cos(np.radians(1.0))
+"""A ray is kept if the camera has turned since the last kept ray by an angle with at most this cosine. A robot that waits
+adds none. A larger cosine keeps more rays."""
+_FORGOTTEN = 500
+"""A part of the robot is forgotten if so many frames of its camera do not show it. An arm may have moved away. With a larger
+number, boxes of things are dropped at its place for longer."""
+
+
+@dataclass
+class _Place:
+    """A place of the image where boxes of a label are. hits: the number of boxes there, less the number of times when a box
+    found no place. at, near: the numbers of boxes at the place, and near it. last: the last frame with a box there. ahead,
+    origin, direction: of the rays of the present window. missed, windows: how many windows show that no thing at rest is
+    there, and how many windows there were.
+    """
+
+    box: Floats
+    last: int
+    hits: int = 1
+    at: int = 1
+    near: int = 1
+    missed: int = 0
+    windows: int = 0
+    ahead: list[Floats] = field(default_factory=list)
+    origin: list[Floats] = field(default_factory=list)
+    direction: list[Floats] = field(default_factory=list)
+
+    @property
+    def is_part(self) -> bool:
+        """Whether a part of the robot is there."""
+        enough = self.at >= FEWEST and self.at >= STEADY * self.near
+        return enough and self.missed >= max(WINDOWS, AGREE * self.windows)
+
+    def add(self, box: Floats, frame: int, pose: Floats, direction: Floats) -> None:
+        """Add a box at this place. pose: (4, 4) of the camera. direction: (3,) of the ray, in the frame of the path."""
+        self.box += (box - self.box) / min(self.at + 1, FEWEST)
+        self.hits, self.at, self.near, self.last = self.hits + 1, self.at + 1, self.near + 1, frame
+        ahead = pose[:3, 2]
+        if self.ahead and ahead @ self.ahead[-1] > _MOVED:
+            return
+        for values, value in ((self.ahead, ahead), (self.origin, pose[:3, 3]), (self.direction, direction)):
+            values.append(value)
+        if ahead @ self.ahead[0] < np.cos(TURN):
+            if len(self.ahead) > 2:
+                self.windows += 1
+                self.missed += misses(np.array(self.origin), np.array(self.direction))
+            self._keep(slice(-1, None))
+        elif len(self.ahead) > _OF_WINDOW:
+            self._keep(slice(None, None, 2))
+
+    def _keep(self, some: slice) -> None:
+        self.ahead, self.origin, self.direction = self.ahead[some], self.origin[some], self.direction[some]
+
+
+class RobotPartFinder:
+    """Finds, frame by frame, which boxes of one camera are of parts of the robot."""
+
+    def __init__(self) -> None:
+        self._places: dict[int, list[_Place]] = {}
+        self._frame = 0
+
+    def add(self, boxes: Floats, label: Ints, pose: Floats, direction: Floats) -> Bools:
+        """Add the boxes of a frame. Return which of them are of parts of the robot, (n,).
+
+        boxes: (n, 4) px. label: (n,). pose: (4, 4) of the camera, in the frame of the odometry or the localisation.
+        direction: (n, 3) of the rays of the boxes, in the frame of the camera.
+        """
+        self._frame += 1
+        turned = direction @ pose[:3, :3].T
+        part = np.zeros(len(boxes), dtype=bool)
+        for index, (box, number, ray) in enumerate(zip(boxes, label.tolist(), turned, strict=True)):
+            part[index] = self._add(box, number, pose, ray)
+        return part
+
+    def are_parts(self, boxes: Floats, label: Ints) -> Bools:
+        """Return which boxes (n, 4) px with labels (n,) are where a part of the robot is now."""
+        part = np.zeros(len(boxes), dtype=bool)
+        for number, places in self._places.items():
+            mine = np.flatnonzero(label == number)
+            for place in places:
+                if len(mine) and place.is_part:
+                    part[mine] |= overlap(place.box, boxes[mine]) >= SAME_BOX
+        return part
+
+    def _add(self, box: Floats, label: int, pose: Floats, direction: Floats) -> bool:
+        places = self._places.setdefault(label, [])
+        places[:] = [one for one in places if not one.is_part or self._frame - one.last <= _FORGOTTEN]
+        if places:
+            alike = overlap(np.array([one.box for one in places]), box)
+            best = int(alike.argmax())
+            for index in np.flatnonzero(alike >= LIKE_BOX).tolist():
+                if index != best or alike[best] < SAME_BOX:
+                    places[index].near += 1
+            if alike[best] >= SAME_BOX:
+                places[best].add(box, self._frame, pose, direction)
+                return places[best].is_part
+        if len(places) < _PLACES:
+            places.append(_Place(box.copy(), self._frame))
+            return False
+        for one in places:
+            one.hits -= 1
+        places[:] = [one for one in places if one.hits > 0 or one.is_part]
+        return False
