@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, kind
 from objslam.core.geometry import inverse, lengths, log_se3
 from objslam.core.types import Keyframes, Rays
@@ -119,6 +119,19 @@ class ReducedSystem:
     descent: Floats
     sensitivity: Floats
     newton: Floats
+
+    def take(self, parameters: Ints) -> Self:
+        """Return the system of some parameters (n,) alone."""
+        block = np.ix_(parameters, parameters)
+        return replace(
+            self,
+            information=self.information[block],
+            slope=self.slope[block],
+            variance=self.variance[block],
+            gradient=self.gradient[parameters],
+            descent=self.descent[parameters],
+            sensitivity=self.sensitivity[:, parameters],
+        )
 
     def with_wider(self, factors: Floats | None) -> Self:
         """Return the system with larger standard deviations of its gradient. factors: (P,), None leaves them as they are."""
