@@ -17,7 +17,7 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Images, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.corrected_log import CorrectablePath, refocused, take_out
+from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, refocused, take_out
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors, take_out_known
 from objslam.frontend.odometry_drift import gathered_drift
@@ -120,6 +120,18 @@ def test_other_errors_of_one_odometry_share_its_corrected_paths(clean, monkeypat
     slower = replace(log, odometry=replace(log.odometry, stamps=2 * log.odometry.stamps))
     other = replace(same, log=slower)
     assert other.with_paths_of(errors) is other
+
+
+def test_a_second_round_of_derivatives_needs_no_new_path(clean):
+    """The scale only lengthens a path, and a clock only moves stamps. The other three errors give a path each."""
+    path, computed = CorrectablePath(clean.odometry), []
+    get = path._moved.get
+    path._moved.get = lambda key, compute: get(key, lambda: computed.append(key) or compute())
+    here = dict.fromkeys(ODOMETRY, 0.01)
+    for _ in range(2):
+        for changed in (None, *ODOMETRY, None):
+            path.poses(here if changed is None else {**here, changed: 0.02})
+    assert len(computed) == 4
 
 
 def test_the_corrected_log_has_the_same_keyframes(clean):
