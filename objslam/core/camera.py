@@ -138,8 +138,6 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
     its pixel. cv2.undistortPoints, iterated to convergence, inverts these two models. Newton's method inverts the pixels
     that OpenCV misses, and all pixels of the model equidistant (Kannala-Brandt).
     """
-    import cv2
-
     if len(pixels) == 0:
         return np.zeros((0, 3)), np.zeros(0, dtype=bool)
     if camera.fisheye:
@@ -149,6 +147,8 @@ def undistort(camera: Camera, pixels: Floats) -> tuple[Floats, Bools]:
         pixels = pixels if finite.all() else np.where(finite[:, None], pixels, 0.0)
         straight = pixels @ camera.inverse_matrix[:, :2].T + camera.inverse_matrix[:, 2]
         return straight / lengths(straight)[:, None], finite
+    import cv2  # Its import takes 0.02 s, and the boxes of many logs are undistorted.
+
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None, :]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
     flat: Floats = np.asarray(cv2.undistortPoints(points, camera.matrix, camera.distortion, criteria=criteria)[:, 0], float)
@@ -222,17 +222,17 @@ def project(camera: Camera, points: Floats) -> Floats:
 
     A pixel has no meaning if its point is outside the lens field, which `in_field` tests.
     """
-    import cv2
-
     if len(points) == 0:
         return np.zeros((0, 2))
+    if not camera.fisheye and not camera.distortion.any():
+        return np.asarray((points @ camera.matrix.T)[:, :2] / points[:, 2:])
+    import cv2  # As in `undistort`.
+
     still = np.zeros(3)
     if camera.fisheye:
         pixels, _ = cv2.fisheye.projectPoints(points[:, None], still, still, camera.matrix, camera.distortion)
-    elif camera.distortion.any():
-        pixels, _ = cv2.projectPoints(points, still, still, camera.matrix, camera.distortion)
     else:
-        pixels = (points @ camera.matrix.T)[:, :2] / points[:, 2:]
+        pixels, _ = cv2.projectPoints(points, still, still, camera.matrix, camera.distortion)
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
 

@@ -30,6 +30,8 @@ class Estimate:
     evidence of the association, up to a constant. It compares associations of the same rays. -inf if it is not known.
     uncalibrated: whether the estimation of the shared errors failed. Then the covariances lack these errors.
     error_covariance: (N, 3, 3) m^2, the part of the covariance that was added by `with_errors`, None if nothing was added.
+    moved_by_held: (N, 3, H) m, how far usual errors that the solve held may move the objects, as a factor of their joint
+    covariance. None if it was not computed. The covariance does not contain it yet.
     """
 
     map_T_base: Floats
@@ -49,6 +51,7 @@ class Estimate:
     log_evidence: float = float("-inf")
     uncalibrated: bool = False
     error_covariance: Floats | None = None
+    moved_by_held: Floats | None = None
 
     def with_errors(self, more: Floats) -> Self:
         """Return the estimate with the covariances (N, 3, 3), m^2, that errors cause in addition to the noise of the

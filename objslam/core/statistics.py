@@ -211,6 +211,29 @@ def poisson_tail(least: Ints, mean: Floats) -> Floats:
     return np.where(least > 0, tail.reshape(least.shape), 1.0)
 
 
+def binomial_tail(least: Ints, number: Ints, share: float) -> Floats:
+    """Return the probability (...) that at least `least` (...) of `number` (...) tries succeed. share: between 0 and 1, the
+    probability of a success.
+
+    It is the regularised incomplete beta function (NIST DLMF 8.17.24). For few numbers, the probabilities of all counts are
+    summed instead.
+    """
+    least, number = (np.asarray(of).astype(np.int64) for of in np.broadcast_arrays(least, number))
+    most = int(number.max(initial=0)) + 1
+    if most * number.size <= _FEW:
+        factorials = np.append(0.0, np.cumsum(np.log(np.arange(1.0, most))))  # Their logarithms.
+        count = np.arange(most)
+        left = number[..., None] - count
+        logs = factorials[np.maximum(number, 0)][..., None] - factorials - factorials[np.maximum(left, 0)]
+        logs += count * np.log(share) + left * np.log1p(-share)
+        some = (count >= least[..., None]) & (left >= 0)
+        return np.asarray(np.minimum(np.exp(np.where(some, logs, -np.inf)).sum(axis=-1), 1.0))
+    from scipy.special import betainc
+
+    some, all_ = (least > 0) & (least <= number), least <= 0
+    return np.where(some, betainc(np.maximum(least, 1), np.maximum(number - least, 0) + 1, share), all_.astype(np.float64))
+
+
 def log_beta(a: Floats, b: Floats) -> Floats:
     """Return the logarithms (...) of the beta function of positive numbers (...)."""
     if a.size <= _FEW:

@@ -38,9 +38,9 @@ _STANDS = 1e-6
 """A shorter way (m) within `_CURVE` counts as this: the robot stands or turns on the spot. It only avoids a division by
 zero."""
 _AHEAD = np.array([[0.0, 0.0, 1.0]])  # The direction along which depths are measured, in the camera frame.
-_KEPT = 3
-"""For how many turn scales, biases and slips the corrected path is kept. The derivatives by the other errors need no new
-path. A larger number takes more memory."""
+_KEPT = 4
+"""For how many turn scales, biases and slips the corrected path is kept. A round of derivatives needs four: the present
+path, and one for each of these errors. A larger number takes more memory."""
 
 
 def take_out(log: Log, error: Mapping[str, float], *, stay: bool = False) -> Log:

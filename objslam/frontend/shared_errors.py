@@ -113,6 +113,15 @@ class SharedErrors:
         vars(other).update(_kept_poses=self._kept_poses, _kept_drift=self._kept_drift)
         return other
 
+    def with_paths_of(self, other: Self) -> Self:
+        """Return the same errors. They share the corrected paths that other errors of the same odometry have computed."""
+        if self.log.odometry is not other.log.odometry:
+            return self
+        found = replace(self, _path=other._path)
+        if self.log is other.log and self.keyframes is other.keyframes and self.settings.poses == other.settings.poses:
+            vars(found).update(_kept_poses=other._kept_poses, _kept_drift=other._kept_drift)
+        return found
+
     def with_unknown_noise(self) -> Self:
         """Return the same measurements with all kinds of noise unknown, whatever the settings say."""
         noise = self.settings.noise.model_copy(update={"rays": True, "ranges": True, "odometry": True})

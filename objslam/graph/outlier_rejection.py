@@ -15,7 +15,7 @@ from objslam.graph.assembly import Measurements
 from objslam.graph.fixed_pose_triangulation import triangulate_at
 from objslam.graph.least_squares.gauss_newton import Solution, gauss_newton
 from objslam.graph.least_squares.joint_rows import JointGraph
-from objslam.graph.least_squares.normal_equations import NormalEquations
+from objslam.graph.least_squares.normal_equations import Equations
 from objslam.graph.optimizers import STILL, Optimum, optimize, trace_solve
 from objslam.graph.robust_cost import truncated_cost
 from objslam.graph.variables import read_poses, with_points
@@ -34,7 +34,7 @@ _SURE = 0.95
 more objects at wrong positions."""
 
 
-Near = tuple[Ints, NormalEquations]
+Near = tuple[Ints, Equations]
 """The landmarks (m,) of a graph with Huber's loss, and its normal equations near the optimum."""
 
 
@@ -165,7 +165,7 @@ def known_landmarks(positions: Floats) -> Ints:
 
 
 def order_near(near: Near | None, landmarks: Ints) -> Ints | None:
-    """Return the order of elimination (D,) of a solve that had these landmarks (m,). None if it had others."""
+    """Return the order of elimination (D,) of a solve that had these landmarks (m,). None if it had others, or no order."""
     return near[1].order if near is not None and np.array_equal(near[0], landmarks) else None
 
 

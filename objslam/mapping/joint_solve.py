@@ -65,7 +65,8 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
         return _associated_again(begin, state, start)
     named, agree = _by_label(state)
-    if (wider := _with_gross_errors(begin, named)) is not None:
+    wider, named = _with_gross_errors(begin, named)
+    if wider is not None:
         other = _begun(wider.attempt())
         again, agrees = _by_label(other)
         if agrees:
@@ -83,7 +84,7 @@ def _associated_again(begin: JointState, state: JointState, start: InitialEstima
     """Return the state after association and solve. If its map shows a gross error that was held, this is done again."""
     before = state.ledger.copy()
     found = _associated(state, start)
-    wider = _with_gross_errors(begin, found)
+    wider, found = _with_gross_errors(begin, found)
     if wider is None:
         return found
     state.ledger.restore(before)
@@ -95,14 +96,15 @@ def _begun(state: JointState) -> JointState:
     return _with_noise_of_poses(_with_clocks(state))
 
 
-def _with_gross_errors(begin: JointState, found: JointState) -> JointState | None:
-    """Return the start of a solve that also estimates the held errors that the map of `found` shows. None if it shows
-    none."""
+def _with_gross_errors(begin: JointState, found: JointState) -> tuple[JointState | None, JointState]:
+    """Return the start of a solve that also estimates those held errors that the map of `found` shows. None if it shows
+    none. Also return `found`, whose estimate may now tell what the held errors do to it."""
     if begin.errors is None or found.errors is None or found.association is None or found.estimate is None:
-        return None
+        return None, found
     errors = found.errors.with_noise(begin.errors.noise)
-    wider = with_gross_errors(errors, Solved(found.association, found.estimate, found.keyframes))
-    return None if wider is None else replace(begin, errors=wider, settings=wider.settings)
+    wider, estimate = with_gross_errors(errors, Solved(found.association, found.estimate, found.keyframes))
+    other = None if wider is None else replace(begin, errors=wider, settings=wider.settings)
+    return other, replace(found, estimate=estimate)
 
 
 def _with_several_a_label(state: JointState, named: JointState) -> JointState:

@@ -16,6 +16,7 @@ from scipy.stats import chi2, norm, rayleigh
 import objslam
 from objslam.core import statistics
 from objslam.core.statistics import (
+    binomial_tail,
     distinct,
     grouped_median,
     grouped_quantile,
@@ -114,15 +115,29 @@ def test_the_poisson_tail_is_one_less_the_sum_of_the_smaller_counts():
     np.testing.assert_allclose(poisson_tail(least, mean), expected, atol=1e-15)
 
 
+def test_the_binomial_tail_is_the_sum_of_its_counts():
+    for share in (0.1, 0.5, 0.97):
+        number, least = np.meshgrid(np.arange(12), np.arange(-1, 14))
+        expected = [
+            sum(math.comb(n, k) * share**k * (1 - share) ** (n - k) for k in range(max(m, 0), n + 1))
+            for n, m in zip(number.ravel().tolist(), least.ravel().tolist(), strict=True)
+        ]
+        np.testing.assert_allclose(binomial_tail(least, number, share).ravel(), expected, rtol=1e-12)
+    assert binomial_tail(np.array(90), np.array(90), 0.01) == pytest.approx(1e-180, rel=1e-10)
+
+
 def test_sums_and_scipy_give_the_same_special_functions(monkeypatch):
     rng = np.random.default_rng(0)
     mean = np.exp(rng.uniform(-8, 6, 200))
     least = np.maximum(np.round(mean + rng.normal(size=200) * 3 * np.sqrt(mean) + rng.integers(-2, 8, 200)), 0).astype(int)
     a, b = np.exp(rng.uniform(-3, 8, (2, 200)))
-    summed = poisson_tail(least, mean), log_beta(a, b)
+    number = rng.integers(0, 90, 200)
+    few = rng.integers(-2, 90, 200)
+    summed = poisson_tail(least, mean), log_beta(a, b), binomial_tail(few, number, 0.2)
     monkeypatch.setattr(statistics, "_FEW", 0)
     np.testing.assert_allclose(summed[0], poisson_tail(least, mean), rtol=1e-11)
     np.testing.assert_allclose(summed[1], log_beta(a, b), atol=1e-10)
+    np.testing.assert_allclose(summed[2], binomial_tail(few, number, 0.2), rtol=1e-11)
 
 
 def test_log_odds_become_probabilities_however_large_they_are():

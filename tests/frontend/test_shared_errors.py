@@ -17,7 +17,7 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Images, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.corrected_log import refocused, take_out
+from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, refocused, take_out
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors, take_out_known
 from objslam.frontend.odometry_drift import gathered_drift
@@ -96,6 +96,42 @@ def test_other_noise_needs_new_poses_only_if_it_moves_them(clean, monkeypatch, n
     assert np.allclose(before.map_T_base, after.map_T_base) == same
     for name in ("stamps", "map_T_base", "odom_T_base", "base_T_camera", "drift"):
         assert_allclose(getattr(after, name), getattr(anew, name), rtol=0, atol=0)
+
+
+def test_other_errors_of_one_odometry_share_its_corrected_paths(clean, monkeypatch):
+    """A freed error and a second camera change no path of the odometry. Other keyframes have other poses."""
+    log = add_shared_errors(clean, ERRORS)
+    keyframes, rays, errors = measured(log)
+    values, made, poses = np.full(len(errors.names), 0.01), [], []
+    init, compute = CorrectablePath.__init__, SharedErrors._computed_poses
+    monkeypatch.setattr(CorrectablePath, "__init__", lambda *args: made.append(args) or init(*args))
+    monkeypatch.setattr(SharedErrors, "_computed_poses", lambda *args: poses.append(args) or compute(*args))
+    errors.at(values)
+    same, fewer = shared_errors(log, keyframes, rays, SETTINGS), keyframes.take(np.arange(60))
+    others = [same, replace(same, keyframes=fewer, rays=rays.take(rays.keyframe < 60))]
+    for other, more in zip(others, (0, 1), strict=True):
+        poses.clear()
+        found, *_ = other.with_paths_of(errors).at(values)
+        assert (len(made), len(poses)) == (1, more)
+        anew, *_ = replace(other, _path=[]).at(values)
+        made.pop()
+        for name in ("stamps", "map_T_base", "odom_T_base", "base_T_camera", "drift", "step", "wander"):
+            assert_allclose(getattr(found, name), getattr(anew, name), rtol=0, atol=0)
+    slower = replace(log, odometry=replace(log.odometry, stamps=2 * log.odometry.stamps))
+    other = replace(same, log=slower)
+    assert other.with_paths_of(errors) is other
+
+
+def test_a_second_round_of_derivatives_needs_no_new_path(clean):
+    """The scale only lengthens a path, and a clock only moves stamps. The other three errors give a path each."""
+    path, computed = CorrectablePath(clean.odometry), []
+    get = path._moved.get
+    path._moved.get = lambda key, compute: get(key, lambda: computed.append(key) or compute())
+    here = dict.fromkeys(ODOMETRY, 0.01)
+    for _ in range(2):
+        for changed in (None, *ODOMETRY, None):
+            path.poses(here if changed is None else {**here, changed: 0.02})
+    assert len(computed) == 4
 
 
 def test_the_corrected_log_has_the_same_keyframes(clean):

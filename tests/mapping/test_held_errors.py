@@ -19,12 +19,13 @@ from objslam.core.types import Log, Trajectory
 from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
+from objslam.frontend.corrected_log import CorrectablePath
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.mapping import pipeline
 from objslam.mapping.alternation import solve
-from objslam.mapping.joint.held_errors import Solved, with_gross_errors
+from objslam.mapping.joint.held_errors import Solved, check_turned_camera, with_gross_errors, with_held_errors
 from objslam.mapping.solution import seen_something
 from objslam.output.viewer.recording import write_recording
 from objslam.simulation import preset, simulate
@@ -91,22 +92,58 @@ def test_the_sigmas_of_a_right_camera_hardly_grow():
 
 
 def test_sigmas_without_the_held_focal_length_are_named(monkeypatch):
-    from objslam.graph.calibration import next_step
+    from objslam.graph.calibration.next_step import NextStep
 
     def fails(*_):
         raise SolveError("not finite")
 
-    monkeypatch.setattr(next_step, "moved_by_held", fails)
+    monkeypatch.setattr(NextStep, "moved_by", fails)
     result, ledger = run(drive(0))
     assert len(result.map.resolved()) == 10
     assert [one for one in ledger.warnings if "sigmas lack the usual error of a focal length" in one] != []
+
+
+def test_the_step_that_finds_no_gross_error_tells_what_the_held_errors_do(monkeypatch):
+    """It has the numbers of a step of the focal length alone, and needs no corrected path of its own."""
+    from objslam.graph.calibration.next_step import NextStep
+
+    solution, _ = solved(drive(0))
+    assert solution.estimate.moved_by_held is not None
+    steps, paths, of, init = [], [], NextStep.of, CorrectablePath.__init__
+    monkeypatch.setattr(NextStep, "of", lambda *given: steps.append(given) or of(*given))
+    monkeypatch.setattr(CorrectablePath, "__init__", lambda *given: paths.append(given) or init(*given))
+    at_once = with_held_errors(solution.errors, solution, Ledger())
+    assert steps == []
+    alone = replace(solution, estimate=replace(solution.estimate, moved_by_held=None))
+    again = with_held_errors(solution.errors, alone, Ledger())
+    assert check_turned_camera(solution.errors, solution) == []
+    assert (len(steps), len(paths)) == (2, 0)
+    assert (np.trace(at_once.estimate.covariance - solution.estimate.covariance, axis1=1, axis2=2) > 0).all()
+    np.testing.assert_allclose(at_once.estimate.covariance, again.estimate.covariance, rtol=1e-9)
+    np.testing.assert_allclose(at_once.estimate.correlated, again.estimate.correlated, rtol=1e-6, atol=1e-9)
+
+
+def test_a_step_of_some_errors_needs_the_others_at_zero():
+    from objslam.graph.calibration.next_step import NextStep
+
+    solution, _ = solved(drive(0))
+    errors, theta = solution.errors, solution.estimate.calibration.values
+    step = NextStep.of(errors, solution.association, solution.estimate, theta)
+    left_out = int(np.argmax(np.abs(theta)))
+    kept = np.delete(np.arange(len(theta)), left_out)
+    names = tuple(errors.names[k] for k in kept.tolist())
+    some = replace(errors, names=names, mean=errors.mean[kept], prior=errors.prior[np.ix_(kept, kept)])
+    assert step.only(some) is None
+    zero = replace(step, theta=np.where(np.arange(len(theta)) == left_out, 0.0, theta)).only(some)
+    np.testing.assert_array_equal(zero.theta, theta[kept])
+    np.testing.assert_array_equal(zero.reduced.gradient, step.reduced.gradient[kept])
 
 
 def test_a_held_focal_length_moves_the_map_as_solves_with_other_ones_do(monkeypatch):
     """The solves converge, and their estimated errors follow the focal length."""
     from objslam.graph.batch_solver import solve_joint
     from objslam.graph.calibration import self_calibration
-    from objslam.graph.calibration.next_step import moved_by_held, predict
+    from objslam.graph.calibration.next_step import NextStep
 
     monkeypatch.setattr(self_calibration, "_CONVERGED", 1e-3)
     monkeypatch.setattr(self_calibration, "_ROUNDS", 30)
@@ -130,9 +167,9 @@ def test_a_held_focal_length_moves_the_map_as_solves_with_other_ones_do(monkeypa
     at = np.array([name == "front.focal" for name in errors.names])
     theta = np.zeros(len(at))
     theta[~at] = solution.estimate.calibration.values
-    given = errors, solution.association, solution.estimate, theta
-    usual = np.hypot(0.02, predict(*given).values[at])
-    moved = moved_by_held(*given, at)[:, :, 0] / usual
+    step = NextStep.of(errors, solution.association, solution.estimate, theta)
+    usual = np.hypot(0.02, step.predicted().values[at])
+    moved = step.moved_by(at)[:, :, 0] / usual
     assert np.linalg.norm(expected) > 1.0  # Metres for each unit of the error.
     assert np.linalg.norm(moved + expected) < 0.18 * np.linalg.norm(expected)  # 0.23 if they did not follow.
 
@@ -151,9 +188,9 @@ def test_a_setting_of_the_user_is_kept():
     solution, settings = solved(add_shared_errors(drive(0), {"front.y": -0.2}), "calibration.translation=0")
     errors = solution.errors
     found = Solved(solution.association, solution.estimate, solution.keyframes)
-    assert with_gross_errors(errors, found) is None
+    assert with_gross_errors(errors, found)[0] is None
     other = settings.model_copy(update={"calibration": settings.calibration.model_copy(update={"translation": "auto"})})
-    wider = with_gross_errors(replace(errors, settings=other), found)
+    wider, _ = with_gross_errors(replace(errors, settings=other), found)
     assert set(wider.names) - set(errors.names) == {"front.x", "front.y", "front.z"}
 
 
@@ -201,12 +238,13 @@ def test_an_odometry_that_turns_in_the_middle_is_no_turned_camera():
 
 
 def test_a_step_from_an_optimum_stays_there():
-    from objslam.graph.calibration.next_step import predict
+    from objslam.graph.calibration.next_step import NextStep
 
     solution, _ = solved(add_shared_errors(drive(0), {"front.yaw": 0.03, "front.clock": 0.1}))
     errors = solution.errors
     found = solution.estimate.calibration
-    again = predict(errors.with_noise(solution.estimate.noise), solution.association, solution.estimate, found.values)
+    like = errors.with_noise(solution.estimate.noise)
+    again = NextStep.of(like, solution.association, solution.estimate, found.values).predicted()
     assert np.abs((again.values - found.values) / found.sigma).max() < 0.25
     assert (again.sigma < 1.1 * found.sigma).all()
     assert (again.sigma > 0.3 * found.sigma).all()

@@ -11,7 +11,7 @@ from objslam.core.geometry import exp_se3
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
-from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
+from objslam.graph.least_squares.normal_equations import Equations, elimination_order
 from objslam.graph.optimizers import levenberg_marquardt
 from objslam.graph.outlier_rejection import Near, order_near, supported
 from objslam.graph.variables import read_poses, with_points
@@ -30,10 +30,10 @@ class InnerSolve(Linearised):
     with stale equations takes a fifth of the time, because no matrix is built and factorised.
     """
 
-    stale: NormalEquations | None = None
+    stale: Equations | None = None
 
     @property
-    def factored(self) -> NormalEquations:
+    def factored(self) -> Equations:
         """The normal equations of the next step."""
         return self.normal if self.stale is None else self.stale
 
@@ -58,8 +58,9 @@ class InnerSolve(Linearised):
         near: an earlier solve. If it had the same variables, its order is taken.
         """
         known = order_near(near, self.landmarks)
-        order = elimination_order(self.rows.jacobian, self.graph.blocks) if known is None else known
-        return replace(self, order=order, known=self.graph)
+        if known is None and not self.graph.is_chain:
+            known = elimination_order(self.rows.jacobian, self.graph.blocks)
+        return replace(self, order=known, known=self.graph)
 
     def moved(self, change: Floats) -> Self:
         """Return the state after a change (D,) of its variables."""

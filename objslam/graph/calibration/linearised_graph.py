@@ -9,7 +9,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
 from objslam.graph.least_squares.joint_rows import JointGraph, JointRows
-from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
+from objslam.graph.least_squares.normal_equations import Equations, factored
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,6 @@ class Linearised:
         return self.graph.rows(self.map_T_camera, self.positions[self.landmarks])
 
     @cached_property
-    def normal(self) -> NormalEquations:
+    def normal(self) -> Equations:
         """The normal equations of `rows`. SolveError if they are singular."""
-        jacobian = self.rows.jacobian
-        order = elimination_order(jacobian, self.graph.blocks) if self.order is None else self.order
-        return NormalEquations.of(jacobian, order)
+        return factored(self.rows.jacobian, self.rows.chain, self.graph.blocks, self.order)

@@ -3,7 +3,8 @@
 One outer step of `self_calibration` is enough to see whether a held error is large. It takes a tenth of the time of a solve.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -20,68 +21,79 @@ from objslam.graph.factors.range import share_bias
 from objslam.graph.multiframes import Multiframes
 
 
-def predict(errors: CalibratedMeasurements, association: Association, estimate: Estimate, theta: Floats) -> Calibration:
-    """Return the shared errors after one Gauss-Newton step from a solution, with their covariance.
-
-    A held error bends the path, so it correlates the residuals, and its effect on the odometry looks like noise. So the step
-    takes the residuals for white noise. Otherwise the step would be only a third as long. The covariance is for white noise
-    too.
+@dataclass(frozen=True)
+class NextStep:
+    """The Gauss-Newton step of the shared errors from a solution.
 
     errors: the estimated and the held errors of the same keyframes and rays, at the noise of the solution. theta: (P,) their
-    values in the solution. SolveError if the linear system is not finite.
+    values in the solution. state: the solution. reduced: its linear system, with poses and landmarks eliminated.
     """
-    _, reduced = _reduced(errors, association, estimate, theta)
-    step, covariance = _step(reduced, errors, theta)
-    return Calibration(errors.names, theta + step, covariance, np.sqrt(np.diagonal(errors.prior)))
 
+    errors: CalibratedMeasurements
+    theta: Floats
+    state: InnerSolve
+    reduced: ReducedSystem
 
-def moved_by_held(
-    errors: CalibratedMeasurements, association: Association, estimate: Estimate, theta: Floats, held: Bools
-) -> Floats:
-    """Return how far the held errors may move landmarks: a factor (N, 3, H), m, of their joint covariance (consider
-    covariance; Schmidt 1966).
+    @classmethod
+    def of(cls, errors: CalibratedMeasurements, association: Association, estimate: Estimate, theta: Floats) -> Self:
+        """Linearise a solution. SolveError if its linear system is singular."""
+        multiframes = Multiframes.of(errors.keyframes)
+        keyframes, rays, settings = errors.at(theta)
+        ties = find_ties(multiframes.keyframes(keyframes), settings)
+        rays = share_bias(rays, association)
+        measured = Measurements.of(keyframes, rays, settings, multiframes, None, ties)
+        map_T_camera = (estimate.map_T_base @ keyframes.base_T_camera)[multiframes.first]
+        used = (estimate.weight > 0) & (association.object >= 0)
+        state = InnerSolve(measured, association, map_T_camera, estimate.positions, used).ordered(None)
+        return cls(errors, theta, state, linearise(state, errors, theta).reduce())
 
-    The estimated errors take up a part of a held error. A held error has the variance of its prior, because real noise is
-    not white, and bends the path as a held error does. The square of a step that `predict` returns is added, as the solution
-    does not follow it. Landmarks outside the graph do not move.
+    def only(self, errors: CalibratedMeasurements) -> Self | None:
+        """Return the step of some of the errors. None if another error is not 0, because it changes the measurements."""
+        columns = np.array([self.errors.names.index(name) for name in errors.names], dtype=np.int64)
+        if np.delete(self.theta, columns).any():
+            return None
+        return replace(self, errors=errors, theta=self.theta[columns], reduced=self.reduced.take(columns))
 
-    held: (P,) which errors the solution held. The other parameters and SolveError are as in `predict`.
-    """
-    state, reduced = _reduced(errors, association, estimate, theta)
-    step, _ = _step(reduced, errors, theta)
-    free, slope = ~held, reduced.slope
-    # The solve weighed the gradients by the estimated errors alone, without those by the held ones.
-    own = np.ix_(free, free)
-    weights, information = likelihood(replace(reduced, slope=slope[own], variance=reduced.variance[own]))
-    curvature = information + np.linalg.inv(errors.prior[own])
-    along = np.zeros((len(held), int(held.sum())))
-    along[held] = np.eye(along.shape[1])
-    along[free] = -np.linalg.solve(curvature, weights @ slope[np.ix_(free, held)])
-    along *= np.sqrt(np.diagonal(errors.prior) + step**2)[held]
-    moved = np.zeros((association.count, 3, along.shape[1]))
-    by_landmark = reduced.sensitivity[: 3 * len(state.landmarks)] @ along
-    moved[state.landmarks] = by_landmark.reshape(len(state.landmarks), 3, along.shape[1])
-    return moved
+    def predicted(self) -> Calibration:
+        """Return the shared errors after the step, with their covariance.
 
+        A held error bends the path, so it correlates the residuals, and its effect on the odometry looks like noise. So the
+        step takes the residuals for white noise. Otherwise the step would be only a third as long. The covariance is also
+        that of white noise. SolveError if the linear system is not finite.
+        """
+        step, covariance = self._step(self._without_shrinking())
+        return Calibration(self.errors.names, self.theta + step, covariance, np.sqrt(np.diagonal(self.errors.prior)))
 
-def _reduced(
-    errors: CalibratedMeasurements, association: Association, estimate: Estimate, theta: Floats
-) -> tuple[InnerSolve, ReducedSystem]:
-    """Return the state of a solution, and its linear system with poses and landmarks eliminated."""
-    multiframes = Multiframes.of(errors.keyframes)
-    keyframes, rays, settings = errors.at(theta)
-    ties = find_ties(multiframes.keyframes(keyframes), settings)
-    rays = share_bias(rays, association)
-    measured = Measurements.of(keyframes, rays, settings, multiframes, None, ties)
-    map_T_camera = (estimate.map_T_base @ keyframes.base_T_camera)[multiframes.first]
-    used = (estimate.weight > 0) & (association.object >= 0)
-    state = InnerSolve(measured, association, map_T_camera, estimate.positions, used).ordered(None)
-    return state, without_shrinking(state, linearise(state, errors, theta).reduce(), errors, theta)
+    def moved_by(self, held: Bools) -> Floats:
+        """Return how far the held errors may move landmarks: a factor (N, 3, H), m, of their joint covariance (consider
+        covariance; Schmidt 1966).
 
+        The estimated errors take up a part of a held error. Its variance is that of its prior, because real noise is not
+        white, and bends the path as a held error does. The square of the step is added, as the solution does not follow it.
+        Landmarks outside the graph do not move. held: (P,) which errors the solution held. SolveError as in `predicted`.
+        """
+        errors, state, reduced = self.errors, self.state, self._without_shrinking()
+        step, _ = self._step(reduced)
+        free, slope = ~held, reduced.slope
+        # The solve weighed the gradients by the estimated errors alone, without those by the held ones.
+        own = np.ix_(free, free)
+        weights, information = likelihood(replace(reduced, slope=slope[own], variance=reduced.variance[own]))
+        curvature = information + np.linalg.inv(errors.prior[own])
+        along = np.zeros((len(held), int(held.sum())))
+        along[held] = np.eye(along.shape[1])
+        along[free] = -np.linalg.solve(curvature, weights @ slope[np.ix_(free, held)])
+        along *= np.sqrt(np.diagonal(errors.prior) + step**2)[held]
+        moved = np.zeros((state.association.count, 3, along.shape[1]))
+        by_landmark = reduced.sensitivity[: 3 * len(state.landmarks)] @ along
+        moved[state.landmarks] = by_landmark.reshape(len(state.landmarks), 3, along.shape[1])
+        return moved
 
-def _step(system: ReducedSystem, errors: CalibratedMeasurements, theta: Floats) -> tuple[Floats, Floats]:
-    """Return the Gauss-Newton step (P,) from theta (P,), and the covariance (P, P) after it."""
-    prior = np.asarray(np.linalg.inv(errors.prior))
-    weights, information = likelihood(system)
-    covariance = np.asarray(np.linalg.inv(information + prior))
-    return covariance @ (weights @ system.gradient - prior @ (theta - errors.mean)), covariance
+    def _without_shrinking(self) -> ReducedSystem:
+        return without_shrinking(self.state, self.reduced, self.errors, self.theta)
+
+    def _step(self, system: ReducedSystem) -> tuple[Floats, Floats]:
+        """Return the step (P,), and the covariance (P, P) after it."""
+        prior = np.asarray(np.linalg.inv(self.errors.prior))
+        weights, information = likelihood(system)
+        covariance = np.asarray(np.linalg.inv(information + prior))
+        return covariance @ (weights @ system.gradient - prior @ (self.theta - self.errors.mean)), covariance

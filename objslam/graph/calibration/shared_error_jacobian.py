@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements, kind
 from objslam.core.geometry import inverse, lengths, log_se3
 from objslam.core.types import Keyframes, Rays
@@ -19,8 +19,9 @@ from objslam.graph.calibration.clock_instruments import ClockInstruments
 from objslam.graph.calibration.instruments import ODOMETRY_SCALES, Motions, motion_instruments
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.factors.localized_rows import LocalizedRows
+from objslam.graph.least_squares.chain import ChainRows
 from objslam.graph.least_squares.joint_rows import from_origins
-from objslam.graph.least_squares.normal_equations import NormalEquations
+from objslam.graph.least_squares.normal_equations import Equations
 
 _SHORT = 1e-3
 """The step of a derivative, as a share of `errors.steps`. With a larger share, the derivative contains more of the
@@ -33,13 +34,14 @@ class LinearSystem:
 
     The rows are in the order of `Measurements.factors`: bearings, ranges, landmark priors, motions, absolute poses. The
     corners of fiducials are last. jacobian: (M, D) by the landmarks, three columns each, then by the poses, six columns
-    each. normal: the normal equations of the Jacobian. sides: (M, P) the derivatives of the rows by the shared errors.
-    residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions. instruments: (M, P). At the
-    optimum, the residuals do not correlate with the instruments. The instruments equal the sides, except for clocks and the
-    scales of the odometry: these sides contain the noise of the odometry, and so do the residuals. motions: None if neither
-    the odometry nor a clock is a parameter. clocks: None without a clock. by_path: (M, C) instruments of the C clocks by the
-    solved path. noise: (P,) the shares of noise in the information, from `noise_shares`. longer: (P,) the ratio of the
-    odometry's noise in the residuals to that in the side of a scale, 0 for other parameters.
+    each. normal: the normal equations of the Jacobian. chain: as in `JointRows`. sides: (M, P) the derivatives of the rows
+    by the shared errors. residual: (M,). first_range, first_motion: the first rows of the ranges and of the motions.
+    instruments: (M, P). At the optimum, the residuals do not correlate with the instruments. The instruments equal the
+    sides, except for clocks and the scales of the odometry: these sides contain the noise of the odometry, and so do the
+    residuals. motions: None if neither the odometry nor a clock is a parameter. clocks: None without a clock. by_path: (M,
+    C) instruments of the C clocks by the solved path. noise: (P,) the shares of noise in the information, from
+    `noise_shares`. longer: (P,) the ratio of the odometry's noise in the residuals to that in the side of a scale, 0 for
+    other parameters.
     """
 
     jacobian: sparse.csr_matrix
@@ -48,7 +50,8 @@ class LinearSystem:
     residual: Floats
     first_range: int
     first_motion: int
-    normal: NormalEquations
+    normal: Equations
+    chain: ChainRows | None
     motions: Motions | None
     clocks: ClockInstruments | None
     by_path: Floats
@@ -120,6 +123,19 @@ class ReducedSystem:
     sensitivity: Floats
     newton: Floats
 
+    def take(self, parameters: Ints) -> Self:
+        """Return the system of some parameters (n,) alone."""
+        block = np.ix_(parameters, parameters)
+        return replace(
+            self,
+            information=self.information[block],
+            slope=self.slope[block],
+            variance=self.variance[block],
+            gradient=self.gradient[parameters],
+            descent=self.descent[parameters],
+            sensitivity=self.sensitivity[:, parameters],
+        )
+
     def with_wider(self, factors: Floats | None) -> Self:
         """Return the system with larger standard deviations of its gradient. factors: (P,), None leaves them as they are."""
         return self if factors is None else replace(self, variance=self.variance * np.outer(factors, factors))
@@ -147,6 +163,7 @@ def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats, noi
         first_range=graph.first_range,
         first_motion=graph.first_motion,
         normal=of.normal,
+        chain=rows.chain,
         motions=motions,
         clocks=clocks,
         by_path=by_path,

@@ -23,7 +23,8 @@ from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry_motions import OdometryMotions
 from objslam.graph.factors.residual_algebra import whitening
-from objslam.graph.least_squares.normal_equations import NormalEquations
+from objslam.graph.least_squares.chain import ChainRows
+from objslam.graph.least_squares.normal_equations import Equations, factored
 
 _PROBES, _FEWEST_PROBES = 12, 4
 """The most and the fewest random probes. With n independent residuals, the relative error of the redundancy is
@@ -125,10 +126,11 @@ def estimate_noise(
         history = [*history[-MEMORY:], (_logarithms(noise), _logarithms(other) - _logarithms(noise))]
         noise = _from_logarithms(accelerated(history, 1.0), other)
         whitens = whitening(_motion_covariance(rows, noise))
-        rescale = rescaling.to(noise, whitens)
+        rescale, chain = rescaling.to(noise, whitens)
         told = np.column_stack([probes, np.append(rescale @ system.residual, residual[len(system.residual) :])])
         scaled = rescale @ jacobian
-        left = _left(scaled, NormalEquations.of(scaled, system.normal.order), rescale @ system.sides, root, told)
+        normal = factored(scaled, chain, of.graph.blocks, of.order)
+        left = _left(scaled, normal, rescale @ system.sides, root, told)
     force, curvature = shrinking_force(of)
     return replace(noise, shrinkage=min(force / curvature, _MOST_SHRINKAGE))
 
@@ -183,7 +185,7 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     )
 
 
-def _left(jacobian: sparse.csr_matrix, normal: NormalEquations, sides: Floats, prior: Floats, told: Floats) -> Floats:
+def _left(jacobian: sparse.csr_matrix, normal: Equations, sides: Floats, prior: Floats, told: Floats) -> Floats:
     """Return the residuals of `told` (M + P, n) after a least-squares solution.
 
     jacobian: (M, D) by poses and landmarks. normal: its normal equations. sides: (M, P) by the shared errors. prior: (P, P)
@@ -222,16 +224,19 @@ class _Rescaling:
         lengths[first:last] = 6
         return cls(system, rows, begin, np.asarray(np.linalg.inv(whitens)), (columns, np.append(0, np.cumsum(lengths))))
 
-    def to(self, noise: NoiseFactors, whitens: Floats) -> sparse.csr_matrix:
-        """Return the matrix (M, M) for another noise. whitens: (s, 6, 6) of the motions, for this noise."""
+    def to(self, noise: NoiseFactors, whitens: Floats) -> tuple[sparse.csr_matrix, ChainRows | None]:
+        """Return the matrix (M, M) for another noise, and the rows of a chain for this noise. whitens: (s, 6, 6) of the
+        motions, for this noise."""
         system, rows, size = self.system, self.rows, len(self.system.residual)
         scale = np.ones(size)
         scale[: system.first_range] = self.begin.rays / noise.rays
         ranges = slice(system.first_range, system.first_range + len(rows.owner))
         scale[ranges] = _range_sigma(rows, self.begin) / _range_sigma(rows, noise)
         last = system.first_motion + whitens.size // 6
-        data = np.concatenate([scale[: system.first_motion], (whitens @ self.colours).ravel(), scale[last:]])
-        return sparse.csr_matrix((data, *self.pattern), shape=(size, size))
+        moves = whitens @ self.colours
+        data = np.concatenate([scale[: system.first_motion], moves.ravel(), scale[last:]])
+        chain = None if system.chain is None else system.chain.rescaled(self.begin.rays / noise.rays, scale[ranges], moves)
+        return sparse.csr_matrix((data, *self.pattern), shape=(size, size)), chain
 
 
 def _updated(

@@ -12,7 +12,7 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import exp_se3
 from objslam.errors import SolveError
 from objslam.graph.least_squares.joint_rows import JointGraph
-from objslam.graph.least_squares.normal_equations import NormalEquations, elimination_order
+from objslam.graph.least_squares.normal_equations import Equations, factored
 
 _SLOW = 0.5
 """The normal equations are computed again if the predicted decrease of the cost is more than this share of the decrease that
@@ -38,13 +38,13 @@ class Solution:
     cost_after: float
     steps: int
     ended: bool
-    normal: NormalEquations | None
+    normal: Equations | None
 
 
 def gauss_newton(
     graph: JointGraph,
     map_T_camera: Floats,
-    normal: NormalEquations | None,
+    normal: Equations | None,
     most: int,
     tolerance: float,
     still: float,
@@ -74,8 +74,8 @@ def gauss_newton(
         gradient = rows.jacobian.T @ rows.residual
         if anew:
             try:
-                order = elimination_order(rows.jacobian, graph.blocks) if normal is None else normal.order
-                normal = NormalEquations.of(rows.jacobian, order)
+                order = None if normal is None else normal.order
+                normal = factored(rows.jacobian, rows.chain, graph.blocks, order)
             except SolveError:
                 break
         assert normal is not None

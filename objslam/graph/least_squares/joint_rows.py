@@ -23,6 +23,7 @@ from objslam.graph.factors.localization import localization_covariance
 from objslam.graph.factors.odometry import JUMP
 from objslam.graph.factors.priors import ANCHOR
 from objslam.graph.factors.residual_algebra import by_end, huber_roots, whitening
+from objslam.graph.least_squares.chain import ChainRows, is_chain
 from objslam.graph.tags.square_rows import SquareRows
 
 
@@ -31,21 +32,27 @@ class JointRows:
     """A graph at some values: M rows in the order of `Measurements.factors`, then those of `Measurements.further_rows`.
 
     The robust weights are in the rows. residual: (M,) whitened. cost: half the sum of the squared residuals, with the robust
-    losses. derive: returns `jacobian`.
+    losses. derive: returns `jacobian` and `chain`.
     """
 
     residual: Floats
     cost: float
-    derive: Callable[[], sparse.csr_matrix]
+    derive: Callable[[], tuple[sparse.csr_matrix, ChainRows | None]]
 
     @cached_property
-    def jacobian(self) -> sparse.csr_matrix:
-        """(M, D) by the landmarks, three columns each, then by the poses, six columns each.
-
-        It is computed at its first use: the rows after the last step of a solve, or after a step that is not taken, do not
-        need it.
-        """
+    def _derived(self) -> tuple[sparse.csr_matrix, ChainRows | None]:
+        """The rows after the last step of a solve, or after a step that is not taken, need no derivatives."""
         return self.derive()
+
+    @property
+    def jacobian(self) -> sparse.csr_matrix:
+        """(M, D) by the landmarks, three columns each, then by the poses, six columns each."""
+        return self._derived[0]
+
+    @property
+    def chain(self) -> ChainRows | None:
+        """The same derivatives by kind, None if the poses are no chain that sees few landmarks."""
+        return self._derived[1]
 
 
 @dataclass(frozen=True)
@@ -115,6 +122,11 @@ class JointGraph:
         """The first row of the kinds in `further`."""
         absolute = len(self.measured.keyframes) if self.measured.keyframes.localized_every else 1
         return self.first_motion + 6 * (len(self.moves[0]) + absolute)
+
+    @cached_property
+    def is_chain(self) -> bool:
+        """Whether the poses are a chain that sees few landmarks and nothing else."""
+        return len(self.pattern[1]) - 1 == self.first_further and is_chain(len(self.weak), *self.moves)
 
     @cached_property
     def motion_roots(self) -> Floats:
@@ -201,7 +213,7 @@ class JointGraph:
         cost = ray_cost.sum() + range_cost.sum() + absolute_cost.sum() + moves.cost.sum() + weak @ weak / 2
         cost += sum(cost for _, _, cost in further)
 
-        def jacobian() -> sparse.csr_matrix:
+        def derive() -> tuple[sparse.csr_matrix, ChainRows | None]:
             columns, first = self.pattern
             data, ends = np.empty(len(columns)), np.cumsum([18 * len(rays), 9 * len(ranged), weak.size, moves.size])
             bearings, ranges, by_weak, by_moves, others = np.split(data, ends)
@@ -214,14 +226,22 @@ class JointGraph:
             moves.put(by_moves.reshape(-1, 6, 12))
             by_absolute = (absolute_roots @ by_end(apart)).ravel()
             np.concatenate([by_absolute, *(derivatives.ravel() for _, derivatives, _ in further)], out=others)
+            chain = None
+            if self.is_chain:
+                count = len(landmarks), len(map_T_camera)
+                which = self.landmark, rays.keyframe, ranged, *self.moves
+                by_rays = bearings.reshape(-1, 2, 9), ranges.reshape(-1, 1, 9)
+                chain = ChainRows(
+                    *count, *which, *by_rays, by_weak, by_moves.reshape(-1, 6, 12), by_absolute.reshape(-1, 6, 6)
+                )
             shape = len(first) - 1, len(self.blocks)
             if data.all():
-                return sparse.csr_matrix((data, columns, first), shape=shape)
-            found = sparse.csr_matrix((data, columns.copy(), first.copy()), shape=shape)
+                return sparse.csr_matrix((data, columns, first), shape=shape), chain
+            found = sparse.csr_matrix((data.copy(), columns.copy(), first.copy()), shape=shape)
             found.eliminate_zeros()  # On a plane, half of the entries are zero.
-            return found
+            return found, chain
 
-        return JointRows(np.concatenate(parts), float(cost), jacobian)
+        return JointRows(np.concatenate(parts), float(cost), derive)
 
     def motion_weights(self, map_T_camera: Floats) -> Floats:
         """Return the roots (s,) of the weights of motions.

@@ -1,5 +1,6 @@
 """Solve the normal equations of a sparse Jacobian. One elimination order serves all graphs of the same variables."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -9,6 +10,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from objslam.core.arrays import Floats, Ints
 from objslam.errors import SolveError
+from objslam.graph.least_squares.chain import ChainEquations, ChainRows
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,22 @@ class NormalEquations:
         last = (self.factored.L[first:, first:] @ self.factored.U[first:, first:]).toarray()
         at = rank[columns] - first
         return np.asarray(np.linalg.inv(last)[np.ix_(at, at)])
+
+
+Equations = NormalEquations | ChainEquations
+"""The factorised normal equations of any graph, or of a chain of poses."""
+
+
+def factored(jacobian: sparse.csr_matrix, chain: ChainRows | None, blocks: Ints, order: Ints | None) -> Equations:
+    """Factor the normal equations of a Jacobian (M, D). SolveError if they are singular.
+
+    chain: the same rows as those of a chain of poses, which takes less time, None for another graph. blocks: (D,) the
+    variable of each column. order: (D,) the order of elimination of a general factorisation, if it is known.
+    """
+    if chain is not None:
+        with suppress(np.linalg.LinAlgError):
+            return ChainEquations.of(chain)
+    return NormalEquations.of(jacobian, elimination_order(jacobian, blocks) if order is None else order)
 
 
 def elimination_order(jacobian: sparse.csr_matrix, blocks: Ints) -> Ints:

@@ -3,13 +3,14 @@
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import binomial_tail
 
 LEAST_LOG_ODDS = np.log(1e3)
 """The least log odds that a group is not there by chance, corrected for the number of tried places. So one log in a thousand
 shows a group by chance. A larger value finds fewer groups."""
 
 
-def crowded(inside: Floats | Ints, around: Floats | Ints, share: float, tried: int) -> Floats:
+def crowded(inside: Ints, around: Ints, share: float, tried: int) -> Floats:
     """Return the log odds that a region holds more boxes than it would by chance.
 
     Without a group, the boxes lie evenly, so the number inside is binomial. The surroundings give the density (scan
@@ -18,8 +19,6 @@ def crowded(inside: Floats | Ints, around: Floats | Ints, share: float, tried: i
     inside: how many lie inside, any shape. around: how many lie inside or in the surroundings. share: the share of the whole
     region that is inside. tried: how many places were tried. With more places, a crowd by chance is more likely.
     """
-    from scipy.special import betainc
-
-    # The regularised incomplete beta function is the tail of a binomial distribution (NIST DLMF 8.17.24).
-    tail = betainc(np.maximum(inside, 1), np.maximum(around - inside, 0) + 1, share)
+    least = np.maximum(inside, 1)
+    tail = binomial_tail(least, np.maximum(around - inside, 0) + least, share)
     return np.where(inside > 0, -np.log(np.maximum(tail * tried, 1e-300)), 0.0)

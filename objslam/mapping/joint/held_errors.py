@@ -6,7 +6,11 @@ A usual error of a focal length stays, and the sigmas contain what it does. A ca
 cannot be corrected, because no box shows when that was.
 """
 
+from __future__ import annotations
+
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +33,9 @@ from objslam.mapping.checks.parts.moved_camera import (
     turns,
 )
 from objslam.mapping.solution import Solution
+
+if TYPE_CHECKING:
+    from objslam.graph.calibration.next_step import NextStep
 
 _SETTING = {"x": "translation", "y": "translation", "focal": "focal"}
 """The setting of each kind of held error. The height of a camera is no held error, because it only lifts the map."""
@@ -57,16 +64,17 @@ class Solved:
     keyframes: Keyframes
 
 
-def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | None:
+def with_gross_errors(errors: SharedErrors, solved: Solved) -> tuple[SharedErrors | None, Estimate]:
     """Return the shared errors with held errors that are gross, to be estimated too, None if no held error is gross.
 
+    Also return the estimate. If no held error is gross, it has its `moved_by_held`, unless this cannot be computed.
     errors: the shared errors of the solve, as measured. The settings of the returned errors have the prior of the new
     errors. A setting that is not `auto` is kept. An error of calibration.file is kept too, because the log is already
     corrected by it.
     """
-    held = _held(errors)
+    held, estimate = _held(errors), solved.estimate
     if not held or not _can_tell(errors):
-        return None
+        return None, estimate
 
     def gross(found: Calibration, least: float, sigmas: float) -> list[str]:
         far = np.abs(found.values) > np.maximum(least * found.prior, sigmas * found.sigma)
@@ -75,11 +83,17 @@ def with_gross_errors(errors: SharedErrors, solved: Solved) -> SharedErrors | No
 
     wider = _freed(errors, held)
     if wider.names == errors.names:  # The poses are those of the camera, which has no errors of its own.
-        return None
-    if not gross(_predicted(wider, solved), _SUSPECT * _GROSS, 0.0):
-        return None
-    there = gross(_solved(wider, solved), _GROSS, SIGMAS)
-    return _freed(errors, there) if there else None
+        return None, estimate
+    try:
+        step = _next_step(wider, solved)
+        suspect = gross(step.predicted(), _SUSPECT * _GROSS, 0.0)
+    except (SolveError, np.linalg.LinAlgError):
+        return None, estimate
+    if suspect and (there := gross(_solved(wider, solved), _GROSS, SIGMAS)):
+        return _freed(errors, there), estimate
+    with suppress(SolveError, np.linalg.LinAlgError):
+        estimate = replace(estimate, moved_by_held=_moved_by_held(errors, solved, step))
+    return None, estimate
 
 
 def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -> Solution:
@@ -87,24 +101,32 @@ def with_held_errors(errors: SharedErrors, solution: Solution, ledger: Ledger) -
 
     errors: the shared errors of the solve, as measured. The ledger gets a warning if these errors cannot be computed.
     """
-    if errors.keyframes.localized_every or _BENDS not in _held(errors) or not _can_tell(errors):
-        return solution
-    wider = _freed(errors, [_BENDS])
-    held = np.array([name not in errors.names for name in wider.names])
-    if not held.any():  # The lens of a camera that is its own base has no errors.
-        return solution
-    from objslam.graph.calibration.next_step import moved_by_held
-
-    solved = Solved(solution.association, solution.estimate, solution.keyframes)
     estimate = solution.estimate
     try:
-        moved = moved_by_held(_like(wider, solved), solution.association, estimate, _values(wider, solved), held)
+        moved = estimate.moved_by_held
+        if moved is None:
+            moved = _moved_by_held(errors, Solved(solution.association, estimate, solution.keyframes))
     except (SolveError, np.linalg.LinAlgError) as error:
         ledger.warn(f"the sigmas lack the usual error of a focal length, which could not be computed: {error}")
+        return solution
+    if moved is None:
         return solution
     estimate = estimate.with_errors(moved @ np.swapaxes(moved, 1, 2))
     factor = moved if estimate.correlated is None else np.concatenate([estimate.correlated, moved], axis=2)
     return replace(solution, estimate=replace(estimate, correlated=factor))
+
+
+def _moved_by_held(errors: SharedErrors, solved: Solved, step: NextStep | None = None) -> Floats | None:
+    """Return how far the usual errors of the held focal lengths may move the objects, as `Estimate.moved_by_held`. None if
+    no focal length is held. step: that of more errors, if it is known."""
+    if errors.keyframes.localized_every or _BENDS not in _held(errors) or not _can_tell(errors):
+        return None
+    wider = _freed(errors, [_BENDS])
+    held = np.array([name not in errors.names for name in wider.names])
+    if not held.any():  # The lens of a camera that is its own base has no errors.
+        return None
+    known = None if step is None else step.only(_like(wider, solved))
+    return (_next_step(wider, solved) if known is None else known).moved_by(held)
 
 
 def _held(errors: SharedErrors) -> list[str]:
@@ -121,7 +143,7 @@ def _freed(errors: SharedErrors, names: list[str]) -> SharedErrors:
     settings = errors.settings.model_copy(update={"calibration": more})
     other = shared_errors(errors.log, errors.keyframes, errors.rays, settings)
     assert other is not None  # It has at least the errors that the solution has.
-    return replace(other, noise=errors.noise)
+    return replace(other, noise=errors.noise).with_paths_of(errors)
 
 
 def check_turned_camera(errors: SharedErrors, solution: Solution) -> list[Finding]:
@@ -137,7 +159,11 @@ def check_turned_camera(errors: SharedErrors, solution: Solution) -> list[Findin
     if min(of_late.sum(), (~of_late).sum()) < _FEWEST or not _can_tell(errors):
         return []
     halves = _halves(errors, late)
-    if not turns(_predicted(halves, solved), _SUSPECT * MOVED, 0.0):
+    try:
+        suspect = turns(_next_step(halves, solved).predicted(), _SUSPECT * MOVED, 0.0)
+    except (SolveError, np.linalg.LinAlgError):
+        return []
+    if not suspect:
         return []
     return finding_of_turns(turns(_solved(halves, solved), MOVED, SIGMAS))
 
@@ -150,7 +176,7 @@ def _halves(errors: SharedErrors, late: Bools) -> SharedErrors:
     assert found is not None  # It has at least the errors that the solution has.
     means = dict(zip(errors.names, errors.mean.tolist(), strict=True))  # A calibration file knows no second half.
     mean = np.array([means[first_half(name)] for name in found.names])
-    return replace(found, mean=mean, prior=one_rotation_each(found), noise=errors.noise)
+    return replace(found, mean=mean, prior=one_rotation_each(found), noise=errors.noise).with_paths_of(errors)
 
 
 def _can_tell(errors: SharedErrors) -> bool:
@@ -159,13 +185,10 @@ def _can_tell(errors: SharedErrors) -> bool:
     return bool(errors.names) and errors.rays.corner_sigma is None
 
 
-def _predicted(errors: SharedErrors, solved: Solved) -> Calibration:
-    from objslam.graph.calibration.next_step import predict
+def _next_step(errors: SharedErrors, solved: Solved) -> NextStep:
+    from objslam.graph.calibration.next_step import NextStep
 
-    try:
-        return predict(_like(errors, solved), solved.association, solved.estimate, _values(errors, solved))
-    except (SolveError, np.linalg.LinAlgError):
-        return _unknown(errors)
+    return NextStep.of(_like(errors, solved), solved.association, solved.estimate, _values(errors, solved))
 
 
 def _solved(errors: SharedErrors, solved: Solved) -> Calibration:
