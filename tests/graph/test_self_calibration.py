@@ -17,7 +17,7 @@ from objslam.frontend.known_errors import shared_errors
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
-from objslam.graph.calibration import correlated_errors
+from objslam.graph.calibration import correlated_errors, shared_error_jacobian
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.noise_in_instruments import noise_shares
@@ -319,6 +319,32 @@ def test_a_longer_focal_length_is_not_asked_for_by_misfit():
     step = 1e-4 * np.eye(len(theta))[k]
     slope = (at(theta + step).rows.cost - at(theta - step).rows.cost) / 2e-4
     assert system.residual @ system.sides[:, k] == pytest.approx(slope, rel=0.02)
+
+
+@pytest.mark.parametrize("localized", [False, True])
+def test_only_what_a_parameter_changes_is_measured_again(monkeypatch, localized):
+    """The centre of a lens turns bearings, and moves neither poses nor ranges. So the other rows have no derivative."""
+    place = {"localization": PoseNoise()} if localized else {}
+    made, errors = drive({}, overrides=("calibration.centre=0.02",), frames=200, false=0.0, depth=DepthNoise(), **place)
+    theta, every = np.zeros(len(errors.names)), np.ones(len(made.rays), dtype=bool)
+    measured, made_of, part = Measurements.of(*errors.at(theta)), [], shared_error_jacobian._Part
+    state = Linearised(measured, made.association, made.map_T_base @ made.keyframes.base_T_camera, made.points, every)
+
+    def counted(first, inputs, measured, residuals):
+        return part(first, inputs, lambda *given: made_of.append(first) or measured(*given), residuals)
+
+    monkeypatch.setattr(shared_error_jacobian, "_Part", counted)
+    sides, _ = shared_error_jacobian._parameter_columns(state, errors, theta)
+    mounts = {f"front.{name}" for name in ("roll", "tilt", "yaw", "x", "y", "z")}
+    poses = sum(name.startswith("odometry.") or name in mounts for name in errors.names)
+    first = state.graph.first_motion
+    assert made_of.count(first) == 1 + poses + 2  # Here, at each of these errors, and at both sides of the clock.
+    lengths = {"range_scale", "range_offset", "surface"} & set(errors.names)
+    assert made_of.count(state.graph.first_range) == 1 + len(lengths)
+    for name in ("front.cx", "front.cy", "range_scale"):
+        of = sides[:, errors.names.index(name)]
+        assert of[:first].any()
+        assert not of[first:].any()
 
 
 @pytest.mark.parametrize("localized", [False, True])

@@ -28,6 +28,10 @@ _SHORT = 1e-3
 curvature. With a share below 1e-6, it contains rounding errors."""
 
 
+_Inputs = tuple[Floats | None, ...]
+"""What the measured values of a kind of measurement depend on."""
+
+
 @dataclass(frozen=True)
 class LinearSystem:
     """The whitened Jacobian and residuals of a graph and its shared errors. The robust weights are kept fixed.
@@ -190,7 +194,7 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
 
     here = measured(theta)
     parts = _parts(of, here[0].base_T_camera, here[1].sigma)
-    values = [part.measured(*here) for part in parts]
+    inputs, values = [part.inputs(*here) for part in parts], [part.measured(*here) for part in parts]
     residuals = [part.residuals(*value) if value else np.zeros(0) for part, value in zip(parts, values, strict=True)]
     for k, name in enumerate(errors.names):
         clock = kind(name) == "clock"
@@ -199,23 +203,31 @@ def _parameter_columns(of: Linearised, errors: CalibratedMeasurements, theta: Fl
         ahead, behind = measured(theta + change), measured(theta - change) if clock else None
         if clock:
             moved[k] = np.abs(ahead[0].stamps - here[0].stamps) > step / 2  # At the ends of the path, stamps hardly move.
-        for part, value, residual in zip(parts, values, residuals, strict=True):
-            after, before = part.measured(*ahead), value if behind is None else part.measured(*behind)
-            if any(not np.array_equal(one, other) for one, other in zip(after, before, strict=True)):
-                off = (part.residuals(*after) - (residual if behind is None else part.residuals(*before))).ravel()
+        for part, given, residual in zip(parts, inputs, residuals, strict=True):
+            if not _same(part.inputs(*ahead), given if behind is None else part.inputs(*behind)):
+                before = residual if behind is None else part.residuals(*part.measured(*behind))
+                off = (part.residuals(*part.measured(*ahead)) - before).ravel()
                 result[part.first : part.first + len(off), k] = off / (2 * step if clock else step)
     return result, moved
+
+
+def _same(ours: _Inputs, theirs: _Inputs) -> bool:
+    """Return whether inputs of a part are equal. The parameters that do not change an array share it."""
+    pairs = [(one, other) for one, other in zip(ours, theirs, strict=True) if one is not other]
+    return all(one is not None and other is not None and np.array_equal(one, other) for one, other in pairs)
 
 
 @dataclass(frozen=True)
 class _Part:
     """The rows of one kind of measurement, from the row `first` on.
 
-    measured: returns the measured values of these rows. Parameters that do not change the values have no derivative here,
-    and most parameters change only one kind of measurement. residuals: returns the whitened residuals of measured values.
+    inputs: returns what the measured values depend on. Parameters that do not change the inputs have no derivative here, and
+    most parameters change those of one kind of measurement. measured: returns the measured values of these rows. residuals:
+    returns the whitened residuals of measured values.
     """
 
     first: int
+    inputs: Callable[[Keyframes, Rays, Settings], _Inputs]
     measured: Callable[[Keyframes, Rays, Settings], tuple[Floats, ...]]
     residuals: Callable[..., Floats]
 
@@ -237,7 +249,8 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
     motion_weight = graph.motion_weights(map_T_camera)
     floor = of.measured.settings.odometry.floor_xy
     _, absolute_root, _ = graph.absolute_roots(map_T_camera)
-    absolute = map_T_camera[: len(absolute_root)]
+    some = slice(len(absolute_root))  # The keyframes with an absolute pose.
+    absolute = map_T_camera[some]
 
     def bearings(direction: Floats, sigma: Floats, to_landmark: Floats) -> Floats:
         # The lens changes angles between directions, and the noise of directions as well (`SharedErrors.at`). Without the
@@ -247,22 +260,29 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
     def distances(measured: Floats, to_landmark: Floats) -> Floats:
         return np.asarray(range_root * (lengths(to_landmark) - measured) / (measured / range_))
 
-    def turned(keyframes: Keyframes) -> Floats:
-        """Return the poses (P, 4, 4) of the cameras on the mounts of `keyframes`, in the frames of the cameras on the
+    from_mounts = inverse(mounts)
+
+    def turned(keyframes: Keyframes, which: Ints | slice) -> Floats:
+        """Return the poses (n, 4, 4) of the cameras of some keyframes on their mounts, in the frames of the cameras on the
         present mounts."""
-        return inverse(mounts) @ keyframes.base_T_camera
+        return from_mounts[which] @ keyframes.base_T_camera[which]
 
     def off(measured: Floats, moved: Floats, turned: Floats) -> Floats:
         # The noise belongs to base. It turns with the camera, or a residual of the heading would make the tilt of the camera
         # look known: turned by this tilt, it would become a roll of the robot, whose noise is far smaller.
         return log_se3(turned @ inverse(measured) @ moved @ inverse(turned))
 
+    def told(keyframes: Keyframes, rays: Rays, settings: Settings) -> _Inputs:
+        if not len(before) or keyframes.odom_T_base is None:
+            return ()
+        return keyframes.odom_T_base, keyframes.base_T_camera, np.array(settings.odometry.floor_xy)
+
     def said(keyframes: Keyframes, rays: Rays, settings: Settings) -> tuple[Floats, ...]:
         if not len(before) or keyframes.odom_T_base is None:
             return ()
         odom_T_camera = keyframes.odom_T_base @ keyframes.base_T_camera
         way = np.array(settings.odometry.floor_xy / floor)
-        return inverse(odom_T_camera[before]) @ odom_T_camera[after], way, turned(keyframes)[after]
+        return inverse(odom_T_camera[before]) @ odom_T_camera[after], way, turned(keyframes, after)
 
     def motions(motion: Floats, way: Floats, turned: Floats) -> Floats:
         twist = off(motion, moved, turned) / np.repeat([1.0, float(way)], 3)
@@ -284,7 +304,7 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
             return ()
         poses = keyframes.map_T_camera
         motion = inverse(poses[localized.of.before]) @ poses[localized.of.after]
-        return motion, turned(keyframes)[localized.of.after]
+        return motion, turned(keyframes, localized.of.after)
 
     def localized_motions(motion: Floats, turned: Floats) -> Floats:
         assert localized is not None
@@ -292,21 +312,33 @@ def _parts(of: Linearised, mounts: Floats, usual: Floats) -> tuple[_Part, ...]:
         return np.einsum("kij,kj->ki", localized.weighted_roots(map_T_camera), twist)
 
     return (
-        _Part(0, lambda _, rays, settings: (rays.direction, rays.sigma, from_origins(rays, seen)), bearings),
+        _Part(
+            0,
+            lambda _, rays, settings: (rays.direction, rays.sigma, rays.offset),
+            lambda _, rays, settings: (rays.direction, rays.sigma, from_origins(rays, seen)),
+            bearings,
+        ),
         _Part(
             graph.first_range,
+            lambda _, rays, settings: (rays.range[ranged], rays.offset),
             lambda _, rays, settings: (rays.range[ranged], from_origins(rays, seen)[ranged]),
             distances,
         ),
-        _Part(graph.first_motion, said, motions),
+        _Part(graph.first_motion, told, said, motions),
         _Part(
             graph.first_motion + 6 * len(before),
-            lambda keyframes, rays, settings: (
-                keyframes.map_T_camera[: len(absolute)],
-                turned(keyframes)[: len(absolute)],
+            lambda keyframes, _, settings: (keyframes.map_T_base[some], keyframes.base_T_camera[some]),
+            lambda keyframes, _, settings: (
+                keyframes.map_T_base[some] @ keyframes.base_T_camera[some],
+                turned(keyframes, some),
             ),
             poses,
         ),
-        _Part(graph.first_further, sides, lambda side: squares.by_sides(landmarks, side)),
-        _Part(graph.first_further + squares.rows_each * len(squares.tag), between, localized_motions),
+        _Part(graph.first_further, sides, sides, lambda side: squares.by_sides(landmarks, side)),
+        _Part(
+            graph.first_further + squares.rows_each * len(squares.tag),
+            lambda keyframes, _, settings: () if localized is None else (keyframes.map_T_base, keyframes.base_T_camera),
+            between,
+            localized_motions,
+        ),
     )
