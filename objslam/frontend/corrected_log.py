@@ -12,7 +12,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import lengths, make_pose, motion_between
 from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import CameraLog, Images, Log, Trajectory
-from objslam.frontend.odometry_bridge import OdometryBridge
+from objslam.frontend.odometry_bridge import OdometryBridge, bridge_of
 from objslam.frontend.odometry_drift import DriftPath, PlanarSteps
 from objslam.frontend.recent_values import RecentValues
 from objslam.frontend.surface_ranges import corrected_ranges
@@ -98,7 +98,7 @@ class CorrectablePath:
     @cached_property
     def bridge(self) -> OdometryBridge:
         """How far the path may be from the interpolated path. The errors hardly change this."""
-        return OdometryBridge.of(self.odometry)
+        return bridge_of(self.odometry)
 
     def path(self, error: Mapping[str, float]) -> Trajectory:
         """Return the corrected path, as `corrected_odometry` does."""

@@ -11,7 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import evenly_spread, interpolate, inverse
 from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError
-from objslam.frontend.odometry_bridge import OdometryBridge
+from objslam.frontend.odometry_bridge import bridge_of
 from objslam.frontend.odometry_drift import gathered_drift
 
 _DIRECTIONS = 400
@@ -56,7 +56,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
             odom_T_base, on_odometry = _on_path(odometry, stamps, valid, boxes, max_gap, ledger, "odometry")
             valid &= on_odometry
         odom_T_base = inverse(odometry.poses[0]) @ odom_T_base
-        step, wander = OdometryBridge.of(odometry).at(stamps)
+        step, wander = bridge_of(odometry).at(stamps)
         gap_ends = odometry.stamps[1:][np.diff(odometry.stamps) > max_gap]
         stretch = np.searchsorted(gap_ends, stamps, side="right")
     base_T_camera = np.empty((len(stamps), 4, 4))

@@ -15,6 +15,7 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse, log_se3
 from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Trajectory
+from objslam.frontend.recent_values import ValuesOfObjects
 
 _SHARED = 1.0
 """In the estimate for a step, the mean change of velocity on the whole path weighs as much as this number of changes. With a
@@ -66,6 +67,10 @@ class OdometryBridge:
         if last == 0:
             return step, np.zeros((len(step), 6))
         return step, self.wander[np.minimum(step.astype(np.int64), last - 1)]
+
+
+bridge_of = ValuesOfObjects[Trajectory, OdometryBridge](OdometryBridge.of)
+"""What `OdometryBridge.of` returns. Several steps of a run need it for the same odometry."""
 
 
 def _densities(step: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats, Floats]:

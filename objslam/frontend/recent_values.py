@@ -1,9 +1,29 @@
-"""Keep the last values of a slow function."""
+"""Keep the last values of a slow function, or its values for objects that are in use."""
 
+import weakref
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
 Value = TypeVar("Value")
+Thing = TypeVar("Thing")
+
+
+class ValuesOfObjects(Generic[Thing, Value]):
+    """The values of a function of objects that never change. A value is kept as long as its object lives, so it must not
+    refer to the object."""
+
+    def __init__(self, compute: Callable[[Thing], Value]) -> None:
+        """Keep the values of a function."""
+        self._compute = compute
+        self._values: dict[int, Value] = {}
+
+    def __call__(self, of: Thing) -> Value:
+        """Return the value of an object, computed if it is not kept."""
+        key = id(of)
+        if key not in self._values:
+            self._values[key] = self._compute(of)
+            weakref.finalize(of, self._values.pop, key, None).atexit = False
+        return self._values[key]
 
 
 class RecentValues(Generic[Value]):

@@ -1,6 +1,15 @@
 """The last values of a slow function."""
 
-from objslam.frontend.recent_values import RecentValues
+import gc
+
+from quick import NOTHING_DRAWN
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.frontend.odometry_bridge import OdometryBridge, bridge_of
+from objslam.frontend.recent_values import RecentValues, ValuesOfObjects
+from objslam.mapping import pipeline
+from objslam.simulation import preset, simulate
 
 
 def test_a_value_is_computed_once_while_it_is_kept():
@@ -21,3 +30,26 @@ def test_a_value_is_computed_once_while_it_is_kept():
     assert computed == [1.0, 2.0, 3.0]
     ask(2.0)
     assert computed == [1.0, 2.0, 3.0, 2.0]
+
+
+def test_the_value_of_an_object_is_computed_once_and_goes_with_the_object():
+    class Path:
+        def __init__(self, length):
+            self.length = length
+
+    computed = []
+    length_of = ValuesOfObjects(lambda path: computed.append(path.length) or path.length)
+    one, other = Path(1), Path(2)
+    assert [length_of(path) for path in (one, other, one, other)] == [1, 2, 1, 2]
+    assert computed == [1, 2]
+    del one
+    gc.collect()
+    assert list(length_of._values.values()) == [2]
+
+
+def test_a_run_measures_the_bends_of_an_odometry_once(monkeypatch):
+    log = simulate(preset("demo", frames=60, objects=4, classes=4, localization=None), 0)
+    measured, of = [], OdometryBridge.of
+    monkeypatch.setattr(bridge_of, "_compute", lambda path: measured.append(path) or of(path))
+    assert pipeline.run(log, load_settings(None, (*NOTHING_DRAWN, "mode=joint")), Ledger()).map.resolved()
+    assert len(measured) == 1
