@@ -17,13 +17,16 @@ def chain(poses: int = 60, seen_by_all: int = 4) -> sparse.csr_matrix:
     )
 
 
-def test_the_last_block_of_the_inverse_is_that_of_the_dense_matrix():
+def test_the_last_block_of_the_inverse_is_that_of_the_dense_matrix(monkeypatch):
+    """It comes from a triangle. The inverse of a dense matrix takes ten times as long for 200 of 1500 columns."""
     jacobian = chain()
     normal = NormalEquations.of(jacobian, elimination_order(jacobian, np.arange(jacobian.shape[1])))
     inverse = np.linalg.inv((jacobian.T @ jacobian).toarray())
     columns = np.array([2, 0])
     assert normal.late(columns, 20).tolist() == [2, 0]
-    found = normal.last_block(columns)
+    with monkeypatch.context() as patched:
+        patched.setattr(np.linalg, "inv", None)
+        found = normal.last_block(columns)
     np.testing.assert_allclose(found, inverse[np.ix_(columns, columns)], rtol=1e-9)
     first = normal.order[0]  # It is eliminated first.
     assert normal.late(np.array([2, first, 0]), 20).tolist() == [2, 0]

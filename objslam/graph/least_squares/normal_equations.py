@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import solve_triangular
 from scipy.sparse.linalg import SuperLU, splu
 
 from objslam.core.arrays import Floats, Ints
@@ -53,18 +54,20 @@ class NormalEquations:
     def last_block(self, columns: Ints) -> Floats:
         """Return the block (n, n) of the inverse at some columns (n,), which are `late`.
 
-        Let J^T J = L U. Multiply the last block of L by the last block of U. The inverse of this product is the last block
-        of the inverse of J^T J. Landmarks are eliminated late, because many poses see them. So their covariances come from a
-        small dense matrix. `solve` would go through all poses for each column.
+        Let J^T J = L U, and so U = D L^T. The last block of the inverse is the inverse of the product of the last blocks of
+        L and U. Landmarks are eliminated late, because many poses see them. So their covariances come from a small dense
+        triangle. `solve` would go through all poses for each column.
         """
         if not len(columns):
             return np.zeros((0, 0))
         rank = np.empty_like(self.order)
         rank[self.order] = np.arange(len(self.order))
         first = int(rank[columns].min())
-        last = (self.factored.L[first:, first:] @ self.factored.U[first:, first:]).toarray()
-        at = rank[columns] - first
-        return np.asarray(np.linalg.inv(last)[np.ix_(at, at)])
+        lower, pivots = self.factored.L[first:, first:].toarray(), self.factored.U.diagonal()[first:]
+        asked = np.zeros((len(lower), len(columns)))
+        asked[rank[columns] - first, np.arange(len(columns))] = 1.0
+        half = solve_triangular(lower, asked, lower=True, unit_diagonal=True, check_finite=False)
+        return np.asarray(half.T @ (half / pivots[:, None]))
 
 
 Equations = NormalEquations | ChainEquations
