@@ -12,9 +12,10 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
-from objslam.core.types import Keyframes, Log, Rays
+from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
+from objslam.frontend.recent_values import ValuesOfObjects
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import half_widths_of_rays, with_known_surfaces
 from objslam.io.calibration_yaml import load_calibration
@@ -37,6 +38,7 @@ its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
 OF_LENGTHS = ("range_scale", "range_offset", "surface", "tag_scale")
 """The errors of measured lengths."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
+_in_plane = ValuesOfObjects[Trajectory, bool](lambda path: is_planar(path.poses))  # A run asks for one odometry many times.
 
 
 def error_names(log: Log) -> tuple[str, ...]:
@@ -104,7 +106,7 @@ def possible(log: Log, settings: Settings) -> list[str]:
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
     mounted = (*AXES, *LENS, "x", "y", "z")
     names = [n for n in error_names(log) if prior_sigma(n, settings, place) > 0]
-    if log.localization is not None or (log.odometry is not None and not is_planar(log.odometry.poses)):
+    if log.localization is not None or (log.odometry is not None and not _in_plane(log.odometry)):
         names = [n for n in names if n != "odometry.turn_slip"]
     return [n for n in names if not ((parts := n.rpartition("."))[0] in base and parts[2] in mounted)]
 

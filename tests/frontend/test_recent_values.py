@@ -2,11 +2,13 @@
 
 import gc
 
+import pytest
 from quick import NOTHING_DRAWN
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.frontend.odometry_bridge import OdometryBridge, bridge_of
+from objslam.frontend import known_errors
+from objslam.frontend.odometry_bridge import bridge_of
 from objslam.frontend.recent_values import RecentValues, ValuesOfObjects
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
@@ -47,9 +49,11 @@ def test_the_value_of_an_object_is_computed_once_and_goes_with_the_object():
     assert list(length_of._values.values()) == [2]
 
 
-def test_a_run_measures_the_bends_of_an_odometry_once(monkeypatch):
+@pytest.mark.parametrize("function", [bridge_of, known_errors._in_plane])
+def test_a_run_looks_at_a_whole_odometry_once(monkeypatch, function):
+    """How it bends between its poses, and whether it lies in a plane."""
     log = simulate(preset("demo", frames=60, objects=4, classes=4, localization=None), 0)
-    measured, of = [], OdometryBridge.of
-    monkeypatch.setattr(bridge_of, "_compute", lambda path: measured.append(path) or of(path))
+    measured, compute = [], function._compute
+    monkeypatch.setattr(function, "_compute", lambda path: measured.append(path) or compute(path))
     assert pipeline.run(log, load_settings(None, (*NOTHING_DRAWN, "mode=joint")), Ledger()).map.resolved()
-    assert len(measured) == 1
+    assert [path is log.odometry for path in measured] == [True]
