@@ -43,14 +43,19 @@ class InnerSolve(Linearised):
         return self.rows.cost - self.decrease
 
     @cached_property
+    def gradient(self) -> Floats:
+        """(D,) of the cost."""
+        return self.rows.jacobian.T @ self.rows.residual
+
+    @cached_property
     def step(self) -> Floats:
         """(D,) the next step of an inner solve, by Gauss-Newton or, with `stale` normal equations, by the chord method."""
-        return -self.factored.solve(self.rows.jacobian.T @ self.rows.residual)
+        return -self.factored.solve(self.gradient)
 
     @property
     def decrease(self) -> float:
         """The decrease of the cost by `step`, in the linear system."""
-        return float(-(self.rows.jacobian.T @ self.rows.residual) @ self.step / 2)
+        return float(-self.gradient @ self.step) / 2
 
     def ordered(self, near: Near | None) -> Self:
         """Return the state with the order of elimination, which all later states share.
