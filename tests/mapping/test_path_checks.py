@@ -104,6 +104,18 @@ def test_poses_that_are_stamped_when_they_arrive_do_not_jump(every: float) -> No
     assert names(moved) == ["localisation jumps"]
 
 
+def test_a_car_whose_poses_are_stamped_when_they_arrive_does_not_jump() -> None:
+    """Each of its steps is longer than the least jump of a slow robot."""
+    path = circle(0.05)
+    poses = path.poses.copy()
+    poses[:, :3, 3] *= 15.0  # 9 m/s
+    car = replace(path, poses=poses)
+    assert np.median(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)) > 0.4
+    late = stamped_late(car, 0.02, 1e-7)
+    assert names(None, late) == names(late) == []
+    assert names(None, stamped_late(jumped(car, 30.01, 5.0), 0.02, 1e-7)) == ["odometry jumps"]
+
+
 @pytest.mark.parametrize(
     ("gap", "restarts", "said"), [(4.0, True, ["odometry restarts"]), (4.0, False, []), (0.0, False, [])]
 )

@@ -154,7 +154,7 @@ def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Fi
 
 
 def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
-    seconds = np.diff(path.stamps)
+    seconds = usual_seconds(np.diff(path.stamps))
     way, angle = steps(path.poses)
     moving = (way > _STILL) | (angle > _STILL)
     if moving.sum() < _FEWEST_STEPS:
