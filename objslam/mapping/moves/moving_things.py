@@ -29,8 +29,8 @@ also pass from one thing to the next where equal things stand close together, bu
 groups had 0.8 to 2.0. All objects of people together had 3 and more, and all objects of carts together had 1.9 to 2.4. A
 larger multiple drops fewer objects."""
 _LONG = 6
-"""The fewest rays of a track that shows that a thing of a moving label is at rest. The rays of shorter tracks meet in a point
-even if the thing moves. A larger number drops more objects of such labels."""
+"""The fewest rays of a track that shows that a thing of a moving label is at rest. The rays of shorter tracks meet in a
+point even if the thing moves. A larger number drops more objects of such labels."""
 _USUAL = 3
 """The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
 label does not seem to move. With a larger number, fewer maps are judged."""
@@ -54,9 +54,9 @@ def things_at_rest(
     The rays of people who walk through a room meet by chance near some points, because there are many of them. A round of
     association takes each ray by itself. But boxes of images that follow each other show one thing. If it moves, its track
     passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
-    because tracks of a few things at rest also pass on to equal things beside them. Of a label that moves, objects stay only if
-    long tracks show that they are at rest. If all things have one label, the usual
-    scatter is unknown, and all objects stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
+    because tracks of a few things at rest also pass on to equal things beside them. Of a label that moves, objects stay only
+    if long tracks show that they are at rest. If all things have one label, the usual scatter is unknown, and all objects
+    stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
     """
     moving = _moving(keyframes, rays, association, estimate, map_T_camera)
     if not moving.any():
