@@ -35,7 +35,7 @@ def explain(
 ) -> None:
     """Say what is doubtful in a result, and why: objects that may be one or two, and boxes that became no object."""
     from objslam.errors import ConfigError, OutputError
-    from objslam.io.results.files import DOUBTS
+    from objslam.io.results.files import DOUBTS, SUMMARY
     from objslam.io.results.read import load_doubts, load_summary
 
     doubts = load_doubts(out)
@@ -45,6 +45,8 @@ def explain(
     cut: dict[str, int] = summary.get("cut_off", {})
     if label is not None and label not in (known := _labels(out, doubts, cut)):
         there = f"there are {', '.join(known)}" if known else "there are none"
+        if summary.get("dropped"):
+            there += f"; boxes that give no ray are counted as dropped in {SUMMARY}"
         raise ConfigError(f"no object, box or doubt has the label {label}", where=str(out), hint=there)
     chosen = [one for one in doubts if label is None or one.label == label]
     if json:

@@ -24,6 +24,13 @@ from objslam.simulation import preset, simulate
 SETTINGS = load_settings(None, ("output.recording=false",))
 
 
+def arms(log: Log) -> np.ndarray:
+    """The boxes of the arm, by their places."""
+    found = log.cameras[0].detections
+    assert found is not None
+    return np.flatnonzero(overlap(ARM, found.boxes) > 0.7)
+
+
 def dropped(log: Log, settings=SETTINGS) -> tuple[Log, int]:
     """The log without parts of the robot, and the number of their boxes in the ledger."""
     ledger = Ledger()
@@ -56,7 +63,13 @@ def looking(path: np.ndarray, seconds: float, things: np.ndarray, yaw: float = 0
 def test_boxes_of_an_arm_are_dropped_and_counted(label):
     clean = drive()
     log = with_arm(clean, label)
-    left, number = dropped(log)
+    ledger = Ledger()
+    left = without_robot_parts(log, SETTINGS, ledger)
+    number = ledger.dropped[ROBOT_PARTS]
+    assert ledger.totals[ROBOT_PARTS] == len(log.cameras[0].detections)
+    assert ledger.examples[ROBOT_PARTS] == [
+        f"camera front, stamp {log.cameras[0].detections.stamps[arms(log)[0]]:.3f}, label {label}"
+    ]
     before, after = clean.cameras[0].detections, left.cameras[0].detections
     assert before is not None
     assert after is not None
@@ -135,7 +148,7 @@ def test_a_session_finds_the_arm_while_it_drives():
     found = log.cameras[0].detections
     assert found is not None
     _, left = dropped(log)
-    arm = overlap(ARM, found.boxes) > 0.7
+    arm = np.isin(np.arange(len(found)), arms(log))
     assert arm.sum() == left  # None of the things has a box there.
     part, finder = found_online(log)
     assert (part <= arm).all()

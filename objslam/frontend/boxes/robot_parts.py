@@ -67,11 +67,14 @@ def _cleaned(one: CameraLog, path: Trajectory, settings: Settings, ledger: Ledge
     poses, known = interpolate(path.stamps, path.poses, found.frame_stamps, settings.poses.max_gap)
     part = np.zeros(len(found), dtype=bool)
     for group in _steady(found, known[found.frame] & (found.scores >= settings.rays.min_score)):
-        part[group] = _never_rests(found, group, poses @ one.camera.base_T_camera, one.camera)
+        if _never_rests(found, group, poses @ one.camera.base_T_camera, one.camera):
+            part[group] = True
+            label = found.label_names[found.label[group[0]]]
+            where = f"{spoken_name(one.camera.name)}, stamp {found.stamps[group[0]]:.3f}, label {label}"
+            ledger.drop(ROBOT_PARTS, len(group), where)
     if not part.any():
         return one
-    where = f"{spoken_name(one.camera.name)}, stamp {found.stamps[np.argmax(part)]:.3f}"
-    ledger.drop(ROBOT_PARTS, int(part.sum()), where, of=len(found))
+    ledger.drop(ROBOT_PARTS, 0, of=len(found))
     return replace(one, detections=found.take(np.flatnonzero(~part)))
 
 
