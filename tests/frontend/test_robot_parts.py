@@ -101,6 +101,12 @@ def after_a_wait() -> Log:
     return looking(np.concatenate([still, np.column_stack([0 * turn, 0 * turn, turn])]), 60.0, np.array([[2.0, 0.0, 0.5]]))
 
 
+def turning_slowly() -> Log:
+    """A robot turns on the spot to and fro, so slowly that a thing moves by a fifth of a pixel from frame to frame."""
+    turn = 0.5 * np.abs((np.arange(6000) * 0.0004 + 0.5) % 2 - 1) * 2 - 0.5
+    return looking(np.column_stack([0 * turn - 2.0, 0 * turn - 3.0, turn + np.pi]), 200.0, np.array([[-6.0, -3.0, 0.5]]))
+
+
 def past_a_row() -> Log:
     """A robot passes a dense row of equal things to and fro."""
     row = np.column_stack([np.arange(-4, 4, 0.35), np.full(23, 2.0), np.full(23, 0.5)])
@@ -175,7 +181,9 @@ def test_a_session_forgets_an_arm_that_has_moved_away():
     assert not finder.add(box, label, np.eye(4), ahead).any()
 
 
-@pytest.mark.parametrize("log", [circling(), past_a_row(), after_a_wait()], ids=["circle", "row", "wait"])
+@pytest.mark.parametrize(
+    "log", [circling(), past_a_row(), after_a_wait(), turning_slowly()], ids=["circle", "row", "wait", "slow"]
+)
 def test_a_session_keeps_boxes_of_things_at_rest(log):
     part, finder = found_online(log)
     assert not part.any()

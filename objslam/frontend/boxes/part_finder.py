@@ -48,7 +48,8 @@ class _Place:
 
     def add(self, box: Floats, frame: int, pose: Floats, direction: Floats) -> None:
         """Add a box at this place. pose: (4, 4) of the camera. direction: (3,) of the ray, in the frame of the path."""
-        self.box += (box - self.box) / min(self.at + 1, FEWEST)
+        if self.at < FEWEST:  # A mean of later boxes would follow a thing that moves slowly through the image.
+            self.box += (box - self.box) / (self.at + 1)
         self.hits, self.at, self.near, self.last = self.hits + 1, self.at + 1, self.near + 1, frame
         ahead = pose[:3, 2]
         if self.ahead and ahead @ self.ahead[-1] > _MOVED:
