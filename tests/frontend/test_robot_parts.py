@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from more_boxes import with_boxes
 from robot_arm import ARM, with_arm
 from turning_drive import BASE_T_CAMERA, drive
 
@@ -77,6 +78,18 @@ def test_boxes_of_an_arm_are_dropped_and_counted(label):
     np.testing.assert_array_equal(after.boxes, before.boxes)
     assert dropped(clean)[1] == 0
     assert dropped(log, load_settings(None, ("rays.robot_parts=false",)))[1] == 0
+
+
+def test_an_arm_is_found_among_thousands_of_boxes_of_its_label():
+    """More boxes than are counted at once. Most are at random places of the image."""
+    rng = np.random.default_rng(0)
+    clean = drive()
+    low = rng.uniform(0, [560, 400], (6000, 2))
+    frames = np.sort(rng.integers(0, len(clean.cameras[0].detections.frame_stamps), 6000))
+    log = with_boxes(clean, frames, np.hstack([low, low + rng.uniform(20, 70, (6000, 2))]), "arm")
+    crowd = with_arm(log, "arm", share=1.0)
+    assert dropped(log)[1] == 0
+    assert dropped(crowd)[1] == pytest.approx(len(crowd.cameras[0].detections) - len(log.cameras[0].detections), abs=10)
 
 
 def test_a_camera_on_an_arm_keeps_its_boxes():

@@ -14,7 +14,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import inverse
 from objslam.core.result import RunResult
-from objslam.core.types import Association, Detections, Log
+from objslam.core.types import Association, Log
 from objslam.frontend.keyframes import build_keyframes
 from objslam.graph.fixed_pose_triangulation import triangulate_at
 from objslam.mapping.describe import describe, make_result
@@ -46,26 +46,6 @@ def boxes_of(log: Log, places: Floats, size: float) -> tuple[Ints, Floats]:
     pixel, half = project(camera, local[frames]), camera.focal * size / local[frames, 2, None] / 2
     inside = ((pixel - half > 0) & (pixel + half < camera.size - 1)).all(axis=1)
     return frames[inside], np.hstack([pixel - half, pixel + half])[inside]
-
-
-def with_boxes(log: Log, frames: Ints, boxes: Floats, label: str) -> Log:
-    """The log with more boxes (n, 4) in frames (n,) of its first camera."""
-    found = log.cameras[0].detections
-    names = found.label_names if label in found.label_names else (*found.label_names, label)
-    count = len(frames)
-    frame = np.concatenate([found.frame, frames])
-    order = np.argsort(frame, kind="stable")
-    more = Detections(
-        found.frame_stamps,
-        frame[order],
-        np.concatenate([found.boxes, boxes])[order],
-        np.concatenate([found.label, np.full(count, names.index(label))])[order],
-        np.concatenate([found.scores, np.full(count, 0.9)])[order],
-        np.concatenate([found.depths, np.full(count, np.nan)])[order],
-        np.concatenate([found.track_ids, np.full(count, -1)])[order],
-        names,
-    )
-    return replace(log, cameras=(replace(log.cameras[0], detections=more),))
 
 
 def relabelled(log: Log, which: Bools, label: str) -> Log:

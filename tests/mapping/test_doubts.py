@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from doubtful_drives import DEFAULT, LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled, with_boxes
+from doubtful_drives import DEFAULT, LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled
+from more_boxes import with_boxes
 from scipy.spatial.transform import Rotation
 
 from objslam.config import Settings

@@ -1,9 +1,8 @@
 """Carts that drive around in a room: they become no objects, and things at rest stay."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from more_boxes import with_boxes
 
 from objslam.config import load_settings
 from objslam.core.camera import project
@@ -54,23 +53,7 @@ def with_carts(log: Log, number: int, seed: int) -> Log:
             if (low > 1).all() and (high < [camera.width - 2, camera.height - 2]).all() and rng.random() > 0.1:
                 boxes.append(np.concatenate([low, high]) + rng.normal(0, 1.5, 4))
                 frames.append(frame)
-    order = np.argsort(np.concatenate([found.frame, frames]), kind="stable")
-    cart = len(found.label_names)
-
-    def joined(one: np.ndarray, more: object) -> np.ndarray:
-        return np.concatenate([one, np.broadcast_to(more, (len(boxes), *one.shape[1:]))])[order]
-
-    both = replace(
-        found,
-        frame=joined(found.frame, frames),
-        boxes=joined(found.boxes, boxes),
-        label=joined(found.label, cart),
-        scores=joined(found.scores, 0.9),
-        depths=joined(found.depths, np.nan),
-        track_ids=joined(found.track_ids, -1),
-        label_names=(*found.label_names, "cart"),
-    )
-    return replace(log, cameras=(replace(log.cameras[0], detections=both),))
+    return with_boxes(log, np.array(frames), np.array(boxes), "cart")
 
 
 @pytest.mark.parametrize("seed", [1, 2])

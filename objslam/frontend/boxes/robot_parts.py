@@ -33,8 +33,10 @@ somebody for a while, see boxes at one place in fewer. A larger number drops few
 _OFTEN = 0.1
 """A tenth counts if at least this share of its frames has the box. A detector may miss a part of the robot in most images. A
 larger share drops fewer boxes."""
-_TRIED = 64
-"""The most boxes of a label and camera around which boxes are counted. A larger number finds rarer boxes."""
+_TRIED, _COUNTED, _PLACES = 64, 4096, 16
+"""To find the fullest place of the image, boxes are counted around at most `_TRIED` boxes of a label and camera, among at
+most `_COUNTED` of its boxes. At most `_PLACES` places of each label are tried. Larger numbers find rarer boxes, and take
+more time. The first two also take memory: without limits, 600,000 boxes of one label would take gigabytes."""
 TURN = np.radians(30.0)
 """The angle (rad) by which the camera turns in a window. Odometry is good over such a turn, and a thing at rest moves by
 much of the image. A larger angle needs more turning."""
@@ -85,18 +87,25 @@ def _steady(found: Detections, usable: Bools) -> Iterator[Ints]:
     often = _OFTEN * np.bincount(tenth, minlength=10)
     for label in np.unique(found.label[usable]).tolist():
         mine = np.flatnonzero(usable & (found.label == label))
-        while len(mine) >= FEWEST:
-            some = mine[np.linspace(0, len(mine) - 1, min(_TRIED, len(mine))).astype(np.int64)]
-            there = overlap(found.boxes[some][:, None], found.boxes[mine][None]) >= SAME_BOX
+        for _ in range(_PLACES):
+            if len(mine) < FEWEST:
+                break
+            some, counted = (found.boxes[mine[_spread(len(mine), most)]] for most in (_TRIED, _COUNTED))
+            there = overlap(some[:, None], counted[None]) >= SAME_BOX
             best = there[there.sum(axis=1).argmax()]
-            alike = overlap(np.median(found.boxes[mine[best]], axis=0), found.boxes[mine])
+            alike = overlap(np.median(counted[best], axis=0), found.boxes[mine]) if best.any() else np.zeros(len(mine))
             group = mine[alike >= SAME_BOX]
             seen = np.bincount(tenth[np.unique(found.frame[group])], minlength=10)
             if len(group) < FEWEST or (seen >= often).sum() < _TENTHS:
                 break
             if len(group) >= STEADY * (alike >= LIKE_BOX).sum():
                 yield group
-            mine = mine[(alike < SAME_BOX) & ~best]
+            mine = mine[alike < SAME_BOX]
+
+
+def _spread(number: int, most: int) -> Ints:
+    """Return at most `most` indices below a number, spread evenly."""
+    return np.linspace(0, number - 1, min(most, number)).astype(np.int64)
 
 
 def _never_rests(found: Detections, group: Ints, map_T_camera: Floats, camera: Camera) -> bool:

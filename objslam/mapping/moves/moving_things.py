@@ -30,7 +30,8 @@ groups had 0.8 to 2.0. All objects of people together had 3 and more, and all ob
 larger multiple drops fewer objects."""
 _LONG = 6
 """The fewest rays of a track that shows that a thing of a moving label is at rest. The rays of shorter tracks meet in a
-point even if the thing moves. A larger number drops more objects of such labels."""
+point even if the thing moves: a cart with four rays in tracks of three passed for a thing at rest. A larger number drops
+more objects of such labels."""
 _USUAL = 3
 """The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
 label does not seem to move. With a larger number, fewer maps are judged."""

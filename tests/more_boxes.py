@@ -1,0 +1,31 @@
+"""Put more boxes into a log."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.types import Log
+
+
+def with_boxes(log: Log, frames: Ints, boxes: Floats, label: str) -> Log:
+    """The log with more boxes (n, 4) of a label in frames (n,) of its first camera."""
+    found = log.cameras[0].detections
+    assert found is not None
+    names = found.label_names if label in found.label_names else (*found.label_names, label)
+    order = np.argsort(np.concatenate([found.frame, frames]), kind="stable")
+
+    def joined(one: np.ndarray, more: object) -> np.ndarray:
+        return np.concatenate([one, np.broadcast_to(more, (len(frames), *one.shape[1:]))])[order]
+
+    more = replace(
+        found,
+        frame=joined(found.frame, frames),
+        boxes=joined(found.boxes, boxes),
+        label=joined(found.label, names.index(label)),
+        scores=joined(found.scores, 0.9),
+        depths=joined(found.depths, np.nan),
+        track_ids=joined(found.track_ids, -1),
+        label_names=names,
+    )
+    return replace(log, cameras=(replace(log.cameras[0], detections=more),))
