@@ -12,7 +12,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.geometry import interpolate, is_planar
+from objslam.core.geometry import interpolate, is_planar, lengths
 from objslam.core.rotation import cross, rotation_from_vector, rotation_vector
 from objslam.core.statistics import NORMAL_MEDIAN
 from objslam.core.trajectory import usual_seconds
@@ -21,13 +21,13 @@ from objslam.core.types import Log, Trajectory
 ANOTHER_MAP = 1.0
 """The longest jump (m) that is corrected. With a longer one, the localisation may have changed to another map, or somebody
 may have carried the robot. A larger value corrects longer jumps."""
-_ACCELERATION = 5.0
+ACCELERATION = 5.0
 """The acceleration (m/s^2) that a robot does not exceed from one step to the next and back. Wheels on a floor slip at 4 to
-8. A larger value finds fewer jumps."""
+8. With a larger value, fewer steps are jumps."""
 _FREE_ACCELERATION = 20.0
 """The highest acceleration (m/s^2) of poses that are not in a plane: a hand swings a camera, and a drone flies, with up to 2
 g. With a larger value, fewer steps are jumps."""
-_TIMES_ODD = 3.5
+TIMES_ODD = 3.5
 """The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
 difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
 deviations. A larger number finds fewer jumps."""
@@ -37,12 +37,12 @@ by the settings. Noise exceeds this size with a probability of 1e-6 (chi-squared
 a thousand logs of a thousand poses. A smaller jump counts as noise. A larger number finds fewer jumps."""
 _OF_MEDIAN = float(np.sqrt(np.log(10) / np.log(2)))
 """The length that a tenth of the steps exceeds, as a multiple of their median length, for normal noise in a plane."""
-_FEWEST_STEPS = 20
+FEWEST_STEPS = 20
 """The fewest steps of a path that are judged. Fewer steps do not show what is usual."""
 _MOST_JUMPS = 10
 """The most jumps of a log. A localisation that jumps more often is a noisy one, and its noise is estimated. A larger number
 corrects worse localisations."""
-_STILL = 1e-4
+STILL = 1e-4
 """Two poses that differ by less than this distance (m) and turn (rad) are one pose that was repeated. A larger value takes
 slow motion for a stop."""
 
@@ -140,32 +140,32 @@ def find_jumps(log: Log, settings: Settings) -> Jumps | None:
     too many jumps, or one of more than `ANOTHER_MAP`, none can be corrected.
     """
     path = log.localization
-    if path is None or settings.poses.jumps == "keep" or len(path) <= _FEWEST_STEPS:
+    if path is None or settings.poses.jumps == "keep" or len(path) <= FEWEST_STEPS:
         return None
     # Some localisations repeat each pose until the next one is known. No step took less time than the repetitions.
-    moved = _lengths(_steps(path.poses)) > _STILL
+    moved = lengths(steps_of(path.poses)) > STILL
     new = np.append(True, moved.any(axis=1))
     path = replace(path, stamps=path.stamps[new], poses=path.poses[new])
-    if len(path) <= _FEWEST_STEPS:
+    if len(path) <= FEWEST_STEPS:
         return None
     if log.odometry is None:
         odd, off, judged = _by_neighbours(path)
     else:
         odd, off, judged = _by_odometry(path, log.odometry, settings.poses.max_gap)
-    if judged.sum() < _FEWEST_STEPS:
+    if judged.sum() < FEWEST_STEPS:
         return None
     # Each pair is a distance and an angle.
-    drift = 0.0 if log.odometry is None else _drift(_lengths(_steps(path.poses)), settings)
+    drift = 0.0 if log.odometry is None else _drift(lengths(steps_of(path.poses)), settings)
     poses = 2 * np.array([settings.localization.xy, settings.localization.yaw]) ** 2
-    usual = _TIMES_ODD * np.quantile(off[judged], 0.9, axis=0)
+    usual = TIMES_ODD * np.quantile(off[judged], 0.9, axis=0)
     least = np.maximum(np.maximum(usual, _usual_corrections(off[judged], usual)), _CERTAIN * np.sqrt(poses + drift))
     # A turn alone is no jump: a hand turns a camera as fast, and wheels that slip do not show a turn.
-    most = _ACCELERATION if is_planar(path.poses) else _FREE_ACCELERATION
+    most = ACCELERATION if is_planar(path.poses) else _FREE_ACCELERATION
     possible = 0.0 if log.odometry is not None else most * np.diff(path.stamps) ** 2
     jumps = off[:, 0] > np.maximum(least[..., 0], possible)
     found = np.flatnonzero(jumps & judged)
     noise = np.median(np.abs(odd[judged]), axis=0) / NORMAL_MEDIAN
-    if not len(found) or len(found) > _MOST_JUMPS or _lengths(odd[found])[:, 0].max() > ANOTHER_MAP:
+    if not len(found) or len(found) > _MOST_JUMPS or lengths(odd[found])[:, 0].max() > ANOTHER_MAP:
         return None
     stamps = path.stamps[found + 1]
     ends = np.concatenate([path.stamps[:1], stamps, path.stamps[-1:]])
@@ -185,25 +185,22 @@ def _usual_corrections(off: Floats, usual: Floats) -> Floats:
     corrections = off[off[:, 0] > usual[0]]
     if len(corrections) <= _MOST_JUMPS:
         return np.zeros(2)
-    return _TIMES_ODD * _OF_MEDIAN * np.median(corrections, axis=0)
+    return TIMES_ODD * _OF_MEDIAN * np.median(corrections, axis=0)
 
 
 def _by_neighbours(path: Trajectory) -> tuple[Floats, Floats, Bools]:
     """Judge each step of a path by the steps beside it.
 
     Returns the differences (N-1, 2, 3) between each step and a step at the median velocity of four steps, the two before it
-    and the two after it. Also returns the oddness (N-1, 2) of each step, and which steps (N-1,) are judged. In the axis of
-    length 2, the first entry is the move, m, and the second is the turn, rad. The oddness is the difference from the more
-    similar of the two neighbouring steps, with the times as given, or with times that are not shorter than usual
-    (`usual_seconds`) if this is less.
+    and the two after it. Also returns the `oddness` (N-1, 2) of each step, and which steps (N-1,) are judged. In the axis of
+    length 2, the first entry is the move, m, and the second is the turn, rad.
     """
-    seconds, steps = np.diff(path.stamps), _steps(path.poses)
-    off = np.min([_unlike(steps / t[:, None, None]) * t[:, None] for t in (seconds, usual_seconds(seconds))], axis=0)
-    velocity = steps / seconds[:, None, None]
+    seconds = np.diff(path.stamps)
+    velocity = steps_of(path.poses) / seconds[:, None, None]
     around = np.clip(np.arange(len(velocity))[:, None] + [-2, -1, 1, 2], 0, len(velocity) - 1)
     odd = (velocity - np.median(velocity[around], axis=1)) * seconds[:, None, None]
     judged = seconds <= 2 * np.median(seconds)  # In a gap of the poses, a robot can do anything.
-    return odd, off, judged
+    return odd, oddness(path), judged
 
 
 def _by_odometry(path: Trajectory, odometry: Trajectory, max_gap: float) -> tuple[Floats, Floats, Bools]:
@@ -213,17 +210,30 @@ def _by_odometry(path: Trajectory, odometry: Trajectory, max_gap: float) -> tupl
     """
     wheels, known = interpolate(odometry.stamps, odometry.poses, path.stamps, max_gap)
     seconds = np.diff(path.stamps)
-    by_map, by_wheels = _steps(path.poses), _steps(wheels)
+    by_map, by_wheels = steps_of(path.poses), steps_of(wheels)
     to_map = (path.poses[:, :3, :3] @ np.swapaxes(wheels[:, :3, :3], 1, 2))[:-1]
     odd = by_map - np.einsum("nij,nkj->nki", to_map, by_wheels)
-    own = _unlike(by_map / seconds[:, None, None]) > _unlike(by_wheels / seconds[:, None, None])
-    return odd, np.where(own, _lengths(odd), 0.0), known[:-1] & known[1:] & (seconds <= max_gap)
+    own = unlike(by_map / seconds[:, None, None]) > unlike(by_wheels / seconds[:, None, None])
+    return odd, np.where(own, lengths(odd), 0.0), known[:-1] & known[1:] & (seconds <= max_gap)
 
 
-def _unlike(steps: Floats) -> Floats:
+def oddness(path: Trajectory) -> Floats:
+    """Return the oddness (N-1, 2) of the steps of a path, m and rad: the difference from the more similar of the two
+    neighbouring steps.
+
+    The difference is found with the times as given, and with times that are not shorter than usual (`usual_seconds`). The
+    smaller difference counts.
+    """
+    seconds, steps = np.diff(path.stamps), steps_of(path.poses)
+    return np.asarray(
+        np.min([unlike(steps / t[:, None, None]) * t[:, None] for t in (seconds, usual_seconds(seconds))], axis=0)
+    )
+
+
+def unlike(steps: Floats) -> Floats:
     """Return how far (N, 2) the moves and turns of steps (N, 2, 3) are from the more similar of their two neighbours. The
     first and the last step give 0, because they have only one neighbour."""
-    change, none = _lengths(np.diff(steps, axis=0)), np.full((1, 2), np.inf)
+    change, none = lengths(np.diff(steps, axis=0)), np.full((1, 2), np.inf)
     found = np.minimum(np.concatenate([change, none]), np.concatenate([none, change]))
     found[[0, -1]] = 0.0
     return np.asarray(found)
@@ -237,13 +247,8 @@ def _drift(travel: Floats, settings: Settings) -> Floats:
     return np.asarray(travel @ per_length)
 
 
-def _steps(poses: Floats) -> Floats:
+def steps_of(poses: Floats) -> Floats:
     """Return the move, m, and the turn as a rotation vector, rad, of each step of a path, both in map: (N-1, 2, 3)."""
     rotation = poses[:, :3, :3]
     turns = rotation_vector(rotation[1:] @ np.swapaxes(rotation[:-1], 1, 2))
     return np.stack([np.diff(poses[:, :3, 3], axis=0), turns], axis=1)
-
-
-def _lengths(steps: Floats) -> Floats:
-    """Return the lengths (N, 2) of moves, m, and of turns, rad."""
-    return np.asarray(np.linalg.norm(steps, axis=2))

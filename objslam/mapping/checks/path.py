@@ -7,10 +7,11 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats
-from objslam.core.geometry import interpolate, inverse
+from objslam.core.geometry import interpolate, inverse, lengths
 from objslam.core.rotation import rotation_vector
 from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Log, Trajectory
+from objslam.frontend.localization_jumps import ACCELERATION, FEWEST_STEPS, STILL, TIMES_ODD, oddness, steps_of, unlike
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import JUMPS, Finding
 from objslam.mapping.checks.parts.moving_boxes import boxes_move
@@ -31,21 +32,9 @@ _JUMP_TURN = 20.0
 for each m/s of live.max_speed. A larger rate warns less often."""
 _JUMP_WAY, _JUMP_ANGLE = 0.3, 0.3
 """The least distance (m) and turn (rad) of a jump. Larger values ignore small corrections."""
-_ACCELERATION = 5.0
-"""The acceleration (m/s^2) that a slow robot does not exceed from one step to the next and back. Wheels on a floor slip at
-4 to 8. A larger value warns less often."""
 _TIMES = 5.0
 """The least speed of a jump, as a multiple of the speed that the moving robot exceeds in a tenth of its steps. It is also
 the multiple for the turn rate of a jump. A larger number warns less often."""
-_TIMES_ODD = 3.5
-"""The least oddness of a jump, as a multiple of the oddness that a tenth of the steps exceeds. The oddness of a step is its
-difference from the steps beside it, or from the step of the odometry. For normal noise in a plane, 3.5 is 7.5 standard
-deviations. A larger number warns less often."""
-_FEWEST_STEPS = 20
-"""The fewest steps of a path that are judged. A larger number judges fewer paths."""
-_STILL = 1e-4
-"""The robot stands still if two poses differ by less than this distance (m) and turn (rad). A larger value takes slow motion
-for a stop."""
 _FROZEN_SECONDS = 8.0
 """The shortest time (s) without motion that may be a frozen path. If a robot really stands still, its boxes do not move in
 the image either. A larger value finds fewer frozen paths."""
@@ -72,7 +61,7 @@ def check_path(log: Log, settings: Settings) -> list[Finding]:
     max_gap, joint = settings.poses.max_gap, settings.mode == "joint"
     found: list[Finding] = []
     for name, path in (("localisation", log.localization), ("odometry", log.odometry)):
-        if path is not None and len(path) > _FEWEST_STEPS:
+        if path is not None and len(path) > FEWEST_STEPS:
             used = joint or path is log.robot_path
             found += (one if used else replace(one, spoils=False) for one in _judge_speed(path, name))
             found += _judge_stops(path, name, log)
@@ -108,16 +97,16 @@ def _compare_steps(localization: Trajectory, odometry: Trajectory, max_gap: floa
     """Find steps of the localisation that the odometry does not show."""
     wheels, known = interpolate(odometry.stamps, odometry.poses, localization.stamps, max_gap)
     pair = np.flatnonzero(known[:-1] & known[1:] & (np.diff(localization.stamps) <= max_gap))
-    if len(pair) < _FEWEST_STEPS:
+    if len(pair) < FEWEST_STEPS:
         return
-    by_map, by_wheels = (inverse(poses[pair]) @ poses[pair + 1] for poses in (localization.poses, wheels))
-    way = np.linalg.norm(by_map[:, :3, 3] - by_wheels[:, :3, 3], axis=1)
+    relative = [inverse(poses[pair]) @ poses[pair + 1] for poses in (localization.poses, wheels)]
+    by_map, by_wheels = (np.stack([one[:, :3, 3], rotation_vector(one[:, :3, :3])], axis=1) for one in relative)
+    way = lengths(by_map[:, 0] - by_wheels[:, 0])
     # A step that only the odometry makes is an error of the odometry, such as a slip.
-    own = _beside(by_map[:, :3, 3]) > _beside(by_wheels[:, :3, 3])
-    own |= _beside(rotation_vector(by_map[:, :3, :3])) > _beside(rotation_vector(by_wheels[:, :3, :3]))
-    angle = np.linalg.norm(rotation_vector(np.swapaxes(by_wheels[:, :3, :3], 1, 2) @ by_map[:, :3, :3]), axis=1)
-    jumps = (way > max(_JUMP_WAY, _TIMES_ODD * float(np.quantile(way, 0.9)))) | (
-        angle > max(_JUMP_ANGLE, _TIMES_ODD * float(np.quantile(angle, 0.9)))
+    own = (unlike(by_map) > unlike(by_wheels)).any(axis=1)
+    angle = lengths(rotation_vector(np.swapaxes(relative[1][:, :3, :3], 1, 2) @ relative[0][:, :3, :3]))
+    jumps = (way > max(_JUMP_WAY, TIMES_ODD * float(np.quantile(way, 0.9)))) | (
+        angle > max(_JUMP_ANGLE, TIMES_ODD * float(np.quantile(angle, 0.9)))
     )
     jumps &= own
     if jumps.any():
@@ -135,12 +124,12 @@ def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Fi
     """Compare the distances that the localisation and the odometry measure in the same pieces of time."""
     begin, end = max(localization.stamps[0], odometry.stamps[0]), min(localization.stamps[-1], odometry.stamps[-1])
     times = np.arange(begin, end, _PIECE)
-    if len(times) < _FEWEST_STEPS:
+    if len(times) < FEWEST_STEPS:
         return
     places = [interpolate(path.stamps, path.poses, times, np.inf)[0][:, :3, 3] for path in (localization, odometry)]
     by_map, by_wheels = (np.linalg.norm(np.diff(place, axis=0), axis=1) for place in places)
     moved = np.minimum(by_map, by_wheels) > _LEAST_PIECE * np.maximum(by_map, by_wheels).max()
-    if moved.sum() < _FEWEST_STEPS:
+    if moved.sum() < FEWEST_STEPS:
         return
     ratio = np.log(by_map[moved] / by_wheels[moved])
     middle = float(np.median(ratio))
@@ -155,9 +144,9 @@ def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Fi
 
 def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
     seconds = usual_seconds(np.diff(path.stamps))
-    way, angle = steps(path.poses)
-    moving = (way > _STILL) | (angle > _STILL)
-    if moving.sum() < _FEWEST_STEPS:
+    way, angle = lengths(steps_of(path.poses)).T
+    moving = (way > STILL) | (angle > STILL)
+    if moving.sum() < FEWEST_STEPS:
         return
     speed, rate = way / seconds, angle / seconds
     usual, turning = float(np.median(speed[moving])), float(np.quantile(_turn_rates(path)[moving], 0.9))
@@ -178,7 +167,7 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
     # A gap in the poses is no jump. The speed over the gap is one that a robot can reach.
     jumps = (speed > max(_JUMP, _TIMES * fast[0])) & (way > _JUMP_WAY)
     jumps |= (rate > max(_JUMP_TURN, _TIMES * fast[1])) & (angle > _JUMP_ANGLE)
-    odd = _oddness(path)
+    odd = oddness(path)[:, 0]
     jumps |= _pulses(path, odd, moving)
     if jumps.any():
         first = int(np.argmax(jumps))
@@ -192,35 +181,16 @@ def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
         )
 
 
-def _oddness(path: Trajectory) -> Floats:
-    """Return by how much (N-1,), m, the steps of a path differ from the steps beside them, which is the size of a jump.
-
-    The difference is found with the times as given, and with times that are not shorter than usual (`usual_seconds`). The
-    smaller difference counts.
-    """
-    seconds, way = np.diff(path.stamps), np.diff(path.poses[:, :3, 3], axis=0)
-    return np.asarray(np.min([_beside(way / t[:, None]) * t for t in (seconds, usual_seconds(seconds))], axis=0))
-
-
 def _pulses(path: Trajectory, odd: Floats, moving: Bools) -> Bools:
     """Return which steps (N-1,) differ from both steps beside them by more than a robot can accelerate and brake.
 
-    odd: (N-1,) as from `_oddness`. moving: (N-1,) the steps that show what is usual. Some localisations repeat each pose
-    until the next one is known.
+    odd: (N-1,) m, the `oddness` of their moves. moving: (N-1,) the steps that show what is usual. Some localisations repeat
+    each pose until the next one is known.
     """
     seconds = np.diff(path.stamps)
     off = np.where(seconds <= 2 * np.median(seconds), odd, 0.0)  # In a gap of the poses, a robot can do anything.
-    least = np.maximum(_JUMP_WAY + _ACCELERATION * seconds**2, _TIMES_ODD * np.quantile(off[moving], 0.9))
+    least = np.maximum(_JUMP_WAY + ACCELERATION * seconds**2, TIMES_ODD * np.quantile(off[moving], 0.9))
     return np.asarray(off > least)
-
-
-def _beside(steps: Floats) -> Floats:
-    """Return how far (N,) each of the steps (N, 3) differs from the more similar of its two neighbours. The first and the
-    last step give 0, because they have only one neighbour."""
-    change = np.linalg.norm(np.diff(steps, axis=0), axis=1)
-    found = np.minimum(np.append(change, np.inf), np.append(np.inf, change))
-    found[[0, -1]] = 0.0
-    return np.asarray(found)
 
 
 def log_is_split(way: Floats, jumps: Bools) -> bool:
@@ -234,8 +204,8 @@ def log_is_split(way: Floats, jumps: Bools) -> bool:
 
 def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
     """Find long times in which the poses stand still while the boxes move."""
-    way, angle = steps(path.poses)
-    still = (way < _STILL) & (angle < _STILL)
+    way, angle = lengths(steps_of(path.poses)).T
+    still = (way < STILL) & (angle < STILL)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
     frozen, begin = 0.0, None
     for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
@@ -252,24 +222,13 @@ def _judge_stops(path: Trajectory, name: str, log: Log) -> Iterator[Finding]:
         )
 
 
-def steps(poses: Floats) -> tuple[Floats, Floats]:
-    """Return the distance (N-1,), m, and the angle (N-1,), rad, of each step of a path."""
-    way = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    return way, np.asarray(np.linalg.norm(_turns(poses), axis=1))
-
-
-def _turns(poses: Floats) -> Floats:
-    """Return the rotation vector (N-1, 3) of each step of a path in base, rad."""
-    return rotation_vector(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
-
-
 def _turn_rates(path: Trajectory) -> Floats:
     """Return the turn rate (N-1,), rad/s, that begins at each pose except the last one. It is a mean over at least
     `_TURN_TIME`.
 
     Steps are added with their directions, so the noise of headings averages out.
     """
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(_turns(path.poses), axis=0)])
+    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps_of(path.poses)[:, 1], axis=0)])
     first = np.arange(len(path) - 1)
     last = np.clip(np.searchsorted(path.stamps, path.stamps[:-1] + _TURN_TIME), first + 1, len(path) - 1)
     turn, seconds = turned[last] - turned[first], path.stamps[last] - path.stamps[first]
@@ -282,7 +241,7 @@ def straightness(path: Trajectory) -> float | None:
     It is the length of the mean direction of motion in base. Motions that are too short have no direction and do not count.
     None if too few motions count, or if the robot hardly turns. All axes fit a robot that does not turn.
     """
-    if len(path) < _FEWEST_STEPS:
+    if len(path) < FEWEST_STEPS:
         return None
     later = np.searchsorted(path.stamps, path.stamps + _BEFORE)
     first = np.flatnonzero(later < len(path))
@@ -292,7 +251,7 @@ def straightness(path: Trajectory) -> float | None:
     near = path.stamps[last] - path.stamps[first] < 4 * _BEFORE
     noise = float(np.median(length[near])) if near.any() else 0.0
     kept = near & (length > max(3 * _LEAST_STEP, noise / 2))
-    if kept.sum() < _FEWEST_STEPS:
+    if kept.sum() < FEWEST_STEPS:
         return None
     first, last, direction = first[kept], last[kept], way[kept] / length[kept, None]
     if np.linalg.norm(direction.mean(axis=0)) > 0.9:
