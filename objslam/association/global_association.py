@@ -18,7 +18,7 @@ from objslam.association.gating import alternate, gate_limit, near, size_costs
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.merging import close_pairs, merge_targets
+from objslam.association.merging import better_neighbours, merge_targets
 from objslam.association.observations import PosedRays, observe
 from objslam.association.refinement import grouped_sums
 from objslam.association.visibility import frames_of
@@ -88,7 +88,7 @@ def associate_globally(
     rays, keyframes, cameras = of.rays, of.keyframes, of.cameras
     obs, ray, keyframe = observe(of)
     view = frames_of(keyframes, keyframe, cameras, of.map_T_camera, settings, drifts=drifts, cut=rays.cut)
-    nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), len(rays.label_names))
+    nothing = Landmarks.none(len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
     task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
     if guess is not None:
@@ -177,8 +177,7 @@ def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: L
             free = free[np.isin(obs.frame[free], some)]
         if len(free) > _MOST_RAYS:
             free = np.sort(rng.permutation(free)[:_MOST_RAYS])
-        pool = obs.take(free)
-        pool = replace(pool, sigma=pool.sigma * noise[label], position_sigma=pool.position_sigma * noise[label])
+        pool = obs.take(free).noisier(noise[label])
         # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
         chance = np.pi * task.gate * float((pool.sigma**2).sum()) / (state.view.solid_angle * obs.scale)
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
@@ -305,20 +304,12 @@ def _drop_all(task: _Task, state: State) -> tuple[State, Floats]:
 
 
 def _drop(task: _Task, state: State, likely: Floats) -> State:
-    """Drop landmarks whose probability (N,) is below association.min_existence.
-
-    If two neighbours of one label both fail, the neighbour with more rays is kept in this call. It may get boxes back from
-    the other neighbour, and the next call judges it again.
-    """
+    """Drop landmarks whose probability (N,) is below association.min_existence, except for `better_neighbours`. The next
+    call judges these again."""
     failing = likely < task.settings.min_existence
     if not failing.any():
         return state
-    number, label = state.ray_count, state.label
-    a, b = close_pairs(state, task.gate)
-    rivals = failing[a] & failing[b] & (label[a] == label[b])
-    keep = ~failing
-    keep[np.where(number[a] > number[b], a, b)[rivals]] = True
-    return _alternate(task, state.keep(keep))
+    return _alternate(task, state.keep(~failing | better_neighbours(state, failing, task.gate)))
 
 
 def _result(state: State, existence: Floats, ray: Ints) -> Association:

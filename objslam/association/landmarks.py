@@ -34,6 +34,11 @@ class Landmarks:
         accepts[np.arange(len(position)), label] = True
         return cls(position, np.zeros((len(position), 3, 3)), noise, accepts)
 
+    @classmethod
+    def none(cls, labels: int) -> Self:
+        """Return no landmarks. labels: the number of all labels."""
+        return cls.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), labels)
+
     def take(self, which: Bools | Ints) -> Self:
         """Select landmarks by a mask or by indices."""
         return type(self)(self.position[which], self.covariance[which], self.noise[which], self.accepts[which])

@@ -11,7 +11,7 @@ from objslam.association.landmarks import State
 from objslam.association.observations import Observations, overlap
 from objslam.association.refinement import BEHIND, normalised_residuals, ray_costs, refine
 from objslam.association.visibility import DetectionHistory
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import nearest_points
 from objslam.core.statistics import RAYLEIGH_MEDIAN, grouped_median
 
@@ -93,6 +93,19 @@ def close_pairs(state: State, gate: float) -> tuple[Ints, Ints]:
     pairs = np.concatenate([np.stack([a[close], b[close]], axis=1), _on_one_line(state, gate)])
     pairs = np.unique(np.sort(pairs, axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1]
+
+
+def better_neighbours(state: State, failing: Bools, gate: float) -> Bools:
+    """Return which landmarks (N,) have more rays than a neighbour of the same label, if both of them fail. Such a landmark
+    may get the rays of its neighbour, and then it need not fail.
+
+    failing: (N,) the landmarks that fail a test.
+    """
+    number, label, better = state.ray_count, state.label, np.zeros(state.count, dtype=bool)
+    a, b = close_pairs(state, gate)
+    rivals = failing[a] & failing[b] & (label[a] == label[b])
+    better[np.where(number[a] > number[b], a, b)[rivals]] = True
+    return better
 
 
 def _on_one_line(state: State, gate: float) -> Ints:

@@ -77,6 +77,10 @@ class Observations:
         selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
         return type(self)(**selected)
 
+    def noisier(self, factor: float) -> Self:
+        """Return the rays with a factor on their nominal noise."""
+        return replace(self, sigma=self.sigma * factor, position_sigma=self.position_sigma * factor)
+
 
 @lru_cache(maxsize=256)
 def _nothing(count: int) -> tuple[Ints, Ints, Floats, Floats]:

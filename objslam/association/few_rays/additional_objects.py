@@ -16,7 +16,7 @@ from objslam.association.few_rays.place_errors import moments, place_errors
 from objslam.association.few_rays.sparse_search import SparseSearch, discover_sparse
 from objslam.association.gating import alternate, gate_limit, near
 from objslam.association.landmarks import Landmarks, State
-from objslam.association.merging import close_pairs, merge_targets
+from objslam.association.merging import better_neighbours, merge_targets
 from objslam.association.observations import PosedRays, observe
 from objslam.association.refinement import refine
 from objslam.association.visibility import frames_of
@@ -189,8 +189,7 @@ class _Few:
     def search_once(self, least: float, seed: int) -> State:
         """Return the landmarks of the free rays that are found from the present places."""
         labels, obs = len(self.known.unassigned), self.known.obs.take(self.free)
-        nothing = Landmarks.new(np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.int64), labels)
-        found = State(obs, self.known.view, nothing, np.full(len(obs), -1, dtype=np.int64), self.known.ratio)
+        found = State(obs, self.known.view, Landmarks.none(labels), np.full(len(obs), -1, dtype=np.int64), self.known.ratio)
         for turn in range(_TURNS):
             before = found.count
             found = self.settled(self.discover(found, np.random.default_rng([seed, turn])), 2)
@@ -210,8 +209,7 @@ class _Few:
         strays = self.strays.take(self.free)
         for label in np.flatnonzero(found.unassigned).tolist():
             rays = _some_frames(obs.frame, np.flatnonzero((obs.label == label) & (found.matched < 0)), rng)
-            pool = obs.take(rays)
-            pool = replace(pool, sigma=pool.sigma * noise[label], position_sigma=pool.position_sigma * noise[label])
+            pool = obs.take(rays).noisier(noise[label])
             search = SparseSearch(strays.take(rays), float(found.unassigned[label]), self.gate, _PARALLAX, 0.0)
             points = discover_sparse(pool, search)
             new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
@@ -238,18 +236,9 @@ class _Few:
         return found.merge(own).keep(~taken[known:][own == np.arange(found.count)])
 
     def dropped(self, found: State, least: float) -> State:
-        """Drop landmarks until all that are left are likely enough to exist.
-
-        If two neighbours both fail, the neighbour with more rays stays for one more turn. It may get rays of the other
-        neighbour.
-        """
+        """Drop landmarks until all that are left are likely enough to exist. `better_neighbours` stay for one more turn."""
         while (failing := self.existence(found) < least).any():
-            number, label = found.ray_count, found.label
-            a, b = close_pairs(found, self.gate)
-            rivals = failing[a] & failing[b] & (label[a] == label[b])
-            keep = ~failing
-            keep[np.where(number[a] > number[b], a, b)[rivals]] = True
-            left = self.settled(found.keep(keep))
+            left = self.settled(found.keep(~failing | better_neighbours(found, failing, self.gate)))
             if left.count == found.count:
                 return self.settled(found.keep(~failing))
             found = left
