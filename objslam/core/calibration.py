@@ -245,3 +245,8 @@ class CalibratedMeasurements(Protocol):
 
         values: (M, P) the errors. One call for many values takes far less time than a call of `at` for each.
         """
+
+
+def expected_errors(errors: CalibratedMeasurements) -> Calibration:
+    """Return the errors as their prior expects them before a solve."""
+    return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))

@@ -135,16 +135,11 @@ class Measurements:
             factors += add_squares(self.tags, landmarks, positions, values, self.settings.joint.prior_sigma)
         return build_graph(factors), values
 
-    def further_rows(self, rays: Rays, owner: Ints, landmarks: Ints) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
+    def further_rows(self, landmarks: Ints) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
         """Return the kinds of factors that bring their own rows.
 
         `JointGraph` itself makes the rows of bearings, ranges, weak priors, motions and poses. All other kinds are returned
-        here.
-
-        Args:
-            rays: the n rays in the graph.
-            owner: (n,) the landmark of each ray.
-            landmarks: (m,) the landmarks in the graph, in increasing order.
+        here. landmarks: (m,) the landmarks in the graph, in increasing order.
         """
         squares, by_localization = SquareRows.of(self.tags, landmarks), self.localized_motions
         if by_localization is None:

@@ -48,11 +48,6 @@ def read_poses(values: gtsam.Values) -> Floats:
     return keyframes_in(values)[1]
 
 
-def read_points(values: gtsam.Values) -> Floats:
-    """Return the points L (n, 3) of the values, in the order of their numbers."""
-    return landmarks_in(values)[1]
-
-
 def keyframes_in(values: gtsam.Values) -> tuple[Ints, Floats]:
     """Return the numbers (K,) and the poses (K, 4, 4) of the variables X, in the order of their numbers."""
     keys = _keys(values, X0)

@@ -91,9 +91,8 @@ class Solution:
 
     keyframes: all with at least one ray. rays: with indices into these keyframes. rounds: counts of each round of
     association and solve. trace: the rounds in detail, empty without a recording. bodies: the body of each object, None for
-    a point. body_share: the standard deviation of the error that all boxes of a body from one side have, as a share of half
-    the box. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
-    object in the box of each ray. bodies, body_share, to_centre and hidden are None if no bodies were solved. doubted: the
+    a point. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
+    object in the box of each ray. bodies, to_centre and hidden are None if no bodies were solved. doubted: the
     labels that may name one object or several. unsettled: the objects that the last round changed, as in `objects_changed`,
     although no further round was allowed. errors: the estimated errors, as a function of the measurements. None if none were
     estimated. If a held error is gross, it is among them too.
@@ -106,7 +105,6 @@ class Solution:
     rounds: tuple[dict[str, int], ...]
     trace: tuple[Round, ...] = ()
     bodies: tuple[PlacedBody | None, ...] | None = None
-    body_share: float | None = None
     to_centre: CentreShift | None = None
     hidden: Bools | None = None
     doubted: tuple[str, ...] = ()

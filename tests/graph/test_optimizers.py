@@ -8,7 +8,7 @@ from objslam.core.geometry import exp_se3
 from objslam.errors import SolveError
 from objslam.graph.factors.bearing import bearings
 from objslam.graph.optimizers import build_graph, graduated, indeterminate, levenberg_marquardt
-from objslam.graph.variables import L0, X0, make_values, read_points, read_poses
+from objslam.graph.variables import L0, X0, landmarks_in, make_values, read_poses
 
 NO_POSES = np.zeros((0, 4, 4))
 
@@ -27,10 +27,10 @@ def test_values_are_read_back_in_the_order_of_their_keys():
     landmarks = np.array([1, 7, 12, 299])
     values = make_values(poses, points, landmarks)
     np.testing.assert_allclose(read_poses(values), poses, atol=1e-15)
-    np.testing.assert_array_equal(read_points(values), points[landmarks])
+    np.testing.assert_array_equal(landmarks_in(values)[1], points[landmarks])
     empty = make_values(NO_POSES, points, landmarks[:0])
     assert read_poses(empty).shape == (0, 4, 4)
-    assert read_points(empty).shape == (0, 3)
+    assert landmarks_in(empty)[1].shape == (0, 3)
 
 
 def test_levenberg_marquardt_finds_the_weighted_mean():
@@ -43,8 +43,8 @@ def test_levenberg_marquardt_finds_the_weighted_mean():
     for j in range(2):
         mine = landmark == j
         mean = np.average(points[mine], axis=0, weights=weights[mine])
-        np.testing.assert_allclose(read_points(optimum.values)[j], mean, atol=1e-9)
-    mean = read_points(optimum.values)[landmark]
+        np.testing.assert_allclose(landmarks_in(optimum.values)[1][j], mean, atol=1e-9)
+    mean = landmarks_in(optimum.values)[1][landmark]
     cost = 0.5 * (((points - mean) / sigmas[:, None]) ** 2).sum()
     assert optimum.cost_after == pytest.approx(cost)
     assert optimum.cost_before == pytest.approx(0.5 * (((points - 9) / sigmas[:, None]) ** 2).sum())
@@ -60,7 +60,7 @@ def test_graduated_rejects_what_does_not_agree():
     optimum = graduated(graph, make_values(NO_POSES, np.zeros((1, 3)), np.arange(1)), 50, [])
     np.testing.assert_allclose(optimum.weights[:12], 1, atol=1e-3)
     np.testing.assert_allclose(optimum.weights[12:], 0, atol=1e-3)
-    np.testing.assert_allclose(read_points(optimum.values)[0], points[:12].mean(axis=0), atol=1e-4)
+    np.testing.assert_allclose(landmarks_in(optimum.values)[1][0], points[:12].mean(axis=0), atol=1e-4)
     assert optimum.cost_after < optimum.cost_before
 
 
@@ -68,7 +68,7 @@ def test_graduated_never_rejects_known_inliers():
     graph = build_graph(priors(np.array([[0.0, 0, 0], [0, 0, 0.01], [0, 0, 8.0]]), [0.01, 0.01, 0.01], [0, 0, 0]))
     optimum = graduated(graph, make_values(NO_POSES, np.zeros((1, 3)), np.arange(1)), 50, [2])
     assert optimum.weights[2] == 1
-    assert read_points(optimum.values)[0, 2] == pytest.approx(8, abs=0.01)
+    assert landmarks_in(optimum.values)[1][0, 2] == pytest.approx(8, abs=0.01)
 
 
 @pytest.mark.parametrize("solve", [levenberg_marquardt, lambda *args: graduated(*args, [])])

@@ -95,7 +95,7 @@ class JointGraph:
     @cached_property
     def further(self) -> tuple[SquareRows, *tuple[RowsOfKind, ...]]:
         """The kinds of factors that bring their own rows. The first are the fiducials, whose corners are landmarks."""
-        return self.measured.further_rows(self.rays, self.landmarks[self.landmark], self.landmarks)
+        return self.measured.further_rows(self.landmarks)
 
     @cached_property
     def ranged(self) -> Ints:
@@ -333,10 +333,7 @@ def _pattern(measured: Measurements, rays: Rays, landmark: Ints, landmarks: Ints
         np.arange(first_pose)[:, None],
         np.repeat(moved, 6, axis=0),
         np.repeat(absolute, 6, axis=0),
-        *(
-            np.repeat(kind.columns, kind.rows_each, axis=0)
-            for kind in measured.further_rows(rays, landmarks[landmark], landmarks)
-        ),
+        *(np.repeat(kind.columns, kind.rows_each, axis=0) for kind in measured.further_rows(landmarks)),
     )
     lengths = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
     columns = np.concatenate([part.ravel() for part in parts])

@@ -82,12 +82,11 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     to_centre.sigma[views.ray] = _noise_of_hidden(found, boxes)
     hidden = views.hidden.copy()
     hidden[views.ray] |= found.hidden.any(axis=1)
-    share = float(found.share[0])
     calibration = solution.estimate.calibration
     common = 0.0 if calibration is not None and "surface" in calibration.names else settings.calibration.surface
     ranges = range_shift(found, boxes, views.ray, len(solution.rays), settings, common)
     to_centre = replace(to_centre, ranges=ranges)
-    return replace(solution, bodies=tuple(bodies), body_share=share, to_centre=to_centre, hidden=hidden)
+    return replace(solution, bodies=tuple(bodies), to_centre=to_centre, hidden=hidden)
 
 
 @dataclass(frozen=True)

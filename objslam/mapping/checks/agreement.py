@@ -95,7 +95,7 @@ def bounded_part(log: Log, settings: Settings) -> Part:
     if not drifts:
         starts, seconds = stamps[:1], np.inf
     else:
-        seconds = _window_length(log, settings)
+        seconds = _window_length(log)
         count = max(1, min(_WINDOWS, int((stamps[-1] - stamps[0]) / seconds)))
         starts = np.linspace(stamps[0], max(stamps[-1] - seconds, stamps[0]), count)
     most = FRAMES // len(starts)
@@ -131,18 +131,18 @@ class _Measured:
     label: Ints
 
 
-def agreement(part: Part, log: Log, settings: Settings, window: tuple[Ints, ...] | None = None) -> Agreement | None:
-    """Return how well the boxes of a log agree. `log` has the frames of the part. None if no frame has a pose.
-
-    window: for each camera, the windows of its frames, if they differ from the windows of the part.
-    """
-    return next(agreements(part, (log,), settings, window))
+def agreement(part: Part, log: Log, settings: Settings) -> Agreement | None:
+    """Return how well the boxes of a log agree. `log` has the frames of the part. None if no frame has a pose."""
+    return next(agreements(part, (log,), settings))
 
 
 def agreements(
     part: Part, logs: Iterable[Log], settings: Settings, window: tuple[Ints, ...] | None = None
 ) -> Iterator[Agreement | None]:
-    """Yield the `agreement` of each of several logs. One log does not affect another, but together they take less time."""
+    """Yield the `agreement` of each of several logs. One log does not affect another, but together they take less time.
+
+    window: for each camera, the windows of its frames, if they differ from the windows of the part.
+    """
     waiting: list[_Measured | None] = []
     built: tuple[Log, Keyframes, Rays] | None = None
     for log in logs:
@@ -233,7 +233,7 @@ def _level_noise(part: Part, settings: Settings) -> tuple[float, float]:
     return settings.localization.yaw, settings.localization.xy
 
 
-def _window_length(log: Log, settings: Settings) -> float:
+def _window_length(log: Log) -> float:
     """Return the time (s), 10 to 120, in which the odometry moves or turns as far as a window covers. It is infinite without
     odometry."""
     path = log.odometry

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.calibration import Calibration
+from objslam.core.calibration import Calibration, expected_errors
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import angles_off
 from objslam.core.statistics import STRAY_RAY
@@ -62,7 +62,7 @@ def calibrate_fixed(
     )
     from objslam.graph.fixed_pose_triangulation import largest_noise
 
-    calibration = _expected(errors)
+    calibration = expected_errors(errors)
     every = errors.take(at.frames, at.rays)
     told = noise_of_errors(every, calibration)
     rounds: tuple[dict[str, int], ...] = ()
@@ -154,11 +154,6 @@ def associate_at_poses(at: FixedPoses, log: Log, progress: Progress) -> Associat
     at = replace(at, settings=at.settings.model_copy(update={"mode": "fixed"}))
     errors = shared_errors(log, at.seen, at.rays_seen, at.settings)
     return None if errors is None else calibrate_fixed(at, errors, Ledger(), progress, None)[1]
-
-
-def _expected(errors: SharedErrors) -> Calibration:
-    """Return the errors as their prior expects them."""
-    return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))
 
 
 @dataclass(frozen=True)

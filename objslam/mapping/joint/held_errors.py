@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats
-from objslam.core.calibration import Calibration, kind
+from objslam.core.calibration import Calibration, expected_errors, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.types import Association, Keyframes
@@ -198,7 +198,7 @@ def _solved(errors: SharedErrors, solved: Solved) -> Calibration:
     like, values = _like(errors, solved), _values(errors, solved)
     given = errors.keyframes, errors.rays, solved.association, errors.settings, Ledger()
     found = solve_joint(*given, start=start, errors=like, theta=values)
-    return _unknown(errors) if found.calibration is None or found.uncalibrated else found.calibration
+    return expected_errors(errors) if found.calibration is None or found.uncalibrated else found.calibration
 
 
 def _like(errors: SharedErrors, solved: Solved) -> SharedErrors:
@@ -213,8 +213,3 @@ def _values(errors: SharedErrors, solved: Solved) -> Floats:
     known = {} if found is None else dict(zip(found.names, found.values.tolist(), strict=True))
     means = zip(errors.names, errors.mean.tolist(), strict=True)
     return np.array([known.get(first_half(name), mean) for name, mean in means])
-
-
-def _unknown(errors: SharedErrors) -> Calibration:
-    """Return the errors as they are expected before a solve."""
-    return Calibration(errors.names, errors.mean, errors.prior, np.sqrt(np.diagonal(errors.prior)))

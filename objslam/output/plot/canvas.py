@@ -124,8 +124,8 @@ def draw_dot(image: Image, centre: Floats, size: float, colour: Colour, rim: Col
         cv2.circle(image, at, round(one * (size - rim_width) / 2), _bgr(colour).tolist(), -1, cv2.LINE_AA, _SHIFT)
 
 
-def draw_area(image: Image, rim: Floats, colour: Colour, opacity: float, width: float) -> None:
-    """Draw a polygon (n, 2), px, filled with a colour. opacity: of the colour, in [0, 1]. width: of its rim, px."""
+def draw_area(image: Image, rim: Floats, colour: Colour, opacity: float) -> None:
+    """Draw a polygon (n, 2), px, filled with a colour, with a rim of 1 px. opacity: of the colour, in [0, 1]."""
     if not np.isfinite(rim).all():
         return
     size = np.array(image.shape[1::-1])
@@ -135,7 +135,7 @@ def draw_area(image: Image, rim: Floats, colour: Colour, opacity: float, width: 
         mask = np.zeros((y2 - y1, x2 - x1), dtype=np.uint8)
         cv2.fillPoly(mask, [_fixed(rim - [x1, y1])], 255, cv2.LINE_AA, _SHIFT)
         _blend(image[y1:y2, x1:x2], mask, colour, opacity)
-    cv2.polylines(image, [_fixed(rim)], True, _bgr(colour).tolist(), max(1, round(width)), cv2.LINE_AA, _SHIFT)
+    cv2.polylines(image, [_fixed(rim)], True, _bgr(colour).tolist(), 1, cv2.LINE_AA, _SHIFT)
 
 
 def text_width(text: str, size: float) -> int:

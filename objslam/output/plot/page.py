@@ -113,7 +113,7 @@ def _draw_shape(area: Image, figure: Figure, shape: Shape) -> None:
     if isinstance(shape, Segments):
         draw_segments(area, figure.pixels(shape.ends), shape.colour, shape.opacity)
     elif isinstance(shape, Area):
-        draw_area(area, figure.pixels(shape.rim), shape.colour, shape.opacity, 1)
+        draw_area(area, figure.pixels(shape.rim), shape.colour, shape.opacity)
     elif isinstance(shape, Line):
         draw_line(area, figure.pixels(shape.points), shape.colour, shape.width, (_DASH, _GAP) if shape.dashed else None)
     else:
@@ -144,7 +144,7 @@ def _draw_marks(image: Image, points: Floats, marks: Marks) -> None:
                 draw_line(image, np.stack([point - arm, point + arm]), marks.colour, 1)
         elif marks.kind in _RIMS:
             rim = marks.size / 2 * _RIMS[marks.kind] @ _turned(marks.turn)
-            draw_area(image, point + rim * [1, -1], marks.colour, 1.0, 1)
+            draw_area(image, point + rim * [1, -1], marks.colour, 1.0)
         else:
             draw_dot(image, point, marks.size, marks.colour, marks.rim, 1.0 if marks.rim == (1.0, 1.0, 1.0) else 2.0)
 
