@@ -75,8 +75,8 @@ def write_file(file: Path, data: bytes, *, tidy: bool = True) -> None:
     """Write one file under a temporary name and rename it. The temporary files that killed processes left behind are deleted
     first.
 
-    tidy: whether to look for such files. This lists the folder, so it takes longer if there are more files. Raises
-    OutputError with the final file name for a disk error.
+    tidy: whether to look for such files. The search lists the whole folder, so it takes long in a folder of many files.
+    Raises OutputError with the final file name for a disk error.
     """
     with _replaced(file, tidy=tidy) as stream:
         stream.write(data)
@@ -90,9 +90,10 @@ def write_lines(file: Path, lines: Iterable[str]) -> None:
 
 
 def copy_files(files: Iterable[Path], folder: Path) -> None:
-    """Copy files into a folder, which exists. Each appears whole, and at the end all of them are on the disk.
+    """Copy files into an existing folder. Each file appears whole.
 
-    So if a file that is written later survives a power cut, they survive too. Raises OutputError for a disk error.
+    At the end, all of them are on the disk. So they survive each power cut that a file written later survives. Raises
+    OutputError for a disk error.
     """
     with disk_errors(folder):
         for file in files:
@@ -138,7 +139,8 @@ def encode(text: str) -> bytes:
 
 @contextmanager
 def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
-    """Turn OSError into OutputError with the name of the failing file. With `only`, or if it is unknown, `path` is named."""
+    """Turn OSError into OutputError with the name of the failing file. If this name is
+    unknown, or with `only`, the error names `path`."""
     try:
         yield
     except OSError as error:

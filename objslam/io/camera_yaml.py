@@ -1,6 +1,6 @@
 """Read and write camera.yaml, which has ROS camera_info keys and the pose of the camera on the robot.
 
-The reader uses YAML nodes, because they keep line numbers. The reader takes 1e-05 as a number. In YAML 1.1 it is text.
+The reader uses YAML nodes, because they keep line numbers. It takes 1e-05 for a number, although YAML 1.1 takes it for text.
 """
 
 import math
@@ -33,7 +33,8 @@ _Mapping = dict[str, yaml.Node]
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera from a file. placed: whether the file has base_T_camera. If not, the camera has the identity."""
+    """A camera from a file. placed: whether the file has base_T_camera. If it has none, the pose of the camera is
+    the identity."""
 
     camera: Camera
     placed: bool

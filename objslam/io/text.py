@@ -17,8 +17,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 
 _IN_ORDER = 0.5
-"""The least share of the rows of a file that are in the order of time. A larger share also rejects files of a robot whose
-clock was set back. In a file in another order, the share is far smaller."""
+"""The least share of the rows of a file that must be in the order of time. A file in another order has a far smaller share.
+A larger value also rejects files of a robot whose clock was set back."""
 _PLACES = 3
 """The most places (file:line) of dropped rows that the ledger gets for a reason. A larger number gives more examples."""
 _SHOWN = 80  # The most characters of a line that a message shows. A larger number makes the message longer.
@@ -177,9 +177,9 @@ def require_order(forward: Bools, path: Path) -> None:
 def in_order(stamps: Floats, repeats: bool = False) -> Bools:
     """Return the mask (N,) of the timestamps (N,) that are later than all previous timestamps.
 
-    After a backward jump of the clock, timestamps are rejected until they pass the latest timestamp. A single outlier in
-    the future is rejected if the next two timestamps continue from the timestamp before the outlier. With `repeats`, a
-    timestamp may equal the latest timestamp.
+    If the clock jumps back, timestamps are rejected until they are later than the latest one before the jump. A single
+    timestamp far in the future is rejected instead of all that follow, if the next two continue from the one before it. With
+    `repeats`, a timestamp may equal the latest one.
     """
     before = np.concatenate([[-np.inf], stamps])[:-1]
     alone = np.zeros(len(stamps), dtype=bool)

@@ -55,15 +55,18 @@ _OF_RANGES = ("odometry.scale", "range_scale", "range_offset", "surface")
 def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> Diagnosis:
     """Return the diagnosis of a log without the findings about boxes that a joint solve refutes.
 
-    solution: the solution of the unchanged log. It explains boxes only if its noise is near the settings. The test depends
-    on the basis of a finding. "boxes": the finding is wrong if the solution explains the boxes. It is also wrong if a
-    solution of the log without the fault explains the boxes no better. If the solution needs noisy odometry, the log without
-    the fault must need it too. If the log without the fault needs noisy odometry, the finding is right only if the solution
-    needs far more noise, of any kind. If neither of the two explains the boxes, the solves show nothing, and a finding
-    stands if the quick check is clear. "halves": the finding is wrong if the solution explains the boxes of both halves, or
-    if both halves agree on the objects. "frames": the finding is wrong if the solution explains similar shares of the rays
-    in all frames. "ranges": the finding is wrong if the ranges fit the odometry without the errors of clocks, turns and
-    mounts that the solution has.
+    solution: the solution of the unchanged log. A solution explains boxes only if it finds about the noise of rays that the
+    settings say.
+
+    The test of a finding depends on its basis:
+
+    - "boxes": the finding is wrong if the solution explains the boxes without noisy odometry. If it does not, the log is
+      solved again without the fault, and `_refuted` compares the two solutions.
+    - "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves have the same
+      objects.
+    - "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
+    - "ranges": the finding is wrong if the ranges fit the odometry once the errors of clocks, turns and mounts that the
+      solution has found are taken out of the log.
     """
     kept = tuple(
         one
@@ -76,6 +79,16 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
 def _refuted(
     finding: Finding, diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress
 ) -> bool:
+    """Return whether a finding is wrong, as `without_refuted` says.
+
+    This is how the solution is compared with the solution of the log without the fault, for the basis "boxes":
+
+    - If the second one does not explain the boxes, the solves show nothing. The finding stands if the quick check is clear.
+    - If both explain the boxes, the first one with noisy odometry, the finding stands if the second one needs far less
+      noise.
+    - If only the second one explains the boxes, the finding stands if it explains clearly more rays, and if its noise is
+      either near the settings or far less than that of the first one.
+    """
     quiet = _noise(solution, rays_only=True) <= _NOISE
     if finding.basis == "frames":
         return quiet and find_mixture(solution.rays.keyframe, _explained(solution)) is None

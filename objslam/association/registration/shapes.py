@@ -1,22 +1,24 @@
 """The shape of a map: where its objects lie relative to each other, and which of their errors a transform of the map can
 absorb.
 
-The error of object i is o_i + L_i e. o_i is its own, and e has the seven numbers that all objects of the map share
-(`core.maps.shared_covariance`): g is a shift and a yaw, and d is a tilt and a size. With J_i and D_i for the columns of L_i
-that belong to g and d, the offset y_i of a matched object from its partner is, to first order,
+The error of object i is L_i e + o_i. The object has o_i alone. All objects of the map share e, which has seven numbers: a
+shift, a rotation and a size (`core.maps.shared_covariance`). The transform x between two maps is a shift and a yaw. So e has
+two parts: g is its shift and its yaw, which x can absorb, and d is its tilt and its size. J_i and D_i are the columns of L_i
+that belong to g and to d. Object i has a partner in the other map. To first order, its offset from this partner is
 
     y_i = J_i x + J_i g + D_i d + o_i.
 
-x is the transform between the maps, about which nothing is known before. A change of g looks exactly like a change of x.
-Three things follow.
+A change of g looks exactly like a change of x, and nothing else is known about x. Three things follow.
 
-1. The residuals of a fit of x do not depend on g. So only o_i + D_i d may widen gates, and only their covariance belongs
-   to an offset. Anything else would take chance matches for true matches.
-2. The best estimate of x is the same with and without g in the covariance of the offsets (Rao 1967). For any weights, a fit
-   is x + sum_i K_i (y_i - J_i x), and sum_i K_i J_i = 1. Its error is g + sum_i K_i (D_i d + o_i). So the whole covariance
-   of g is added to the covariance of x, however many objects match.
-3. The vector p_j - p_i between two objects has the error o_j - o_i + turn x (p_j - p_i) + size (p_j - p_i). Its length and
-   its rise contain neither the shift nor the yaw.
+1. The residuals of a fit of x do not depend on g. So the covariance of an offset contains only o_i + D_i d. Gates with more
+   than this covariance would be too wide, and would take chance matches for true matches.
+2. The best estimate of x does not change if the covariance of the offsets contains g as well (Rao 1967). Each fit moves a
+   start x_0 to x_0 + sum_i K_i (y_i - J_i x_0), with weights K_i for which sum_i K_i J_i = 1. So its error is
+   g + sum_i K_i (D_i d + o_i). The whole covariance of g is therefore added to the covariance of x. It does not become
+   smaller if more objects match.
+3. Let p_i be the position of object i. The vector p_j - p_i from object i to object j has the error
+   o_j - o_i + turn x (p_j - p_i) + size (p_j - p_i), where "turn" and "size" are the rotation and the size of e. The shift
+   of e does not change the vector. The yaw of e changes neither its horizontal length nor its rise.
 """
 
 from __future__ import annotations
@@ -41,8 +43,8 @@ class Shape:
     """N objects of a map, relative to their centre.
 
     position: (N, 3) m. label: (N,). own: (N, 3, 3) m^2, the error that each object has alone. shared: (7, 7) the covariance
-    of the error that all share, at the centre, 0 if it is not known. covariance: (N, 3, 3) m^2, the own errors and the part
-    of the shared error that no shift and no yaw absorbs. centre: (3,) m in the frame of the map.
+    of the error that all objects share, about the centre, 0 if it is not known. covariance: (N, 3, 3) m^2, of the
+    own error and of the part of the shared error that no shift and no yaw absorbs. centre: (3,) m in the frame of the map.
     """
 
     position: Floats
@@ -84,8 +86,8 @@ class Shape:
 class Vectors:
     """P vectors between objects of one map.
 
-    base: (P, 3) m. length: (P,) m, horizontal. length_variance, rise_variance: (P,) m^2, of the length and of the vertical
-    part.
+    base: (P, 3) m, the vectors. length: (P,) m, of their horizontal part. length_variance, rise_variance: (P,) m^2, of this
+    length and of the vertical part.
     """
 
     base: Floats
@@ -97,8 +99,8 @@ class Vectors:
 def shape_of(whole: Constellation, keep: Ints, shared: Floats | None) -> Shape:
     """Return the shape of the objects `keep` (N,) of a map.
 
-    The covariances of `whole` contain the shared error. shared: (7, 7) its covariance in the frame of the map, None if it is
-    not known. `_FLOOR` is added to the own errors.
+    shared: (7, 7) the covariance of the shared error, in the frame of the map. The covariances of `whole` contain this
+    error. None if it is not known. The standard deviation `_FLOOR` is added to each own error.
     """
     centre = whole.position[keep].mean(axis=0)
     back = np.eye(4)

@@ -1,4 +1,4 @@
-"""Instruments for the offsets of clocks: derivatives by the velocities of the solved path."""
+"""Instruments for the offsets of clocks: derivatives with the velocities of the solved path, not with measured ones."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,18 +14,21 @@ from objslam.graph.calibration.linearised_graph import Linearised
 
 @dataclass(frozen=True)
 class ClockInstruments:
-    """The instruments of clocks as a linear function of the velocities of base at the K poses of a graph.
+    """The instruments of clocks (see `instruments`), as a linear function of velocities of base at the K poses of a graph.
 
-    The derivative of a motion by a clock is the difference of the velocities at its ends. The noise of measured velocities
-    is also in the residuals, so it would bias the clock. The velocities of the solved path do not correlate with the
-    residuals, so they are the instruments.
+    If a clock changes, a motion changes by the difference of the velocities at its two ends. The noise of measured
+    velocities is also in the residuals, so it would bias the clock. The velocities of the solved path do not correlate with
+    the residuals. So the instruments are made of these.
 
-    moved: for each clock, by the index of its parameter, the poses (K,) whose images have this clock. moves: (s,), (s,) the
-    poses before and after the motions in the graph. motions: None without odometry. back: (s, 6, 6) from twists before a
-    motion to twists after it. absolute: (a, 6, 6) from velocities to the rows of absolute poses, which begin at the row
-    `first`. before, after: (K,) the poses between which the velocity at a pose is measured. along: (K, 6, 6) from twists of
-    `before` to twists of `after`. seconds: (K,) between them, 0 without a measured motion. to_base: (K, 6, 6) from camera to
-    base twists. velocity: (K, 6) twists of base per s, with the rotation first.
+    All twists have the rotation first. Matrices (..., 6, 6) convert twists or velocities, which are twists per s.
+
+    moved: for each clock, by the index of its parameter, a mask (K,) of the poses whose images have this clock. moves: (s,),
+    (s,) the poses before and after each motion in the graph. motions: these motions, None without odometry. back: (s, 6, 6)
+    from twists before a motion to twists after it. absolute: (a, 6, 6) from velocities to the rows of absolute poses. first:
+    the first of these rows. before, after: (K,) the two poses from which the velocity at a pose is computed. along: (K, 6,
+    6) from twists of `before` to twists of `after`. seconds: (K,) the time between the two, 0 without a measured motion.
+    to_base: (K, 6, 6) from twists of the camera to twists of base. velocity: (K, 6) the velocities of base on the solved
+    path.
     """
 
     moved: Mapping[int, Bools]
@@ -70,7 +73,7 @@ class ClockInstruments:
         )
 
     def put(self, instruments: Floats, clock: int, velocity: Floats) -> None:
-        """Write the instruments of a clock for velocities (K, 6, n) into columns (M, n)."""
+        """Write the instruments of a clock, for n sets of velocities (K, 6, n), into the columns `instruments` (M, n)."""
         own = self._own(clock, velocity)
         if self.motions is not None:
             instruments[self.motions.rows] = -self.motions.whitened(self._changes_of_motions(own))
@@ -93,16 +96,17 @@ class ClockInstruments:
         return products
 
     def _own(self, clock: int, velocity: Floats) -> Floats:
-        """The velocities (K, 6, n) of the poses that a clock moves, 0 for the others."""
+        """Return the velocities (K, 6, n) of the poses that a clock moves, with 0 for all other poses."""
         return np.where(self.moved[clock][:, None, None], velocity, 0.0)
 
     def _changes_of_motions(self, own: Floats) -> Floats:
-        """The changes (s, 6, n) of the motions by velocities (K, 6, n)."""
+        """Return by how much (s, 6, n) velocities (K, 6, n) change the motions."""
         first, last = self.moves
         return np.asarray(own[last] - self.back @ own[first])
 
     def changes(self, poses: Floats) -> Floats:
-        """Return the changes (K, 6, n) of the velocities for changes (K, 6, n) of the poses, twists of the cameras."""
+        """Return by how much (K, 6, n) the velocities change if the poses change by the twists `poses` (K, 6, n) of the
+        cameras."""
         moved = self.to_base @ poses
         change = moved[self.after] - self.along @ moved[self.before]
         return np.asarray(np.where(self.seconds > 0, 1 / np.maximum(self.seconds, 1e-9), 0.0)[:, None, None] * change)

@@ -65,12 +65,15 @@ class NextStep:
         return Calibration(self.errors.names, self.theta + step, covariance, np.sqrt(np.diagonal(self.errors.prior)))
 
     def moved_by(self, held: Bools) -> Floats:
-        """Return how far the held errors may move landmarks: a factor (N, 3, H), m, of their joint covariance (consider
-        covariance; Schmidt 1966).
+        """Return how far the H held errors may move the N landmarks: a factor (N, 3, H), m, of their joint covariance
+        (consider covariance; Schmidt 1966).
 
-        The estimated errors take up a part of a held error. Its variance is that of its prior, because real noise is not
-        white, and bends the path as a held error does. The square of the step is added, as the solution does not follow it.
-        Landmarks outside the graph do not move. held: (P,) which errors the solution held. SolveError as in `predicted`.
+        If a held error is wrong, the estimated errors follow it and take up a part of it. The variance of a held error is
+        that of its prior. The data would give a smaller one, but their noise is not white and bends the path as a held error
+        does. The square of the step is added, because the solution does not take this step. Landmarks outside the graph do
+        not move.
+
+        held: (P,) the mask of the errors that the solution held. SolveError as in `predicted`.
         """
         errors, state, reduced = self.errors, self.state, self._without_shrinking()
         step, _ = self._step(reduced)

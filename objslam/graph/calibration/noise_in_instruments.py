@@ -19,21 +19,29 @@ standard deviation of the gradient."""
 
 
 def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasurements) -> Floats:
-    """Return the shares (P,) of the information that come from noise of the odometry.
+    """Return for each shared error (P,) the share of its information that comes from noise of the odometry.
 
-    Only scales of the odometry and clocks have such noise. For a scale, the share is the expected product of the noise in
-    its instrument and in its eliminated side. The noise of neighbours is independent, but the eliminated poses spread the
-    noise of a motion over the residuals of its neighbours. For a clock, the share is the expected square of the noise in its
-    eliminated side. These expectations are traces, which random probes measure (Hutchinson 1990). A probe is a random walk
-    at the stamps of the odometry, because keyframes between two stamps share a step. The noise is limited by the roughness
-    of the measured motions and by the residuals of the solution. Commanded motions are smooth: their residuals come from the
-    robot and not from the measurement, so the sides have no noise.
+    Only clocks and the scales of the odometry have such noise, because their sides (`LinearSystem.sides`) contain measured
+    motions. A side without its best fit by poses and landmarks (`LinearSystem.left`) is called the rest of the side here.
+    The information is the sum of the squares of this rest.
 
-    For motions below ties (`Instruments.tied`), the solved path is the instrument of clocks. An interpolated pose averages
-    the noise of two poses of the odometry, so it has less noise midway between them. A clock offset that moves the ends of
-    ties there therefore seems to fit better. For motions between keyframes, this effect cancels, because keyframes lie
-    anywhere in a step. All ties end at about the same share of a step if the rates of images and odometry have a simple
-    ratio. On simulated wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
+    For a scale, the noise in the information is the expected product of two noises: that of its instrument, and that of the
+    rest of its side. The instrument has the noise of the neighbours of each motion. It is independent of the noise of the
+    motion itself, but the fit by poses spreads the noise of a motion over its neighbours. For a clock, the noise in the
+    information is the expected square of the noise in the rest of its side.
+
+    These expectations are traces of matrices, which random probes estimate (Hutchinson 1990). A probe is a random walk with
+    steps at the stamps of the odometry, because keyframes between two stamps share a step.
+
+    The size of the noise is the smaller of two: the roughness of the measured motions, and the residuals of the solution.
+    Motions that were commanded and not measured are smooth. Their residuals come from the robot, so the sides have no noise.
+
+    The share of a clock is at least the share of the motions that are below ties (`Motions.tied`). For these motions, the
+    solved path is the instrument of clocks, for the following reason. An interpolated pose averages the noise of two poses
+    of the odometry, so it has less noise midway between them. A clock offset that moves the ends of ties there therefore
+    seems to fit better. For motions between keyframes, this effect cancels, because keyframes lie anywhere in a step. But
+    all ties end at about the same share of a step if the rates of images and odometry have a simple ratio. On simulated
+    wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
     """
     names, clocks = errors.names, {} if system.clocks is None else system.clocks.moved
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}
@@ -58,7 +66,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     for axis in (2, 3, 4):
 
         def rows(steps: Floats, axis: int = axis) -> Floats:
-            """The rows (6 s, n) of noise (s, n) along the axis."""
+            """Return the rows (6 s, n) of the linear system for noise (s, n) of the motions along the axis."""
             noise = np.zeros((len(sigma), 6, steps.shape[1]))
             noise[:, axis] = sigma[:, axis, None] * steps
             return motions.whitened(noise)

@@ -127,8 +127,8 @@ def load_truth(path: Path) -> Truth | None:
 
     Args:
         path: an objects file, a folder named groundtruth, a log folder with such a folder, or a result folder with the truth
-            of its log. The objects.json of a result folder is not taken for the truth. To compare two results, give the path
-            of that file itself.
+            of its log. The objects.json of a result folder is not taken for the truth. To compare a result with another
+            one, give the path of the other's objects.json itself.
     Raises:
         LogError: the path does not exist, or the truth is malformed.
     """

@@ -96,8 +96,8 @@ class BoxGroups:
 def find_groups(evidence: Evidence, settings: Settings) -> BoxGroups:
     """Return the groups of boxes without an object, each with the reason why it is no object.
 
-    A box belongs to the first group that takes it. The association itself has the same reasons at a place, in the same
-    order.
+    The reasons are tried in the order of `REASONS`, and a box belongs to the first group that takes it. The association
+    rejects an object at a place for the same reasons, in the same order.
     """
     left = np.flatnonzero(evidence.left)
     # A rejected ray shows another thing than its object, so it is no box of this object.

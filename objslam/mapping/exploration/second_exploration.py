@@ -36,26 +36,28 @@ factor suits worse odometry, and loses more objects of good odometry."""
 
 
 def with_loose_odometry(state: JointState, assumed: Floats | None, sure: bool = False) -> JointState | None:
-    """Return an attempt with the noise and the shared errors of the odometry that the last solve suggests.
+    """Return the state for a second exploration of the log, None if there is no reason for one.
 
-    The result is None in three cases. The noise and the shared errors are about as the first exploration assumed them. The
-    settings fix the noise. Nearly all rays agree.
+    An exploration needs the noise and the shared errors of the odometry, but only a solve shows them. So the first
+    exploration assumes nominal noise and the values `assumed`. The last solve has found other values, and the second
+    exploration uses these. There is no reason for it in three cases. The found values are about the assumed ones. The
+    settings fix the noise. Or nearly all rays agree with the map.
 
-    Noise and shared errors are known only after a solve, but an exploration needs them before. A wrong map can hide the
+    If the solve found only the rays to be noisy, the odometry gets more noise (`_LOOSE`), because a wrong map can hide the
     noise of the odometry in the noise of the rays.
 
-    The noise of the attempt is at least nominal. A solve estimates shared errors and noise together, so the remaining noise
-    may be small. An exploration has the shared errors fixed, and shared errors from a wrong map are wrong by more than their
-    sigma. With too little noise, known objects would be outside their gates, and the exploration would map them twice.
+    The noise of the second exploration is never below the settings. The solve may find less noise, because it estimates the
+    shared errors too. The exploration does not change them, and after a wrong map they are wrong by more than their sigma.
+    With too little noise, known objects would be outside their gates, and the exploration would map them twice.
 
-    Even if nearly all rays agree, the shared error `surface` may have misled the exploration. It is the error of the
-    distance from surfaces to the centres behind them. With a wrong value, an object that is seen from another side seems to
-    be another object. If the solve changes the value by more than single objects differ, the log is explored with the new
-    value.
+    There are two exceptions if nearly all rays agree. First, the shared error `surface` may be wrong. It is the error of the
+    distance from surfaces to the centres behind them. With a wrong value, an object seen from another side seems to be
+    another object. If the solve changed the value by more than single objects differ, the second exploration uses the new
+    value. Second, with `sure`, noisy odometry is reason enough.
 
-    assumed: (P,) the shared errors in the first exploration. Its noise was nominal. sure: whether the filter for logs with
-    ranges was sure of the first exploration. Another exploration by this filter takes little time. So noisy odometry is
-    reason enough, even if nearly all rays agree: they can also agree with a map that shows objects twice.
+    assumed: (P,) the shared errors in the first exploration, None for the means of their priors. sure: whether the filter
+    for logs with ranges was sure of the first exploration. It explores a log again in little time, and rays can also agree
+    with a map that shows objects twice.
     """
     if state.errors is None or "odometry" not in state.errors.unknown_noise:
         return None

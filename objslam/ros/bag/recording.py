@@ -179,8 +179,8 @@ def _read_metadata(file: Path, ledger: Ledger) -> dict[str, Any]:
 
 
 def _listed(metadata: dict[str, Any], here: list[str], ledger: Ledger) -> list[str]:
-    """Return the listed file names that `here` contains. Only the last part of a listed path counts, because old
-    metadata also list the folder."""
+    """Return the listed file names that `here` contains. Of a listed path, only the file name counts, because old
+    metadata also name the folder."""
     names = []
     given = metadata.get("relative_file_paths")
     for entry in given if isinstance(given, list) else []:

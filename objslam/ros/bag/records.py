@@ -65,7 +65,7 @@ class FileReport:
 
 @dataclass
 class Reading:
-    """The state while a file of chunks is read. The index of a chunk follows the chunk.
+    """The state of reading a file of chunks. In the file, the index of a chunk comes after the chunk.
 
     connections: by their number in the file. chunk_read, chunk_indexed: how many messages of the current chunk were read,
     and how many its index lists. chunk_problem: why the chunk cannot be read, "" if it can.

@@ -23,7 +23,8 @@ def _leaf(frame: str) -> str:
 
 
 def is_world(frame: str) -> bool:
-    """Return whether the name of a frame says that it is fixed in the world, such as map, world or robot1/map, not odom."""
+    """Return whether the name of a frame says that it is fixed in the world, as map, world or robot1/map do. odom does
+    not."""
     return not _WORLDS.isdisjoint(re.split(r"[^a-z]+", _leaf(frame).lower()))
 
 
