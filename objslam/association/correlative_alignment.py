@@ -70,8 +70,12 @@ def align(
 
 @dataclass(frozen=True)
 class _Lines:
-    """Rays in the plane: offset (R, 2) m from the centre of the corrections, heading (R,) rad, its noise sigma (R,) rad, the
-    horizontal part of the range (R,) m, NaN if unknown, with its noise (R,) m, and the share (R,) of the correction."""
+    """R rays, seen from above.
+
+    offset: (R, 2) m, where each ray begins, from the point about which a correction turns. heading, sigma: (R,) rad, its
+    direction, and the noise of this. range, range_sigma: (R,) m, the horizontal part of its range, NaN if unknown, and the
+    noise of this. share: (R,) the share of the correction that its pose gets.
+    """
 
     offset: Floats
     heading: Floats

@@ -272,8 +272,9 @@ class Rays:
     object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
     the cut off boxes of the same images, None if they were not collected. feature: (R,) the row of each ray's appearance
     vector in feature_table, -1 without a vector. feature and feature_table are None if no ray has a vector. surface: (R, 2)
-    how far each range was lengthened from a surface to the centre, as a share of half the width, and the weight of the
-    shared error `surface` that is added to this share. None means `depth.centre` and 1.
+    two numbers for each range, which was lengthened from a surface to the centre behind it. The first number says
+    by how much, as a share of half the width. The second is the weight of the shared error `surface`, which is added to this
+    share. None means `depth.centre` and 1.
     """
 
     keyframe: Ints

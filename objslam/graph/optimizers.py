@@ -16,9 +16,8 @@ from objslam.graph.variables import read_poses, with_points
 
 STILL = 5e-3
 """A joint solve ends if an iteration decreases the cost by less than this. The cost is half the sum of squared residuals in
-standard deviations. So if a step decreases the cost by d, it moves no variable by more than sqrt(2 d) of the variable's own
-standard deviation (Cauchy-Schwarz with the information matrix). Here, sqrt(2 d) is 0.1. A larger value ends a solve
-sooner."""
+standard deviations. A step that decreases it by d moves no variable by more than sqrt(2 d) standard deviations of this
+variable (Cauchy-Schwarz with the information matrix). Here, sqrt(2 d) is 0.1. A larger value ends a solve sooner."""
 
 OnIteration = Callable[[float, gtsam.Values], None]
 """A function that is called after each iteration with the new cost and the new values."""

@@ -1,8 +1,8 @@
 """Match two maps that bend: one tilt and one size of each map move all their objects together.
 
-A tilt or a size moves a far object by more than a near one, so a transform alone may match the objects of a row to the
-neighbours of their partners. Here, tilt and size are estimated together with the transform. They have priors, the shared
-covariances of the maps. So they cannot move each object to another side, as independent errors of objects could.
+A wrong tilt or size moves a far object by more than a near one. So a transform alone may match the objects of a row to the
+neighbours of their true partners. Here, tilt and size are estimated together with the transform. The shared covariances of
+the maps are their priors. Tilt and size cannot move each object to another side, as independent errors of objects could.
 """
 
 import numpy as np
@@ -42,9 +42,9 @@ transforms that few matches determine."""
 def bent_matches(problem: Problem, x: Floats) -> Ints:
     """Return the pairs (P, 2) of objects of a and b that match, one to one, under the best transform near x (4,).
 
-    Starts are shifts that move one object onto a partner, at several sizes. The start with the least cost after some rounds
-    of matching and fitting decides. The cost is the squared Mahalanobis distance of all matches, tilt and size together, and
-    each match lowers it by twice the limit of a match.
+    The search has many starts: shifts that move one object onto a partner, each at several sizes. After some rounds of
+    matching and fitting, the start with the least cost is chosen. The cost is the sum of the squared Mahalanobis distances
+    of the matches and of tilt and size, minus twice the limit of a match for each match.
     """
     one, other = problem.a, problem.b
     turn = lift_se2(x[[0, 1, 3]])[:3, :3]

@@ -24,9 +24,9 @@ SAME_BOX, LIKE_BOX = 0.7, 0.3
 """Boxes are at one place of the image if their intersection over union with one box is above the first value. Boxes above
 the second value are near that place. With a larger first value, only steadier boxes are found."""
 STEADY = 0.5
-"""At least this share of the boxes near a place must be at the place. Random boxes have 0.03 to 0.1 there (the share
-((1 - 0.7) / (1 - 0.3))^4 of boxes in four coordinates, and more if the boxes have similar sizes), and a part of the robot
-has 0.9 and more. A larger share drops fewer boxes."""
+"""At least this share of the boxes near a place must be at the place. A part of the robot has a share of
+0.9 and more. Random boxes have ((1 - 0.7) / (1 - 0.3))^4 = 0.03 if their four coordinates are independent, and up to 0.1 if
+their sizes are similar. A larger share drops fewer boxes."""
 _TENTHS = 6
 """The boxes must be in at least this number of the tenths of the frames. A robot that waits, and a robot that follows
 somebody for a while, see boxes at one place in fewer. A larger number drops fewer boxes."""
@@ -34,21 +34,22 @@ _OFTEN = 0.1
 """A tenth counts if at least this share of its frames has the box. A detector may miss a part of the robot in most images. A
 larger share drops fewer boxes."""
 _TRIED, _COUNTED, _PLACES = 64, 4096, 16
-"""To find the fullest place of the image, boxes are counted around at most `_TRIED` boxes of a label and camera, among at
-most `_COUNTED` of its boxes. At most `_PLACES` places of each label are tried. Larger numbers find rarer boxes, and take
-more time. The first two also take memory: without limits, 600,000 boxes of one label would take gigabytes."""
+"""Limits of the search for the fullest place of the image, for each label and camera. Around at most `_TRIED` boxes, the
+near ones among at most `_COUNTED` boxes are counted. At most `_PLACES` places are tried. Larger numbers find rarer boxes,
+and take more time. The first two also take memory: without limits, 600,000 boxes of one label would take gigabytes."""
 TURN = np.radians(30.0)
 """The angle (rad) by which the camera turns in a window. Odometry is good over such a turn, and a thing at rest moves by
 much of the image. A larger angle needs more turning."""
 _MISSED = np.radians(5.0)
-"""A window shows that boxes are of no thing at rest if their rays miss the nearest point by more than this (rad, root mean
-square). Poses err by less over such a turn. Rays of boxes that stay in the image miss it by about 8.7 degrees if the camera
-turns in its place (30 degrees / sqrt(12)). A larger angle drops fewer boxes."""
+"""A window shows that boxes are of no thing at rest if the point that fits their rays best is missed by more than this (rad,
+root mean square). Poses err by less over such a turn. If the camera turns in its place, rays of boxes that stay in the image
+miss the point by about 8.7 degrees (30 degrees / sqrt(12)). A larger angle drops fewer boxes."""
 _BEHIND = 0.2
-"""A window also shows this if the nearest point is behind the camera for more than this share of its rays. A larger share
-drops fewer boxes."""
+"""A window also shows this if the point that fits best is behind the camera for more than this share of its rays. A larger
+share drops fewer boxes."""
 WINDOWS, AGREE = 3, 0.8
-"""At least so many windows must show it, and at least this share of all windows. Larger values drop fewer boxes."""
+"""The first is the least number of windows that must show that boxes are of no thing at rest, and the second is the least
+share of all windows. Larger values drop fewer boxes."""
 
 
 def without_robot_parts(log: Log, settings: Settings, ledger: Ledger) -> Log:

@@ -1,8 +1,8 @@
 """Shared errors that lie far from their priors: by how much the priors were too narrow.
 
-An estimate that is 3 standard deviations from its prior is improbable. It is far more probable that the prior is too narrow
-for this robot. If the log determines the error alone, the prior hardly matters. If it determines only the sum of two errors,
-the priors decide how the sum is shared out, and then narrow priors make the covariance too small.
+A true value is hardly ever 3 standard deviations from its prior. If an estimate is, the prior is probably too narrow for
+this robot. This does not matter if the log alone determines the error. But if the log determines only the sum of two errors,
+the priors decide how the sum is divided between the two. Then narrow priors make the covariance too small.
 """
 
 from dataclasses import replace
@@ -14,9 +14,9 @@ from objslam.core.calibration import Calibration
 
 _CHANCE = 2.0
 """Up to this many standard deviations, the distance from a prior is chance. A larger number widens fewer priors. Beyond it,
-a prior is widened about as by a Student prior with 4 degrees of freedom. An example is a sum of two errors that is 3 prior
-standard deviations of the first error and 4.5 of the second. The standard deviation of each error grows by a factor of 1.5,
-and by 1.9 with the Student prior."""
+a prior is widened about as much as a Student prior with 4 degrees of freedom would do it. An example is a sum of two errors
+that is 3 prior standard deviations of the first error and 4.5 of the second. The standard deviation of each error grows by a
+factor of 1.5 here, and by 1.9 with the Student prior."""
 _TOLD = 0.9
 """A direction is determined by the log if its variance is at most this share of its prior variance. With a larger share,
 directions count that the log hardly shows."""
@@ -27,10 +27,11 @@ _LEAST = 1e-12
 def with_wider_priors(found: Calibration, mean: Floats, prior: Floats) -> Calibration:
     """Return the calibration with the covariance of wider priors if the values are too far from the priors.
 
-    The values stay, and so does the information of the log itself. If the prior (P, P) and the covariance are right, the
-    values minus the mean (P,) of their prior have the covariance `prior - covariance` (prior predictive check; Box 1980).
-    The check is done along each direction that the log determines. If it fails along a direction, the priors of the
-    parameters that have a part in this direction become wider. The larger its part, the wider a prior becomes.
+    The values stay, and so does the information of the log itself. The check compares the distances of the values from the
+    mean (P,) of their prior (P, P) with their expected covariance. This is `prior - covariance`, if both are right (prior
+    predictive check; Box 1980). The check is done along each direction that the log determines. If it fails along a
+    direction, the priors of the parameters that have a part in this direction become wider. The larger its part, the wider a
+    prior becomes.
     """
     if not len(mean):
         return found

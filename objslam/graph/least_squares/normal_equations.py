@@ -77,8 +77,9 @@ Equations = NormalEquations | ChainEquations
 def factored(jacobian: sparse.csr_matrix, chain: ChainRows | None, blocks: Ints, order: Ints | None) -> Equations:
     """Factor the normal equations of a Jacobian (M, D). SolveError if they are singular.
 
-    chain: the same rows as those of a chain of poses, which takes less time, None for another graph. blocks: (D,) the
-    variable of each column. order: (D,) the order of elimination of a general factorisation, if it is known.
+    chain: the same rows, if the poses of the graph form a chain, which takes less time to factor. None for other graphs.
+    blocks: (D,) the variable of each column. order: (D,) the order of elimination of a general factorisation, if it is
+    known.
     """
     if chain is not None:
         with suppress(np.linalg.LinAlgError):

@@ -1,9 +1,9 @@
 """The evidence for an association: the likelihood of all measurements, over all poses and landmarks (Laplace 1774).
 
 A map can explain more rays, or explain them more closely, if it bends the path. Then the odometry disagrees, and a solve
-that estimates the noise finds more noise in the odometry. The evidence counts both: each measurement has a density, which
-is lower if its noise is larger. It is integrated over poses and landmarks, so a landmark costs more, the better it is
-determined (Occam factor; MacKay, Information Theory, 2003, chapter 28).
+that estimates the noise finds more noise in the odometry. The evidence counts both: each measurement has a density, which is
+lower if its noise is larger. It is integrated over poses and landmarks. So each landmark has a cost, which is larger for a
+better determined landmark (Occam factor; MacKay, Information Theory, 2003, chapter 28).
 """
 
 import numpy as np

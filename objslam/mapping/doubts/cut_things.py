@@ -29,8 +29,8 @@ _PARALLAX = np.sin(np.radians(5.0)) ** 2
 """The least squared sine of the angle between two axes that are crossed. Axes of cut off boxes point beside their thing, so
 narrower crossings give no distance. With a larger value, fewer places are tried."""
 _NEAR, _FAR = 0.2, 3.0
-"""The least distance of a place from a camera, m, and its greatest distance, as a multiple of the greatest distance at which
-an object was seen. Larger values suit larger places."""
+"""The limits on the distance of a tried place from a camera. The first is the least distance, m. The second gives the
+greatest distance, as a multiple of the greatest distance at which an object was seen. Larger values suit larger places."""
 _MOST = 5
 """The most things of one label. Nobody reads a list of more."""
 _SAMPLE = 2000

@@ -22,24 +22,21 @@ from objslam.mapping.doubts.moving import moving_things
 from objslam.mapping.doubts.points import MISSED, Points, as_landmarks, fit_points
 
 Reason = Literal[
-    "fixed in the image",
-    "on an object",
-    "follow",
-    "few",
+    "fixed in the image",  # The boxes stay at one place of the image.
+    "on an object",  # The boxes lie on an object of the map.
+    "follow",  # The boxes follow one another, and no place explains them.
+    "few",  # Too few rays pass the place.
     "no parallax",
-    "apart",
-    "range",
-    "rare",
-    "size",
-    "moves",
-    "chance",
-    "unclear",
+    "apart",  # The rays do not meet.
+    "range",  # The ranges disagree.
+    "rare",  # Too few frames show the thing.
+    "size",  # The thing has a wrong size.
+    "moves",  # The thing moves a little.
+    "chance",  # As many strays (boxes of no object) would meet by chance.
+    "unclear",  # No single reason.
 ]
 REASONS: tuple[Reason, ...] = get_args(Reason)
-"""Why boxes became no object, in order. Three reasons belong to no place: the boxes stay at one place of the image, they lie
-on an object, or they follow one another and no place explains them. The others belong to a place: too few rays, no parallax,
-rays that do not meet, ranges that disagree, too few frames that show the thing, a wrong size, a thing that moves a little,
-as many rays as strays (boxes of no object) that meet by chance, and no single reason."""
+"""Why boxes became no object, in the order in which the reasons are tried. All but the first three belong to a place."""
 _OPEN = REASONS.index("unclear")  # The reason of a group before it is examined.
 _RANGE_SIGMAS = 3.0
 """The ranges disagree if their median deviation from the place exceeds this number of standard deviations. With a larger

@@ -92,7 +92,7 @@ def _scatter(result: RunResult, mine: Ints) -> tuple[Floats, Floats]:
     size = np.log(size_per_metre(result.rays.take(mine), result.keyframes, result.cameras) * away[:, None])
     sides = result.rays.box[mine, 2:] - result.rays.box[mine, :2]
     off = size - grouped_median(size, owner, count)[owner]
-    # Both edges of a side are noisy. The noise of most boxes tells that of an edge, in px.
+    # The noise of an edge, px, from the scatter of most boxes. Each of the two edges of a side has it, hence sqrt(2).
     edge = min(float(np.median(np.abs(off) * sides)) / (NORMAL_MEDIAN * np.sqrt(2)), result.settings.rays.pixel_sigma)
     number = np.maximum(np.bincount(owner, minlength=count), 1)[:, None]
     mean = grouped_sums(size, owner, count) / number

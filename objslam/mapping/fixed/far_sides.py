@@ -24,8 +24,9 @@ infinity. With a larger share, objects whose place the rays hardly determine bec
 def with_far_sides(solution: Solution) -> Solution:
     """Return the solution with covariances that reach to the far end of the depths that the rays allow.
 
-    An object at the depth d has the standard deviation s along its mean ray. Its inverse depth has the standard deviation s
-    / d^2. The far end, `_SIGMAS` of them away, is at d / (1 - `_SIGMAS` s / d), so s becomes s / (1 - `_SIGMAS` s / d).
+    An object at the depth d has the standard deviation s along its mean ray. So its inverse depth 1 / d has the standard
+    deviation s / d^2. At the far end of the depths, the inverse depth is smaller by `_SIGMAS` times that. This is the depth
+    d / (1 - `_SIGMAS` s / d). For an ellipsoid that reaches there, s becomes s / (1 - `_SIGMAS` s / d).
     Objects with a measured range keep their covariance, because a range errs as much to both sides. Objects that were seen
     from many sides nearly keep it too, because their s is a small share of d.
     """
@@ -49,6 +50,9 @@ def with_far_sides(solution: Solution) -> Solution:
 
 
 def far_sigma(sigma: Floats, depth: Floats) -> Floats:
-    """Return the standard deviations (N,), m, that reach to the far end of depths (N,), m. sigma: (N,) m, at the depths."""
+    """Return the standard deviations (N,), m, of ellipsoids that reach to the far end of their depths.
+
+    sigma: (N,) m, their standard deviations before. depth: (N,) m.
+    """
     share = np.minimum(sigma / np.maximum(depth, 1e-9), _MOST)
     return np.asarray(sigma / (1 - _SIGMAS * share))

@@ -1,8 +1,8 @@
 """The size of errors of given poses that last for some seconds, from the rays of all objects together.
 
-If an object was seen only for a few seconds, its place is fitted to the errors of these seconds, so its own rays miss it by
-little. But the same errors turn the rays to every object of these seconds, and each object can absorb only what a shift of
-its own explains. So the objects count together.
+An object that was seen only for a few seconds hides the errors of these seconds: its place is fitted to them, so its own
+rays miss it by little. But the same errors turn the rays to every object of these seconds. Each object can absorb only what
+a shift of its own explains. So all objects together show the errors.
 """
 
 from dataclasses import dataclass
@@ -27,9 +27,9 @@ _MOST = 400
 """The most cells that count. Some hundred cells determine the factor to a few percent. The time grows with the cube of this
 number."""
 _TOGETHER = 50
-"""If there are more than `_MOST` cells, a part of them counts. The part consists of stretches with this number of cells in
-the order of time, because only cells of the same seconds share their errors. Longer stretches show errors that last longer,
-but fewer parts of the drive."""
+"""If there are more than `_MOST` cells, only stretches of this many cells count, in the order of time. Single cells would
+not do, because only cells of the same seconds share their errors. Longer stretches show errors that last longer, but fewer
+parts of the drive."""
 
 
 @dataclass(frozen=True)

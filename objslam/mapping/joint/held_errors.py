@@ -1,9 +1,9 @@
 """Errors of a camera that joint mode holds, and that are so large that the map shows them.
 
-With odometry alone, the place and the focal length of a camera are held, because a path that is free to bend fits usual
-errors of them too. A gross error bends the path, and the objects move by many of their sigmas. So it is estimated after all.
-A usual error of a focal length stays, and the sigmas contain what it does. A camera that somebody turned during the drive
-cannot be corrected, because no box shows when that was.
+With odometry alone, the place and the focal length of a camera are held: they are not estimated, because a path that is free
+to bend fits their usual errors too. But a gross error bends the path so much that the objects move by many of their sigmas.
+Such an error is estimated after all. A usual error of a focal length stays, and the sigmas contain its effect. A camera that
+somebody turned during the drive cannot be corrected, because no box shows when that was.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.turning_clocks import clocks_of_turns
 
 _LONG = 5.0
-"""The least duration (s) of errors that count. A clock of the odometry that runs 0.2 s behind causes errors for as long as a
-turn takes, 2 to 4 s in recorded drives. A larger value misses shorter errors."""
+"""The least duration (s) of errors that count. Shorter ones may come from a clock. If the clock of the odometry is 0.2 s
+late, the errors last as long as a turn, which is 2 to 4 s in recorded drives. A larger value misses shorter errors."""
 
 
 def odometry_contradicts(log: Log, settings: Settings) -> bool:
@@ -34,8 +34,9 @@ def odometry_contradicts(log: Log, settings: Settings) -> bool:
 
 
 def lasting_by_odometry(errors: SharedErrors | None) -> tuple[float, float]:
-    """Return the factors on `localization.yaw` and `localization.xy` of lasting errors that the odometry shows, 0 without
-    odometry, or if the noise of the localisation is known. errors: of all frames, because frames without a box count too."""
+    """Return the sizes of the lasting errors of the localisation that the odometry shows, as factors on `localization.yaw`
+    and `localization.xy`. They are 0 without odometry, or if the noise of the localisation is known. errors: of all frames,
+    because frames without a box count too."""
     if errors is None or "localization" not in errors.unknown_noise or errors.keyframes.odom_T_base is None:
         return 0.0, 0.0
     from objslam.graph.calibration.paths_alone import noise_of_paths  # It imports scipy.sparse. Few runs need it.
@@ -44,7 +45,8 @@ def lasting_by_odometry(errors: SharedErrors | None) -> tuple[float, float]:
 
 
 def lasting_long(noise: NoiseFactors) -> tuple[float, float]:
-    """Return the factors on `localization.yaw` and `localization.xy` of errors that last for `_LONG` or longer."""
+    """Return the sizes of the errors that last for `_LONG` or longer, as factors on `localization.yaw` and
+    `localization.xy`."""
     turned, moved = (
         factor if lasting.seconds >= _LONG else 0.0
         for factor, lasting in zip(noise.lasting_factors, noise.lasting, strict=True)

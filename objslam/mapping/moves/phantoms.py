@@ -25,8 +25,8 @@ _LARGE = 1.0
 From this value on, the errors that last are as large as all errors should be. With a larger value, fewer maps take the time
 of the search."""
 _APART = 2.0
-"""The lasting errors shift a ray. Two things of one label cannot be told apart if they are nearer to each other than this
-multiple of the shift, at the distance from which they are seen. A ray errs by more than 2 standard deviations in 5 % of the
+"""Lasting errors of poses shift the rays to a thing, far ones by more. Two things of one label cannot be told apart if the
+distance between them is less than this multiple of the shift. A ray errs by more than 2 standard deviations in 5 % of the
 cases. A larger value warns of more maps."""
 NEIGHBOURS = "equal things nearer than the poses err"
 """The name of the finding that the errors of poses are as large as the distances of equal things."""
@@ -34,9 +34,10 @@ BENT = "a path that may be bent to false objects"
 """The name of the finding that the odometry contradicts both the poses and the boxes. The path may then be bent, because
 some labels have several objects."""
 _BENT = 3.0
-"""The path may be bent to false objects, which hide how far the poses err, if two things come together. An earlier map at
-the given poses showed that they err, and the odometry now counts as at least this many times as noisy as the settings say.
-From this value on, nine tenths of the variance are not in the settings. A larger value warns of fewer maps."""
+"""False objects can hide how far the poses err, because the path was bent to them. A run warns of this under two
+conditions. An earlier map at the given poses showed that the poses err. And the solve now finds the odometry at least this
+many times as noisy as the settings say. At 3, the settings explain only a ninth of the variance. A larger value warns of
+fewer maps."""
 UNTOLD = "errors of poses that the solve does not show"
 """The name of the finding that a map at the given poses shows large errors of the poses, and the solved map shows none."""
 _MOST = 60
