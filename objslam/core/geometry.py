@@ -83,18 +83,16 @@ def split_se2(pose: Floats) -> tuple[Floats, Floats]:
     return part, inverse(lift_se2(part)) @ pose
 
 
-def is_planar(poses: Floats, tolerance: float = 1e-6) -> bool:
-    """Return whether all poses (N, 4, 4) have one height, roll and pitch, as on an SE(2) path with a constant offset.
-
-    tolerance: the largest difference between two poses, in m or rad.
-    """
+def is_planar(poses: Floats) -> bool:
+    """Return whether all poses (N, 4, 4) have one height, roll and pitch, as on an SE(2) path with a constant offset. They
+    may differ by 1e-6, m or rad."""
     if len(poses) == 0:
         return True
     x_axis, y_axis = poses[:, 0, :3], poses[:, 1, :3]  # The axes of the map, in the frame of each pose.
     yaw = np.arctan2(poses[:, 1, :1], poses[:, 0, :1])
     cos, sin = np.cos(yaw), np.sin(yaw)
     remainder = poses[:, 2], cos * x_axis + sin * y_axis, cos * y_axis - sin * x_axis
-    return all(bool(np.abs(part - part[:1]).max() <= tolerance) for part in remainder)
+    return all(bool(np.abs(part - part[:1]).max() <= 1e-6) for part in remainder)
 
 
 def log_se3(pose: Floats) -> Floats:

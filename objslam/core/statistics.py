@@ -79,8 +79,7 @@ class Lasting:
     seconds: float = 0.0
 
     def like(self, other: "Lasting", tolerance: float) -> bool:
-        """Return whether the shares differ by less than a tolerance, and the times relatively by less than this
-        tolerance."""
+        """Return whether the shares differ by less than a tolerance, and the logarithms of the times as well."""
         if not self.share or not other.share:
             return self.share == other.share
         times = abs(math.log(max(self.seconds, 1e-9) / max(other.seconds, 1e-9)))

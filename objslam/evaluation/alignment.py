@@ -232,12 +232,13 @@ def _nearest_costs(starts: list[Transform], source: Floats, target: Floats, same
     return np.asarray(nearest.sum(axis=1))
 
 
-def lay_truth(objects: ObjectMap, truth: Truth, radius: float = 0.5) -> Truth:
+def lay_truth(objects: ObjectMap, truth: Truth) -> Truth:
     """Return the ground truth in the coordinate frame of the map, so that both can be drawn together.
 
     A map from odometry alone has its own frame. The truth is aligned with the map in the plane if fewer than half of the
-    possible matches are within the radius (m) and the alignment adds matches. If not, the truth is returned unchanged.
+    possible matches are within 0.5 m and the alignment adds matches. If not, the truth is returned unchanged.
     """
+    radius = 0.5
     source, target, same = correspondences(objects.resolved(), truth.objects)
     matched = len(match_points(source, target, same, radius)[0])
     if 2 * matched >= min(len(source), len(target)):

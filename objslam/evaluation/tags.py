@@ -18,9 +18,9 @@ of freedom)."""
 
 @dataclass(frozen=True)
 class TagMatch:
-    """A fiducial against a true fiducial, after the alignment. error: rad, the angle between its rotation and the true
-    rotation. squared: the squared Mahalanobis distance of the rotations. If the fiducial may have a second rotation, the
-    nearer one of the two counts."""
+    """The rotation of a fiducial, compared with the true rotation after the alignment. error: rad, the angle between its
+    rotation and the true rotation. squared: the squared Mahalanobis distance of the rotations. If the fiducial may have a
+    second rotation, the nearer one of the two counts."""
 
     error: float
     squared: float

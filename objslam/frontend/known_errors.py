@@ -51,8 +51,8 @@ def error_names(log: Log) -> tuple[str, ...]:
 def usual_place(log: Log, settings: Settings) -> float:
     """Return the prior standard deviation, m, of the place of a camera on the base, if `calibration.translation` is auto.
 
-    Against given poses (a localisation, or fixed mode), a wrong place of a camera moves all objects. A map from odometry
-    alone moves with the camera.
+    At given poses (a localisation, or fixed mode), a wrong place of a camera moves all objects, so the place is estimated. A
+    map from odometry alone simply moves with the camera.
     """
     if settings.mode == "fixed":
         return USUAL_PLACE

@@ -25,8 +25,9 @@ FEWEST = 3
 def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
     """Return an association with an object for each track of at least three rays.
 
-    A ray continues a track if it and the last ray of the track are the nearest of their label to each other. The images
-    before are asked one after the other, because a detector misses boxes. Rays of shorter tracks have no object.
+    Two rays of one label in neighbouring images are linked if each is the nearest one to the other. A detector misses boxes.
+    So a ray without a link is then compared with the image one further back, and so on. Linked rays are a track. Rays of
+    shorter tracks have no object.
 
     keyframes: with odometry, which predicts each ray in the next image.
     """

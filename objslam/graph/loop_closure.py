@@ -164,8 +164,8 @@ def find_closure(
     There are two searches. For a long drift, the recently seen landmarks (`active`, (N,)) are matched with all others. For a
     slip or a push, only the new landmarks (first seen in the last `_EPOCH` keyframes) are matched with all others.
 
-    A search is made only if it has a new pair, or more rays of the recent landmark of a pair (`_MORE`). A pair is a recent
-    and an old landmark of one label. It counts once for each tried drift.
+    A pair is a recent and an old landmark of one label. A search is made only if it has a new pair, or if the recent
+    landmark of a pair has many more rays than at the last search (`_MORE`). A pair counts once for each tried drift.
 
     window: the solved graph. now: the newest keyframe. looks: what the landmarks look like, None if this is not known.
     """

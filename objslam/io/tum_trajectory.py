@@ -84,9 +84,10 @@ def _read_numbers(path: Path, ledger: Ledger) -> Table:
 
 
 def _in_other_order(names: list[str]) -> bool:
-    """Return whether a known name among the 4 or 8 names of columns stands in another place than its own.
+    """Return whether the 4 or 8 names of columns say that the columns are in another order than they should be.
 
-    Names that are not known, such as "east", may stand anywhere, but the last of 8 names must end with w.
+    A known name must stand in its own place. Other names, such as "east", may stand anywhere. But the last of 8 names must
+    end with w.
     """
     order = (_COLUMNS if len(names) == 8 else "stamp tx ty yaw").split()
     known = {*_COLUMNS.split(), *_PLANAR.split(), *_WORDS}

@@ -304,7 +304,7 @@ def _by_label(state: JointState) -> tuple[JointState, bool]:
     if state.settings.association.method == "by_label":
         return solved, True
     told = labels_tell(association, solved.estimate)
-    if (association.object < 0).any():  # Noise or a wrong clock cannot cause a second box of one label.
+    if (association.object < 0).any():  # A frame has two boxes of a label. No noise causes that.
         return _with_doubles(solved) if told else (solved, False)
     if told:
         return solved, True

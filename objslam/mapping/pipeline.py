@@ -163,7 +163,7 @@ def _run(
         solution, lasting = with_lasting_errors(solution, settings, lambda known: with_bodies(known, cameras, settings))
     if solution.bodies is None:
         solution = with_bodies(solution, cameras, settings)
-    if settings.mode == "fixed":  # After the bodies: their edges tell depths that the rays of a point do not tell.
+    if settings.mode == "fixed":  # This comes after the bodies, because edges of boxes show depths that rays do not show.
         solution = with_far_sides(solution)
     solution = with_hidden_parts(solution, cameras)
     solution = with_box_offsets(solution, cameras, settings)

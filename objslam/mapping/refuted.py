@@ -39,10 +39,10 @@ _MORE = 0.05
 """A finding stands only if a solve without the fault explains more rays, by this share of all rays. A larger share refutes
 more findings."""
 _QUIETER = 0.5
-"""A solve may explain the boxes only with noise. A finding then stands if its corrected log needs at most this share of the
-noise. A larger share refutes fewer findings. Examples are the logs of an MRCLAM robot with a fault. Without the fault, a log
-needs 0.17 of the noise if its images were mirrored, because then the path must turn the other way. It needs 0.15 if
-base_T_camera was the identity, but 2.9 times the noise in the settings."""
+"""If a solve explains the boxes only with much noise, a finding stands if the corrected log needs at most this share of that
+noise. A larger share refutes fewer findings. Examples are logs of an MRCLAM robot with a fault. If the images were mirrored,
+the corrected log needs 0.17 of the noise, because with the fault the path must turn the other way. If base_T_camera was the
+identity, it needs 0.15 of the noise, which is still 2.9 times the noise in the settings."""
 _IN_BOTH = 0.4
 """The halves of a log agree if at least this share of their rays belongs to common objects. Common objects are seen in both
 halves. The share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean

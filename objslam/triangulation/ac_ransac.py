@@ -39,9 +39,10 @@ def fit_consensus(
     Each object has three candidate points: the solution of Eq. 1 on all its rays, the best midpoint of two rays, and a point
     far ahead, on which nearly parallel rays agree. No pairs are tried for 2 rays, or if all rays agree with the first point
     within noise. From the best candidate on, two steps alternate while the agreement grows: select the rays that agree with
-    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays. A `judged` (N,) object also
-    keeps all its rays if they agree within noise, because its rays do not meet by chance. hypotheses, jitter: as in
-    `best_pair`.
+    the point, and solve Eq. 1 on them. An object without two agreeing rays keeps all its rays.
+
+    judged: (N,) the objects whose rays certainly do not meet by chance. They keep all rays that agree within noise.
+    hypotheses, jitter: as in `best_pair`.
     """
     xp = bundle.xp
     used = xp.ones_like(bundle.index, dtype=xp.bool)

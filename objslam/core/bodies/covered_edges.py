@@ -1,7 +1,7 @@
 """Edges of boxes along which another box of the same image begins.
 
-If a thing hides a part of another thing, the visible part of the other ends along the outline of the first. So the box of
-the visible part ends at the box of the thing in front, or inside its nearer half.
+If thing A hides a part of thing B, the visible part of B ends along the outline of A. So the box of B ends at the box of A,
+or inside the half of it that is nearer to B.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def pairs_in_images(image: Ints) -> Iterator[tuple[Ints, Ints]]:
 
 
 def covered_shares(box: Floats, front: Floats, noise: Floats) -> Floats:
-    """Return the share (P, 4) of each edge of a box (P, 4), px, along which a box in front (P, 4), px, may begin.
+    """Return for each edge of a box (P, 4), px, along which share (P, 4) of its length the box `front` (P, 4), px, may hide
+    what is beyond the edge.
 
     It is 0 for an edge that the other box does not reach, or does not go beyond. noise: (P,) px, the most by which two
     measurements of one edge differ.

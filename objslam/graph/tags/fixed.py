@@ -14,9 +14,9 @@ from objslam.graph.tags.placement import place
 from objslam.graph.tags.square_fit import fit, scatter, with_pose_noise
 
 _NOMINAL = 30.0
-"""With this many views, half of the scatter beyond the nominal noise counts. A fiducial has seven parameters, so the scatter
-of n views gives a variance with a relative error of about sqrt(7 / n). At 30 views, this is a half. A larger number leaves
-more to the nominal noise."""
+"""The scatter of the views of a fiducial may be larger than the nominal noise. With this many views, half of the difference
+counts. A fiducial has seven parameters, so the scatter of n views gives a variance with a relative error of about
+sqrt(7 / n). At 30 views, this is a half. With a larger number, the nominal noise counts more."""
 _STEPS = 5
 """The iterations of a fit to all views. It starts at a pose that fits some of the views. More iterations are slower."""
 

@@ -17,8 +17,9 @@ from objslam.mapping.bodies.cut_boxes import clipped, keyframe_of
 from objslam.mapping.solution import Solution
 
 _NEARER = 0.25
-"""A thing is in front of another if its centre is nearer by more than this share of the sum of their apparent half axes. Two
-equal balls that touch, at this difference, hide 1 % of each other. With a larger share, fewer things are in front."""
+"""A thing is in front of another if its centre is nearer by more than this share of the sum of their apparent half axes. If
+two equal balls touch, and one is nearer by this difference, it hides 1 % of the other. With a larger share, fewer things are
+in front."""
 _COVERED = 0.5
 """An edge is hidden if boxes in front cover more than this share of it. In simulated drives, 0.5 finds 98 % of the edges
 that are hidden by 12 px. A share of 0.1 finds the same 98 %, and half as many more edges that are not hidden. With a larger

@@ -150,7 +150,10 @@ def nearest_point(origins: Floats, directions: Floats, start: Floats, used: Bool
 
 
 def _tables(left: Ints, owner: Ints, rays: tuple[Floats, Floats, Floats], place: float) -> Iterator[_Rows]:
-    """Yield the rays `left` (R,), whose labels (R,) are in order, in tables. A label with too few rays is in none."""
+    """Yield the rays in tables, with one label a row. A label with too few rays is in no table.
+
+    left: (R,) the numbers of the rays, in the order of their labels. owner: (R,) the label of each.
+    """
     begin = np.flatnonzero(np.diff(owner, prepend=-1))
     size = np.diff(begin, append=len(owner))
     labels = np.argsort(size, kind="stable")
@@ -207,8 +210,8 @@ def _nearly_parallel(rows: _Rows) -> Bools:
 def _tried_points(rows: _Rows, size: Ints, dice: Floats) -> tuple[Floats, Bools]:
     """Return the points (L, P, 3) where pairs of rays come closest, and which of them (L, P) are ahead of both cameras.
 
-    All pairs of a label are tried if there are few enough, else random pairs. Points that are ahead come first. The others
-    are there only to fill the rows, because the table takes its time for each of them too.
+    All pairs of a label are tried if there are few enough, else random pairs. Points that are ahead come first. The other
+    points only fill the rows, which all have the same length.
     """
     tried = int(_tried(size).max())
     order = np.arange(tried)

@@ -129,18 +129,16 @@ def shared(
     return found
 
 
-def find_small_errors(
-    log: Log, found: Agreement, settings: Settings, noise: tuple[float, float], kinds: tuple[str, ...] = _KINDS
-) -> SmallErrors | None:
+def find_small_errors(log: Log, found: Agreement, settings: Settings, noise: tuple[float, float]) -> SmallErrors | None:
     """Return the errors that explain the residuals of the fitting rays, None if there are none.
 
-    noise: the errors of the poses (rad, m). kinds: the kinds of errors that are examined.
+    noise: the errors of the poses (rad, m).
     """
     held = found.point >= 0
     if held.sum() < 10 * len(_KINDS):
         return None
     errors = shared(log, found.keyframes, found.rays, settings)
-    wanted = np.array([i for i, name in enumerate(errors.names) if kind(name) in kinds])
+    wanted = np.array([i for i, name in enumerate(errors.names) if kind(name) in _KINDS])
     number, owner = np.unique(found.point[held], return_inverse=True)
     points = found.points[number]
     theta = np.zeros(len(errors.names))

@@ -60,8 +60,8 @@ def check_stamps(log: Log) -> Finding | None:
 def _common_unit(path: Trajectory, frames: list[Floats]) -> str | None:
     """Return the unit of the stamps of poses and of the frames (F,) of each camera, or None for seconds.
 
-    No date in s is as large as a date in ms. If stamps begin at zero, the time between two of them shows their unit, if the
-    robot also crawls.
+    A date in ms is larger than any date in s. If the stamps begin at zero, two other signs together show that they are not
+    in s: the times between them are too long, and the robot seems to crawl.
     """
     last = float(path.stamps[-1])
     if last > MAX_LIVE_STAMP:

@@ -218,12 +218,12 @@ def _first_trial(
 ) -> tuple[_Trial, bool]:
     """Return the association at the expected errors that a calibration brings closest to the noise of the settings.
 
-    The widest association allows for all the uncertainty that the errors give to ray directions. It is right if things are
-    far apart. In a row of equal things it is wider than the gaps, so rays of neighbours become one object at a wrong
-    distance. Then a narrower one is right, whose rays fit after the calibration. Wrong objects still miss. So the
-    associations are compared by how likely the rays are after a calibration. A narrower one has to be clearly better than
-    the widest. The widest association with an object is taken at once if it fits. Also return whether a narrower one is
-    taken.
+    The widest association allows for all the uncertainty that the errors give to the directions of rays. It is right if
+    things are far apart. In a row of equal things, it is wider than the gaps, and rays of neighbours become one object at a
+    wrong distance. Then a narrower association is right. After a calibration, the rays of a right association fit, and the
+    rays of wrong objects still miss. So the associations are compared by how likely the rays are after a calibration. A
+    narrower one has to be clearly better than the widest. The widest one that has an object is taken at once if it fits.
+    Also return whether a narrower one is taken.
 
     at, now: the input as measured, and at the expected errors. told: (R,) rad, the noise of rays because of the uncertainty
     of the errors.

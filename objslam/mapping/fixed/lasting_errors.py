@@ -60,7 +60,8 @@ def with_lasting_errors(
 
     A pose has an error of its heading and an error of its place. Both turn a ray to a side, as seen from the object. If the
     poses are not in a plane, they have such errors along each axis, and also turn a ray up or down. On uneven ground, planar
-    poses turn rays up and down by `planar` times a factor of its own, and ground whose tilt lasts also rises (`rise_of`).
+    poses also turn rays up or down. This has the size `planar` times another factor. Ground whose tilt lasts also rises or
+    falls (`rise_of`).
     The size of the errors is `localization` times a factor, whose prior is half-normal with the scale 1. Their correlation
     falls exponentially over time. The factor and the correlation time are estimated by restricted maximum likelihood
     (Patterson and Thompson 1971), and averaged over their posterior.

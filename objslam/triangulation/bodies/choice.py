@@ -51,9 +51,11 @@ def with_shares_of_shapes(evidence: Floats, label: Ints) -> Floats:
     """Return the logarithm of the evidence (S, N), plus the logarithm of the share of each shape among the other things.
 
     The boxes of one thing often hardly show whether it is an ellipsoid or a cylinder. But things of one label are alike, and
-    so are the things of a room. The shares of the shapes come from the other things of the label. Their prior is the shares
-    in the whole log, whose own prior is that all are equal. Each is the expectation over what the other things may be (CVB0;
-    Asuncion et al. 2009). evidence: (S, N) of each shape. label: (N,).
+    so are the things of a room. So a shape gets more probable if other things of the label have it. With few such things,
+    the shares of the shapes in the whole log count, and with few things in the log, equal shares. The shapes of the other
+    things are not known either, so each share is an expectation (CVB0; Asuncion et al. 2009).
+
+    evidence: (S, N) the logarithm of the evidence of each shape. label: (N,).
     """
     shapes, things = evidence.shape
     own = np.unique(label, return_inverse=True)[1].ravel()

@@ -249,8 +249,9 @@ def covariance_with_unlike(edges: BoxEdges, fit: Fit, sides: Sides, factors: Flo
 def _weights_of_bounds(edges: BoxEdges, found: Residuals) -> Floats:
     """Return the weights (B, 4), 1/px^2, with which bounds count in a covariance, 0 for residuals that are no bounds.
 
-    A body that just reaches a bound may go on beyond it. So a bound counts as a measured edge, whose error is the hidden
-    length: at least `_BEYOND`. All boxes of a body share this error, so they count as one.
+    A body that just reaches a bound may go on beyond it, by a length that nobody sees. So a bound counts like a measured
+    edge with an error of this length, which is at least `_BEYOND`. All boxes of a body share this error, so they count as
+    one.
     """
     length = np.hypot(_BEYOND * np.maximum(edges.size, 1.0)[:, None], np.maximum(found.value[:, : ROWS - 1], 0.0))
     number = np.bincount(edges.body)[edges.body, None]

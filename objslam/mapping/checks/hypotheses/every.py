@@ -121,8 +121,8 @@ def _boxes(sized: bool) -> Iterator[Hypothesis]:
 
 
 def _squares(edges: set[int]) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about boxes in px of a detector's square. edges: (px), as returned by `_clipped_edges`. If boxes
-    end at another edge than the side of a square, this square is left out."""
+    """Yield the hypotheses that the boxes are in px of the square image that a detector gets. edges: px, the edges at which
+    boxes end, from `_clipped_edges`. A square is left out if boxes end at an edge that is not its own."""
     for side in _SQUARES:
         if edges - {side}:
             continue

@@ -48,9 +48,10 @@ _CHANCE = 90.0
 """The percentage of all turned mounts that have at most the score of chance. With a larger percentage, more agreement counts
 as chance."""
 _LEFT, _TIMES_CHANCE = 0.62, 1.5
-"""At poses of a localisation, a hypothesis must pass one of two tests against turned mounts, which fit by chance. Its misfit
-(1 - score) is at most the share `_LEFT` of theirs, or its score is at least `_TIMES_CHANCE` times theirs. Noisy poses spoil
-what really fits, but hardly what fits by chance, so a wrong hypothesis may fit better than the unchanged log. In 80 logs of
+"""At poses of a localisation, a hypothesis is compared with turned mounts, which fit by chance. It must pass one of two
+tests. Its misfit (1 - score) is at most the share `_LEFT` of theirs, or its score is at least `_TIMES_CHANCE` times theirs.
+The tests are needed because noisy poses spoil a true fit, but hardly a fit by chance. So a wrong hypothesis may fit better
+than the unchanged log. In 80 logs of
 16 simulated robots with a mistake, the right hypothesis leaves at most 0.57. In noisy logs without a mistake, the best
 hypothesis leaves at least 0.68, and has at most 1.36 times the score. A larger share and a smaller multiple name more
 causes."""
