@@ -16,8 +16,6 @@ from objslam.association.nearest_neighbour import assign
 from objslam.association.observations import MIN_DEPTH, Observations, PosedRays, observe
 from objslam.core.geometry import exp_se3, lift_se2
 
-EVERY = np.ones((2, 1), dtype=bool)
-
 
 def side_by_side(count=40, **more):
     """Two points passed by at 2 m."""

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drives import drive_of
+from lasting_localization import with_lasting
 from numpy.testing import assert_allclose
 from test_joint_rows import by_gtsam
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import exp_se3, lift_se2
+from objslam.core.geometry import exp_se3
 from objslam.core.statistics import WHITE, Lasting
 from objslam.core.types import Log
 from objslam.frontend.bearings import build_rays
@@ -122,19 +123,6 @@ def test_the_sides_of_a_clock_contain_the_motions_of_the_localisation():
     )
 
 
-def with_lasting(log: Log, xy: float, yaw: float, seconds: float, seed: int) -> Log:
-    """The log with a first-order Gauss-Markov process added to its localisation."""
-    path, rng = log.localization, np.random.default_rng(seed)
-    kept = np.exp(-np.median(np.diff(path.stamps)) / seconds)
-    drawn = rng.standard_normal((len(path), 3))
-    for i in range(1, len(drawn)):
-        drawn[i] = kept * drawn[i - 1] + np.sqrt(1 - kept**2) * drawn[i]
-    drawn *= [xy, xy, yaw]
-    poses = path.poses @ lift_se2(np.column_stack([np.zeros((len(path), 2)), drawn[:, 2]]))
-    poses[:, :2, 3] += drawn[:, :2]
-    return replace(log, localization=replace(path, poses=poses))
-
-
 def found_in(log: Log, *told: str):
     settings, ledger = load_settings(None, ("mode=joint", *told)), Ledger()
     keyframes = build_keyframes(log, settings, ledger)
@@ -179,7 +167,7 @@ def test_the_size_of_lasting_errors_and_their_time_are_found():
     sizes, times = [], []
     for seed in range(3):
         log, _ = localised(seed, frames=600, localization=PoseNoise(xy=0.001, yaw=0.001))
-        found = found_in(with_lasting(log, 0.3, 0.01, 3.0, seed))
+        found = found_in(with_lasting(log, 1.0, 3.0, seed, 0.3, 0.01))
         sizes.append(0.02 * found.place)
         times.append(found.place_seconds)
         assert found.place_share > 0.9
@@ -196,7 +184,7 @@ def test_new_errors_in_each_pose_are_found_to_be_new():
 
 def test_how_long_errors_last_is_found_if_their_size_is_given():
     log, _ = localised(0, frames=600, localization=PoseNoise(xy=0.001, yaw=0.001))
-    found = found_in(with_lasting(log, 0.3, 0.01, 3.0, 0), "localization.xy=0.3", "localization.yaw=0.01")
+    found = found_in(with_lasting(log, 1.0, 3.0, 0, 0.3, 0.01), "localization.xy=0.3", "localization.yaw=0.01")
     assert (found.heading, found.place) == (1.0, 1.0)
     assert found.place_share > 0.9
     assert 1 < found.place_seconds < 10

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from lasting_localization import with_lasting
 from scipy.optimize import linear_sum_assignment
-from test_lasting_errors import with_lasting
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_lasting_errors import with_lasting
+from lasting_localization import with_lasting
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger

@@ -7,30 +7,18 @@ from itertools import product
 
 import numpy as np
 import pytest
+from lasting_localization import with_lasting
 from quick import HELD
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import lift_se2, make_pose
+from objslam.core.geometry import make_pose
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log
 from objslam.errors import SolveError
 from objslam.mapping import pipeline
 from objslam.mapping.fixed.lasting_noise import _FACTORS, _KINDS, _LOOSE, TIMES, Cells, _misfits, lasting_variances
 from objslam.simulation import PoseNoise, preset, simulate
-
-
-def with_lasting(log: Log, factor: float, time: float, seed: int) -> Log:
-    """The log with errors of its localisation that last for `time`: an autoregressive process at each pose."""
-    path, rng = log.localization, np.random.default_rng(seed)
-    kept = np.exp(-np.median(np.diff(path.stamps)) / time)
-    drawn = rng.standard_normal((len(path), 3)) * factor * [0.02, 0.02, 0.005]
-    for i in range(1, len(drawn)):
-        drawn[i] = kept * drawn[i - 1] + np.sqrt(1 - kept**2) * drawn[i]
-    turned = lift_se2(np.column_stack([np.zeros((len(path), 2)), drawn[:, 2]]))
-    poses = path.poses @ turned
-    poses[:, :2, 3] += drawn[:, :2]
-    return replace(log, localization=replace(path, poses=poses))
 
 
 def squares(log: Log) -> list[float]:

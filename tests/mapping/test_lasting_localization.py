@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from test_lasting_errors import with_lasting
+from lasting_localization import with_lasting
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_lasting_errors import with_lasting
+from lasting_localization import with_lasting
 from test_phantoms import two_objects
 
 from objslam.config import load_settings

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_lasting_errors import with_lasting
+from lasting_localization import with_lasting
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger

@@ -21,7 +21,6 @@ from objslam.mapping.solution import seen_something
 
 BASE_T_CAMERA = make_pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 1.0]))
 WAY = [(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (9.0, 0.0, np.pi / 2), (9.0, 4.0, np.pi / 2), (9.0, 4.0, np.pi), (0.0, 4.0, np.pi)]
-AISLES = (0.0, 4.0)
 
 
 def signs(apart: float) -> tuple[Floats, Floats]:
