@@ -146,14 +146,7 @@ def detection_history(
     own, furthest = (np.nan_to_num(quantile) for quantile in grouped_quantiles(distance[held], index, count, (0.5, 1.0)))
     near, far = np.minimum(own, near[label]), np.maximum(own, far[label])
     reach = np.maximum(furthest, far)
-    boxed = [None if one else extent for one in _whole_boxes(obs, view)]
-    pairs = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)))]
-    for number, camera in enumerate(view.cameras):
-        frames = np.flatnonzero(view.camera == number)
-        step = max(1, _PAIRS_AT_ONCE // max(count, 1))
-        for begin in range(0, len(frames), step):
-            pairs.append(_in_image(position, boxed[number], reach, camera, frames[begin : begin + step], view))
-    obj, frame, away, pixel = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    obj, frame, away, pixel = _in_images(position, extent, reach, obs, view)
     inside = np.bincount(obj, minlength=count)
     usual = (away >= near[obj]) & (away <= far[obj])
     usual &= _from_the_front(obs.origin[held], index, position, obj, view.map_T_camera[frame, :3, 3])
@@ -199,20 +192,13 @@ def count_looks(
     object of each of these boxes, NaN where unknown.
     """
     near, far = (np.array([getattr(one, name) for one in known]) for name in ("near", "far"))
-    found = np.zeros(len(position), dtype=np.int64)
-    boxed = [None if one else np.nan_to_num(extent) for one in _whole_boxes(obs, view)]
-    for number, camera in enumerate(view.cameras):
-        frames = np.flatnonzero(view.camera == number)
-        step = max(1, _PAIRS_AT_ONCE // max(len(position), 1))
-        for begin in range(0, len(frames), step):
-            some = frames[begin : begin + step]
-            obj, frame, away, pixel = _in_image(position, boxed[number], far, camera, some, view)
-            usual = away >= near[obj]
-            usual &= _from_known_sides(obj, view.map_T_camera[frame, :3, 3] - position[obj], known)
-            obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
-            clear = ~_hidden(frame, away, pixel, obs, distance, _mean_size(np.nan_to_num(extent[obj])))
-            found += np.bincount(obj[clear], minlength=len(position))
-    return found
+    extent = np.nan_to_num(extent)
+    obj, frame, away, pixel = _in_images(position, extent, far, obs, view)
+    usual = away >= near[obj]
+    usual &= _from_known_sides(obj, view.map_T_camera[frame, :3, 3] - position[obj], known)
+    obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
+    clear = ~_hidden(frame, away, pixel, obs, distance, _mean_size(extent[obj]))
+    return np.bincount(obj[clear], minlength=len(position))
 
 
 def _from_known_sides(obj: Ints, toward: Floats, known: list[SeenFrom]) -> Bools:
@@ -257,6 +243,20 @@ def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, ca
     facing = np.einsum("pi,pi->p", toward, front[index])
     one_sided = np.nan_to_num(grouped_quantile(facing, index, count, 1 - _FRONT_SHARE)) >= 0
     return ~one_sided[obj] | (np.einsum("vi,vi->v", camera - position[obj], front[obj]) >= 0)
+
+
+def _in_images(
+    position: Floats, extent: Floats, reach: Floats, obs: Observations, view: CameraFrames
+) -> tuple[Ints, Ints, Floats, Floats]:
+    """Return what `_in_image` returns, for all frames. extent: (N, 2) m. obs: shows which boxes go around whole objects."""
+    whole, step = _whole_boxes(obs, view), max(1, _PAIRS_AT_ONCE // max(len(position), 1))
+    pairs = [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 2)))]
+    for number, camera in enumerate(view.cameras):
+        frames, boxed = np.flatnonzero(view.camera == number), None if whole[number] else extent
+        for begin in range(0, len(frames), step):
+            pairs.append(_in_image(position, boxed, reach, camera, frames[begin : begin + step], view))
+    obj, frame, away, pixel = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    return obj, frame, away, pixel
 
 
 def _in_image(

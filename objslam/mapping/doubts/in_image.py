@@ -8,19 +8,16 @@ import numpy as np
 
 from objslam.association.observations import overlap
 from objslam.core.arrays import Ints
+from objslam.frontend.boxes.robot_parts import LIKE_BOX, SAME_BOX
 from objslam.mapping.doubts.chance import LEAST_LOG_ODDS, crowded
 from objslam.mapping.doubts.evidence import Evidence
 from objslam.mapping.doubts.points import MISSED, fit_points
 
 _FEWEST = 8
 """The fewest boxes of a group. A larger number finds fewer groups."""
-_SAME_BOX, _LIKE_BOX = 0.7, 0.3
-"""Boxes are at one place of the image if their intersection over union with one box is above the first value. The number of
-boxes above the second value shows how many are there by chance. With a larger first value, only steadier boxes are found."""
 _BY_CHANCE = 0.1
-"""Of random boxes that overlap by more than `_LIKE_BOX`, this share overlaps by more than `_SAME_BOX`. It follows from the
-four coordinates of a box: ((1 - 0.7) / (1 - 0.3))^4 is 0.03, and boxes of one detector have similar sizes. A larger share
-finds fewer groups."""
+"""Of random boxes near a place of the image, at most this share is at the place (`robot_parts.STEADY`). A larger share finds
+fewer groups."""
 _TRIED = 64
 """For each label and camera, boxes at one place of the image are counted around at most this number of boxes. A larger
 number finds smaller groups."""
@@ -38,10 +35,10 @@ def fixed_in_image(evidence: Evidence, left: Ints) -> Iterator[Ints]:
         while len(mine) >= _FEWEST:
             centre = mine[np.linspace(0, len(mine) - 1, min(_TRIED, len(mine))).astype(np.int64)]
             alike = overlap(obs.box[centre][:, None], obs.box[mine][None])
-            inside = alike >= _SAME_BOX
+            inside = alike >= SAME_BOX
             best = int(inside.sum(axis=1).argmax())
             group = mine[inside[best]]
-            around = (alike >= _LIKE_BOX).sum(axis=1)
+            around = (alike >= LIKE_BOX).sum(axis=1)
             odds = crowded(inside.sum(axis=1), around, _BY_CHANCE, len(centre))
             if len(group) < _FEWEST or odds[best] < LEAST_LOG_ODDS:
                 break

@@ -87,10 +87,7 @@ def noise_in_frames(
     number = np.bincount(association.object[association.object >= 0], minlength=association.count)
     usable = np.append(np.isfinite(positions[:, 0]) & (number >= _FEWEST), False)
     held = np.flatnonzero(usable[association.object])  # The index -1 (no object) gives the last entry.
-    pose = np.unique(keyframes.stamps, return_inverse=True)[1][rays.keyframe[held]]
-    several = np.flatnonzero(np.bincount(pose) > 1)
-    some = np.isin(pose, several[:: -(-len(several) // _MOST_POSES) or 1])
-    held, pose = held[some], pose[some]
+    held, pose = of_several(keyframes, rays, held, _MOST_POSES)
     if not len(held) or not keyframes.localized_every:
         return 1.0, 1.0
     owner = association.object[held]
@@ -139,6 +136,17 @@ def _most_likely(sums: _Sums) -> Floats:
     usual, cost_usual = least_cost(sums.cost, np.array([True, False, False]), np.zeros(3), _BOUNDS)
     found, cost = least_cost(sums.cost, np.ones(3, dtype=bool), usual, _BOUNDS)
     return np.exp(found if cost < cost_usual - _SIGNIFICANT else usual)
+
+
+def of_several(keyframes: Keyframes, rays: Rays, held: Ints, most: int) -> tuple[Ints, Ints]:
+    """Return those of the rays `held` (n,) whose pose has several of them, and the number of the pose of each.
+
+    Keyframes with one stamp share a pose. most: the most poses that are kept, spread evenly.
+    """
+    pose = np.unique(keyframes.stamps, return_inverse=True)[1][rays.keyframe[held]]
+    several = np.flatnonzero(np.bincount(pose) > 1)
+    some = np.isin(pose, several[:: -(-len(several) // most) or 1])
+    return held[some], pose[some]
 
 
 def least_cost(cost: Callable[[Floats], float], free: Bools, start: Floats, bounds: Floats) -> tuple[Floats, float]:

@@ -17,7 +17,7 @@ from objslam.association.observations import MIN_DEPTH
 from objslam.core.arrays import Floats, Ints
 from objslam.core.types import Keyframes, Rays
 from objslam.errors import SolveError
-from objslam.mapping.fixed.pose_noise import least_cost
+from objslam.mapping.fixed.pose_noise import least_cost, of_several
 
 _MOST_POSES = 300
 """The most poses that count, spread evenly. More poses are more exact and slower."""
@@ -251,10 +251,7 @@ def common_tilt(keyframes: Keyframes, rays: Rays, point: Ints, points: Floats, p
     rays, as a number of residuals.
     """
     held = np.flatnonzero(point >= 0)
-    pose = np.unique(keyframes.stamps, return_inverse=True)[1][rays.keyframe[held]]
-    several = np.flatnonzero(np.bincount(pose) > 1)
-    some = np.isin(pose, several[:: -(-len(several) // _MOST_POSES) or 1])
-    held, pose = held[some], pose[some]
+    held, pose = of_several(keyframes, rays, held, _MOST_POSES)
     order = np.argsort(pose, kind="stable")
     held, pose = held[order], pose[order]
     if not len(held):
