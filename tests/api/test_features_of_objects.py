@@ -12,7 +12,7 @@ import pytest
 
 import objslam
 from objslam.core.object_map import MapObject, ObjectMap
-from objslam.io.results.read import load_features
+from objslam.io.rays_parquet import read_features
 from objslam.simulation import AppearanceNoise, DriveSettings, simulate
 
 QUIET = {"output": {"picture": False, "recording": False}}
@@ -68,8 +68,7 @@ def test_the_vectors_of_all_rays_lie_beside_them(drive: objslam.Log, result: obj
     assert detections is not None
     assert detections.features is not None
     result.save(tmp_path / "out")
-    found = load_features(tmp_path / "out")
-    assert found is not None
+    found = read_features(tmp_path / "out" / "features.parquet")
     assert found.ray.tolist() == list(range(len(result.rays)))
     row = {tuple(box): i for i, box in enumerate(detections.boxes.tolist())}
     of_rays = [row[tuple(box)] for box in result.rays.box.tolist()]
@@ -84,16 +83,15 @@ def test_a_log_without_vectors_has_a_result_without(drive: objslam.Log, result: 
     assert bare.objects.search(np.ones(16)) == ()
     result.save(tmp_path / "out")
     assert "features.parquet" in bare.save(tmp_path / "out")
-    assert load_features(tmp_path / "out") is None
+    assert not (tmp_path / "out" / "features.parquet").exists()
 
 
 @pytest.mark.parametrize("rays", [[0.5, 1.0], [float("nan"), 1.0], [None, 1]])
 def test_vectors_of_rays_without_a_whole_number_are_refused(tmp_path: Path, rays: list[float | None]) -> None:
     vectors = pa.FixedSizeListArray.from_arrays(pa.array(np.eye(2, dtype=np.float32).ravel()), 2)
     pq.write_table(pa.table({"ray": rays, "features": vectors}), tmp_path / "features.parquet")
-    (tmp_path / "objects.json").touch()
     with pytest.raises(objslam.ObjslamError, match="not whole numbers"):
-        load_features(tmp_path)
+        read_features(tmp_path / "features.parquet")
 
 
 def test_vectors_of_another_length_are_named_or_left_out() -> None:

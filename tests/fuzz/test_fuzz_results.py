@@ -22,9 +22,9 @@ from objslam.config import Output, Settings
 from objslam.core.result import Doubt
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
 from objslam.io.odometry_parquet import Motions, dump_motions
-from objslam.io.rays_parquet import RayFeatures, dump_features
+from objslam.io.rays_parquet import RayFeatures, dump_features, read_features
 from objslam.io.results import files
-from objslam.io.results.read import load_features, load_trajectory
+from objslam.io.results.read import load_trajectory
 from objslam.output.export import write_export
 from objslam.output.export.formats import FORMATS
 from objslam.output.report import write_report
@@ -71,7 +71,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def read_everything(out: Path) -> list[bool]:
     """Read a result folder with every command, and return which commands take it."""
     taken = [survives(lambda: write_report(out, crops=0)), survives(lambda: evaluate_folder(out))]
-    taken += [survives(lambda: load_features(out))]
+    taken += [survives(lambda: read_features(out / files.FEATURES))]
     return taken + [survives(lambda name=name: write_export(out, name)) for name in FORMATS]  # type: ignore[misc]
 
 

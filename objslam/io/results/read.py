@@ -14,7 +14,7 @@ from objslam.errors import LogError, OutputError
 from objslam.io.atomic_files import has_staging
 from objslam.io.objects_json import read_objects, read_truth_objects
 from objslam.io.odometry_parquet import Motions, read_motions
-from objslam.io.rays_parquet import RayFeatures, RaysTable, read_features, read_rays
+from objslam.io.rays_parquet import RaysTable, read_rays
 from objslam.io.results import files
 from objslam.io.results.shapes import DoubtsFile, EvaluationFile, Summary, fault_of
 from objslam.io.tum_trajectory import read_trajectory
@@ -104,14 +104,6 @@ def load_motions(out: Path) -> Motions | None:
 def load_rays(out: Path) -> RaysTable:
     """Read the rays of the result folder `out`. OutputError if the file is missing, damaged or of an older version."""
     return read_rays(_existing(out, files.RAYS))
-
-
-def load_features(out: Path) -> RayFeatures | None:
-    """Read the appearance vectors of the rays of the result folder `out`. None if its boxes had none. OutputError if the
-    file is damaged or there is no result."""
-    _existing(out, files.OBJECTS)
-    file = out / files.FEATURES
-    return read_features(file) if file.is_file() else None
 
 
 def load_views(out: Path) -> Views | None:
