@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from objslam import config
-from objslam.triangulation.triangulate import closed_form, solve_eq1, triangulate
+from objslam.triangulation.triangulate import solve_eq1, triangulate
 
 
 def scene(objects: int, rays: int, outliers: float, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,7 +79,10 @@ def main() -> None:
     args = parser.parse_args()
     rays = scene(args.objects, args.rays, args.outliers, args.noise)
     number = args.objects * args.rays
-    start, _ = closed_form(*rays, args.objects)
+    origins, directions = (one.reshape(args.objects, args.rays, 3) for one in rays[:2])
+    unit = directions / np.linalg.norm(directions, axis=2, keepdims=True)
+    across = np.eye(3) - unit[..., None] * unit[..., None, :]
+    start = np.linalg.solve(across.sum(axis=1), np.einsum("nrij,nrj->ni", across, origins)[..., None])[..., 0]
     settings = config.Triangulation(device=args.device)
 
     def fastest(work) -> float:
@@ -94,12 +97,11 @@ def main() -> None:
     batch = fastest(lambda: solve_eq1(*rays, args.objects, device=args.device))
     whole = fastest(lambda: triangulate(*rays, args.objects, args.noise, settings))
     begin = time.process_time()
-    shape = (args.objects, args.rays, 3)
-    reference = scipy_loop(rays[0].reshape(shape), rays[1].reshape(shape), start)
+    reference = scipy_loop(origins, directions, start)
     loop = time.process_time() - begin
     few = min(args.adam, args.objects)
     begin = time.process_time()
-    slow = adam_loop(rays[0].reshape(shape)[:few], rays[1].reshape(shape)[:few], start[:few])
+    slow = adam_loop(origins[:few], directions[:few], start[:few])
     adam = (time.process_time() - begin) * args.objects / few
     points, _, gradient = solve_eq1(*rays, args.objects, device=args.device)
     apart = np.linalg.norm(points - reference, axis=1)

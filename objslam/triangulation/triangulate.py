@@ -176,28 +176,13 @@ def _triangulate(
     )
 
 
-def closed_form(
-    origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, count: int, *, device: config.Device = "auto"
-) -> tuple[Floats, Bools]:
-    """Return the points (N, 3) m with the least sum of squared distances to their rays as lines, and which are unique (N,).
-
-    Arguments are as in `triangulate`. Parallel rays and a single ray fix no point. The result is then the point of the mean
-    ray that lies 1 m ahead of the mean origin. It is NaN without rays.
-    """
-    m, n, index = _rays(origins, directions, object_index, count)
-    with array_backend(device, len(m) >= _LARGE) as backend:
-        _, base, bundle = _bundle(m, n, index, count, np.ones(len(m)), 0.0, backend)
-        points, determined = least_squares(bundle)
-        return as_numpy(base + points), as_numpy(determined)
-
-
 def solve_eq1(
     origins: ArrayLike, directions: ArrayLike, object_index: ArrayLike, count: int, *, device: config.Device = "auto"
 ) -> tuple[Floats, int, Floats]:
     """Solve Eq. 1 for each object, argmin over o of sum_i ||(o - m_i) x n_i|| / ||n_i||, to machine precision.
 
-    Arguments are as in `triangulate`. An object whose rays fix no point gets the point of `closed_form`. For two rays, each
-    point between them on their common perpendicular is optimal, and the result is the midpoint.
+    Arguments are as in `triangulate`. An object whose rays fix no point gets the point of `least_squares`. For two rays,
+    each point between them on their common perpendicular is optimal, and the result is the midpoint.
 
     Returns:
         The points (N, 3) m, the number of iterations, and the norm (N,) of the gradient. The norm is NaN if the rays fix no

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize, root
 from scipy.spatial.transform import Rotation
 
-from objslam.triangulation.triangulate import closed_form, solve_eq1
+from objslam.core.array_module import array_backend, as_numpy
+from objslam.triangulation.point_to_lines import least_squares
+from objslam.triangulation.triangulate import _bundle, solve_eq1
 
 
 def offsets(o, m, n):
@@ -61,6 +63,15 @@ def rays_around(rng, count, sizes, noise=0.01, wrong=0.0, spread=3.0):
     anywhere = rng.random(len(index)) < wrong
     n[anywhere] = rng.normal(size=(int(anywhere.sum()), 3))
     return m, n / np.linalg.norm(n, axis=1, keepdims=True), index, places
+
+
+def closed_form(m, n, index, count):
+    """The points from which Eq. 1 is solved, and whether the rays fix them."""
+    m, n = np.asarray(m), np.asarray(n) / np.linalg.norm(n, axis=1, keepdims=True)
+    with array_backend("cpu", False) as backend:
+        _, base, bundle = _bundle(m, n, np.asarray(index), count, np.ones(len(m)), 0.0, backend)
+        points, determined = least_squares(bundle)
+        return as_numpy(base + points), as_numpy(determined)
 
 
 def test_equals_a_convex_solution_of_scipy_on_320_objects():
