@@ -113,7 +113,7 @@ def associate_globally(
         state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
     state, likely = _by_size(task, state, likely, sized)
     if solved or keyframes.localized_every:
-        # The things of these bundles are no landmarks, so that their rays always return.
+        # This comes last: the things of these bundles get no landmarks, so a further assignment would give their rays back.
         state = without_smaller_bundles(state, sized)
         stays = _plausible(task, state)
         state, likely = state.keep(stays), likely[stays]

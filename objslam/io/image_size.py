@@ -30,8 +30,8 @@ def _pair(form: str, data: bytes, at: int) -> tuple[int, int]:
 
 
 def _png(data: bytes) -> tuple[int, int]:
-    """Check the stated lengths of all chunks too. OpenCV takes the memory for a stated length before it finds that the file
-    is shorter."""
+    """Return the size of a PNG. Check the stated lengths of all its chunks too, because OpenCV takes the memory for a stated
+    length before it finds that the file is shorter."""
     size, at, kind = _pair(">II", data, 16), 8, b""
     while kind != b"IEND":
         length, kind = struct.unpack_from(">I4s", data, at)

@@ -60,7 +60,7 @@ def fit_points(bundles: Bundles, index: Ints, landmark: Ints, noise: Floats, sta
     n = state.obs.direction[ray]
     across = (np.eye(3) - n[:, :, None] * n[:, None, :]) / variance(state.obs, away, noise[index], ray)[:, None, None]
     information = grouped_sums(across.reshape(-1, 9), index, count).reshape(-1, 3, 3)
-    # A uniform distribution over the usual distance has its variance.
+    # A prior for each axis: the variance distance^2 / 12 of a uniform distribution over the usual distance.
     information += (12 / bundles.usual.distance[landmark] ** 2)[:, None, None] * np.eye(3)
     eigenvalues = np.linalg.eigvalsh(information)
     log_volume = 1.5 * np.log(2 * np.pi) - 0.5 * np.log(eigenvalues).sum(axis=1)

@@ -70,7 +70,7 @@ def with_doubts(result: RunResult) -> RunResult:
     unmapped, told = unmapped_labels(result, evidence, cut), {one.label for one in doubts if one.kind == "boxes"}
     disagreeing = [*apart.crossing(result, evidence), *apart.disagreeing(result, apart.misfits_of(result))]
     mixed, unsure = mixed_sizes(result), wide.unsure_objects(result)
-    # One doubt says why boxes are no object.
+    # If a whole label has no object, its doubt is enough. Its things get no doubts of their own.
     lacking = {one.label for one in unmapped}
     cut = [thing for thing in cut if result.rays.label_names[thing.label] not in lacking]
     of_things = [*unsure, *cut_off.in_doubts(cut, result), *_unnamed(disagreeing, doubts), *mixed]

@@ -180,8 +180,8 @@ def _halves(errors: SharedErrors, late: Bools) -> SharedErrors:
 
 
 def _can_tell(errors: SharedErrors) -> bool:
-    """Return whether the solve estimates shared errors, and all rays are rays of boxes: the corners of fiducials are rays of
-    other landmarks."""
+    """Return whether the solve can show held errors: it estimates shared errors, and no ray is to a fiducial with corners,
+    because corners are landmarks of their own."""
     return bool(errors.names) and errors.rays.corner_sigma is None
 
 

@@ -31,8 +31,8 @@ _WHITE: Colour = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class _Look:
-    """The mark of an outcome. Its kind differs too, so that the picture is readable without colours. words: what the legend
-    says after the name."""
+    """The mark of an outcome. Outcomes differ in colour and in the kind of mark, so that the picture is readable without
+    colours. words: what the legend says after the name."""
 
     colour: Colour
     kind: Literal["dot", "plus", "x", "diamond"]

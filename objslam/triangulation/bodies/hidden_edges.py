@@ -56,7 +56,7 @@ class Noise:
 
 
 def with_hidden(edges: BoxEdges, hidden: Bools) -> BoxEdges:
-    """Return the edges. Those in the mask `hidden` (B, 4) become bounds, too."""
+    """Return the edges, with those in the mask `hidden` (B, 4) as further bounds."""
     return replace(edges, bound=edges.bound | hidden)
 
 
