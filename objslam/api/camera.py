@@ -49,12 +49,9 @@ class Camera(camera.Camera):
 
 def as_camera(given: camera.Camera) -> Camera:
     """Return a camera whose calibration is checked. ValueError names what is wrong with it."""
-    return given if isinstance(given, Camera) else Camera(**vars_of(given))
-
-
-def vars_of(given: camera.Camera) -> dict[str, Any]:
-    """Return the fields of a camera by name."""
-    return {name: getattr(given, name) for name in camera.Camera.__dataclass_fields__}
+    if isinstance(given, Camera):
+        return given
+    return Camera(**{name: getattr(given, name) for name in camera.Camera.__dataclass_fields__})
 
 
 def checked_arrays(given: camera.Camera) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from objslam.graph.factors.localized_rows import LocalizedRows
 from objslam.graph.factors.noise import robust
 from objslam.graph.factors.odometry import betweens, motions
 from objslam.graph.factors.odometry_motions import OdometryMotions, find_ties
-from objslam.graph.factors.priors import anchor, landmark_priors
+from objslam.graph.factors.priors import anchor, point_prior
 from objslam.graph.factors.range import along_ray
 from objslam.graph.factors.rays import ray_factors
 from objslam.graph.multiframes import Multiframes
@@ -180,7 +180,7 @@ class Measurements:
         keyframes, settings = self.keyframes, self.settings
         end = len(keyframes) if end is None else end
         made = [f for _, group in ray_factors(self.rays.take(which), owner[which], loss, settings) for f in group]
-        made += landmark_priors(landmarks, positions, settings)
+        made += [point_prior(j, positions[j], settings.joint.prior_sigma) for j in landmarks.tolist()]
         if self.motions is not None:
             after = self.motions.after
             made += [self.motion_factors[i] for i in np.flatnonzero((after >= begin) & (after < end)).tolist()]

@@ -110,7 +110,8 @@ def register_maps(
     x = _grow(problem, first, x)
     if len(x) == 0:
         return _nothing()
-    odds = _log_odds(problem, _everything(problem, x), x, tried)
+    every = np.broadcast_to(np.arange(len(problem.a.label)), (len(x), len(problem.a.label)))
+    odds = _log_odds(problem, every, x, tried)
     best = int(np.argmax(odds))
     other = np.where(_differ(x, x[best]), odds, -np.inf)
     second = int(np.argmax(other)) if np.isfinite(other).any() else None
@@ -158,11 +159,6 @@ def _grow(problem: Problem, first: Ints, x: Floats) -> Floats:
                 kept.append(h)
         first, x = first[kept], x[kept]
     return x
-
-
-def _everything(problem: Problem, x: Floats) -> Ints:
-    """Return the indices (H, N) of all objects of a for each transform."""
-    return np.broadcast_to(np.arange(len(problem.a.label)), (len(x), len(problem.a.label)))
 
 
 def _differ(x: Floats, other: Floats) -> Bools:

@@ -3,18 +3,12 @@
 import gtsam
 import numpy as np
 
-from objslam.config import Settings
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Floats
 from objslam.graph.variables import L0, X0
 
 ANCHOR = 1e-4
 """The standard deviation (rad, m) of the prior on the first keyframe. A larger value lets the whole map drift. A smaller
 value conditions the linear system worse. This value is far below the noise of any measurement."""
-
-
-def landmark_priors(landmarks: Ints, positions: Floats, settings: Settings) -> list[gtsam.NonlinearFactor]:
-    """Return a weak prior on each of the landmarks (n,). The mean is the landmark's row of positions (N, 3)."""
-    return [point_prior(j, positions[j], settings.joint.prior_sigma) for j in landmarks.tolist()]
 
 
 def anchor(keyframe: int, map_T_camera: Floats) -> gtsam.NonlinearFactor:
