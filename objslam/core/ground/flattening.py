@@ -36,7 +36,7 @@ def raised_points(points: Floats, scale: float) -> Floats:
 
 
 def raised_covariances(covariances: Floats, scale: float) -> Floats:
-    """Return covariances (..., 3, 3) of the flattened world in the world."""
+    """Convert covariances (..., 3, 3), m^2, from the flattened world to the world."""
     axes = 1 / np.array([1.0, 1.0, scale])
     return covariances if scale == LEVEL else covariances * axes[:, None] * axes
 
