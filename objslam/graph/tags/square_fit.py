@@ -20,8 +20,9 @@ _DAMPING = 1e-3
 """The first damping of Levenberg-Marquardt, as a share of the diagonal. A larger share takes smaller first steps."""
 
 _MOST_LEVERAGE = 0.9
-"""The share of a view's influence on its own residuals that is corrected. It is below 1, because the residuals of a view
-that decides alone are 0. A larger share widens the covariances of squares that few views show."""
+"""A view draws the fit towards itself, so its residuals are too small. They are corrected for this share of its influence on
+the fit (its leverage). The share is below 1, because a view that decides alone has residuals of 0, which cannot be
+corrected. A larger share widens the covariances of squares that few views show."""
 
 
 @dataclass(frozen=True)
