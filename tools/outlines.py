@@ -47,16 +47,16 @@ def outline_box(camera: Camera, body: Floats, pose: Floats) -> Floats | None:
         return None
     angles = np.linspace(0, 2 * np.pi, _ANGLES, endpoint=False)
     rough = pixels(angles)
-    sides = []
-    for axis, pick in ((0, np.argmin), (1, np.argmin), (0, np.argmax), (1, np.argmax)):
-        best, step = angles[pick(rough[:, axis])], 2 * np.pi / _ANGLES
-        for _ in range(_STEPS):  # the vertex of a parabola through three points
-            before, at, after = pixels(best + step * np.array([-1, 0, 1]))[:, axis]
-            bend = before - 2 * at + after
-            best += np.clip(0.5 * step * (before - after) / bend, -step, step) if bend else 0.0
-            step = max(step / 4, 1e-4)
-        sides.append(pixels(np.array([best]))[0, axis])
-    return np.array(sides)
+    best = angles[[rough[:, 0].argmin(), rough[:, 1].argmin(), rough[:, 0].argmax(), rough[:, 1].argmax()]]
+    side, step = np.arange(4), np.full(4, 2 * np.pi / _ANGLES)  # The sides are left, top, right, and bottom.
+    for _ in range(_STEPS):  # the vertex of a parabola through three points
+        three = pixels((best + step * np.array([[-1], [0], [1]])).ravel()).reshape(3, 4, 2)
+        before, at, after = three[:, side, side % 2]
+        bend = before - 2 * at + after
+        move = 0.5 * step * (before - after) / np.where(bend == 0, 1.0, bend)
+        best = best + np.where(bend == 0, 0.0, np.clip(move, -step, step))
+        step = np.maximum(step / 4, 1e-4)
+    return np.asarray(pixels(best)[side, side % 2])
 
 
 def visible_box(camera: Camera, body: Floats, pose: Floats) -> Floats | None:

@@ -1,5 +1,7 @@
 """Simulated drives between large objects, as logs with boxes and a truth."""
 
+from functools import cache
+
 import numpy as np
 from outlines import from_axes, outline_box, visible_box
 
@@ -27,6 +29,7 @@ def drifting_odometry(true: np.ndarray, rng: np.random.Generator) -> list[np.nda
     return odometry
 
 
+@cache
 def drive(seed, frames=200, objects=8, short=None, laps=1):
     """Laps on an ellipse inside a ring of objects of 0.7 to 1.6 m, with boxes of 2 px noise and drifting odometry.
 

@@ -45,6 +45,12 @@ def run(log: Log, *more: str):
     return pipeline.run(log, load_settings(None, (*SETTINGS, *more)), ledger), ledger
 
 
+@cache
+def plain(*more: str):
+    """A run of a drive without shared errors."""
+    return run(drive(0), *more)
+
+
 GROSS = [("front.y", -0.2), ("front.x", 0.25), ("front.focal", 0.1), ("front.focal", -0.1)]
 
 
@@ -64,7 +70,7 @@ def test_a_gross_error_is_estimated_and_named(name, value):
 
 @pytest.mark.parametrize("errors", [{}, {"front.y": 0.05, "front.x": -0.05}, {"front.focal": 0.02, "front.cx": 0.04}])
 def test_usual_errors_stay_held(errors):
-    result, ledger = run(add_shared_errors(drive(0), errors))
+    result, ledger = run(add_shared_errors(drive(0), errors)) if errors else plain()
     assert {"front.x", "front.y", "front.focal"}.isdisjoint(result.calibration.names)
     assert not any("moved the camera" in warning for warning in ledger.warnings)
 
@@ -86,7 +92,7 @@ def test_the_sigmas_contain_a_focal_length_that_stays_held(value):
 def test_the_sigmas_of_a_right_camera_hardly_grow():
     sigma = []
     for more in ((), ("calibration.focal=0",)):
-        objects = run(drive(0), *more)[0].map.resolved()
+        objects = plain(*more)[0].map.resolved()
         sigma.append(np.median([np.sqrt(np.linalg.eigvalsh(one.covariance)[-1]) for one in objects]))
     assert 1.0 < sigma[0] / sigma[1] < 1.2
 
@@ -107,7 +113,7 @@ def test_the_step_that_finds_no_gross_error_tells_what_the_held_errors_do(monkey
     """It has the numbers of a step of the focal length alone, and needs no corrected path of its own."""
     from objslam.graph.calibration.next_step import NextStep
 
-    solution, _ = solved(drive(0))
+    solution = plainly_solved()
     assert solution.estimate.moved_by_held is not None
     steps, paths, of, init = [], [], NextStep.of, CorrectablePath.__init__
     monkeypatch.setattr(NextStep, "of", lambda *given: steps.append(given) or of(*given))
@@ -126,7 +132,7 @@ def test_the_step_that_finds_no_gross_error_tells_what_the_held_errors_do(monkey
 def test_a_step_of_some_errors_needs_the_others_at_zero():
     from objslam.graph.calibration.next_step import NextStep
 
-    solution, _ = solved(drive(0))
+    solution = plainly_solved()
     errors, theta = solution.errors, solution.estimate.calibration.values
     step = NextStep.of(errors, solution.association, solution.estimate, theta)
     left_out = int(np.argmax(np.abs(theta)))
@@ -172,6 +178,12 @@ def test_a_held_focal_length_moves_the_map_as_solves_with_other_ones_do(monkeypa
     moved = step.moved_by(at)[:, :, 0] / usual
     assert np.linalg.norm(expected) > 1.0  # Metres for each unit of the error.
     assert np.linalg.norm(moved + expected) < 0.18 * np.linalg.norm(expected)  # 0.23 if they did not follow.
+
+
+@cache
+def plainly_solved():
+    """The solution of a drive without shared errors."""
+    return solved(drive(0))[0]
 
 
 def solved(log: Log, *more: str):
