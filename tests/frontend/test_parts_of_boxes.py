@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from more_boxes import with_parts
+from more_boxes import left_parts, with_second_boxes
 
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
@@ -62,7 +62,7 @@ def test_many_boxes_are_compared_with_each_other():
 def test_parts_give_no_rays_and_are_counted():
     log, ledger = simulate(preset("demo"), 0), Ledger()
     some = np.arange(0, len(log.cameras[0].detections), 5)
-    changed = with_parts(log, some)
+    changed = with_second_boxes(log, some, left_parts)
     settings = Settings()
     before = build_rays(log, build_keyframes(log, settings, Ledger()), settings, Ledger())
     after = build_rays(changed, build_keyframes(changed, settings, Ledger()), settings, ledger)
