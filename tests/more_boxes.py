@@ -1,5 +1,6 @@
 """Put more boxes into a log."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -29,3 +30,28 @@ def with_boxes(log: Log, frames: Ints, boxes: Floats, label: str) -> Log:
         label_names=names,
     )
     return replace(log, cameras=(replace(log.cameras[0], detections=more),))
+
+
+def left_parts(boxes: Floats) -> Floats:
+    """The left parts of boxes (n, 4)."""
+    return np.column_stack([boxes[:, :2], 0.55 * boxes[:, 2] + 0.45 * boxes[:, 0], boxes[:, 3]])
+
+
+def aside(boxes: Floats) -> Floats:
+    """Boxes as large as others (n, 4), a quarter of a box away along both axes, each in one of four directions."""
+    way = np.random.default_rng(0).choice([-0.25, 0.25], (len(boxes), 2))
+    return boxes + np.tile(way * (boxes[:, 2:] - boxes[:, :2]), 2)
+
+
+def with_second_boxes(log: Log, some: Ints, second: Callable[[Floats], Floats]) -> Log:
+    """The log with a second box for some boxes (n,) of its first camera, with half of the score. second: makes these boxes
+    (n, 4) of the first ones."""
+    found = log.cameras[0].detections
+    assert found is not None
+    rows = np.sort(np.concatenate([np.arange(len(found)), some]))
+    again = np.flatnonzero(np.diff(rows) == 0) + 1
+    more = found.take(rows)
+    boxes, scores = more.boxes.copy(), more.scores.copy()
+    boxes[again] = second(boxes[again])
+    scores[again] *= 0.5
+    return replace(log, cameras=(replace(log.cameras[0], detections=replace(more, boxes=boxes, scores=scores)),))

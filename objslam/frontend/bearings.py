@@ -26,7 +26,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
     the lens model has no inverse at its centre. A box that the image's edge cuts off is not usable either, unless
     rays.border is negative or the detections are `whole`. In each frame, the `MAX_OF_LABEL` boxes of a label with the
     highest scores are used. `Rays.cut` has the boxes that only the image's edge made unusable. The boxes of
-    `parts_of_boxes` do not count.
+    `parts_of_things` do not count.
     """
     label_names, _ = label_table([n for c in log.cameras if c.detections is not None for n in c.detections.label_names])
     place = {name: i for i, name in enumerate(label_names)}
@@ -154,6 +154,32 @@ def _table(features: list[Floats32 | None], counts: list[int]) -> tuple[Ints | N
     return (row, FeatureTable(np.concatenate(rows))) if (row >= 0).any() else (None, None)
 
 
+def parts_of_things(
+    boxes: Floats,
+    frame: Ints,
+    label: Ints,
+    scores: Floats,
+    stamps: Floats | float,
+    camera: Camera,
+    settings: Settings,
+    ledger: Ledger,
+    whole: bool,
+) -> Bools:
+    """Return which boxes (M, 4) px of a camera show the thing of another box (`parts_of_boxes`). The ledger counts them.
+
+    Boxes with a low score are no reason to drop others. frame, label, scores: (M,) of each box. stamps: (M,) s, or one stamp
+    for all boxes. whole: as in `types.Detections`.
+    """
+    sure = np.flatnonzero(scores >= settings.rays.min_score)
+    cut = np.zeros(len(sure), dtype=bool)
+    if settings.rays.border >= 0 and not whole:
+        cut = np.asarray(cut_edges(boxes[sure], camera, settings).any(axis=1))
+    part = np.zeros(len(boxes), dtype=bool)
+    part[sure] = parts_of_boxes(boxes[sure], frame[sure], label[sure], scores[sure], cut)
+    ledger.drop(PARTS, int(part.sum()), _where(camera, stamps, part), of=len(boxes))
+    return part
+
+
 def surest(frame: Ints, label: Ints, scores: Floats, camera: Camera, ledger: Ledger) -> Ints:
     """Return the increasing indices of the boxes that are used: for each label in each frame the `MAX_OF_LABEL` best.
 
@@ -203,15 +229,9 @@ def cut_edges(boxes: Floats, camera: Camera, settings: Settings) -> Bools:
 
 
 def _without_parts(boxes: Detections, camera: Camera, settings: Settings, ledger: Ledger) -> Detections:
-    """Return the boxes without those of `parts_of_boxes`. Boxes with a low score are no reason to drop others."""
-    sure = np.flatnonzero(boxes.scores >= settings.rays.min_score)
-    some = boxes.take(sure)
-    cut = np.zeros(len(sure), dtype=bool)
-    if settings.rays.border >= 0 and not boxes.whole:
-        cut = np.asarray(cut_edges(some.boxes, camera, settings).any(axis=1))
-    part = np.zeros(len(boxes), dtype=bool)
-    part[sure] = parts_of_boxes(some.boxes, some.frame, some.label, some.scores, cut)
-    ledger.drop(PARTS, int(part.sum()), _where(camera, boxes.stamps, part), of=len(boxes))
+    """Return the boxes without those of `parts_of_things`."""
+    columns = boxes.boxes, boxes.frame, boxes.label, boxes.scores, boxes.stamps
+    part = parts_of_things(*columns, camera, settings, ledger, boxes.whole)
     return boxes.take(np.flatnonzero(~part)) if part.any() else boxes
 
 

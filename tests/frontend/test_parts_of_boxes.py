@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from more_boxes import left_parts, with_second_boxes
 
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
@@ -62,16 +61,8 @@ def test_many_boxes_are_compared_with_each_other():
 
 def test_parts_give_no_rays_and_are_counted():
     log, ledger = simulate(preset("demo"), 0), Ledger()
-    camera = log.cameras[0]
-    found = camera.detections
-    some = np.arange(0, len(found), 5)
-    half = found.boxes[some].copy()
-    half[:, 2] -= 0.45 * (half[:, 2] - half[:, 0])
-    more = found.take(np.sort(np.concatenate([np.arange(len(found)), some])))
-    again = np.flatnonzero(np.diff(np.sort(np.concatenate([np.arange(len(found)), some]))) == 0) + 1
-    boxes, scores = more.boxes.copy(), more.scores.copy()
-    boxes[again], scores[again] = half, 0.5 * scores[again]
-    changed = replace(log, cameras=(replace(camera, detections=replace(more, boxes=boxes, scores=scores)),))
+    some = np.arange(0, len(log.cameras[0].detections), 5)
+    changed = with_second_boxes(log, some, left_parts)
     settings = Settings()
     before = build_rays(log, build_keyframes(log, settings, Ledger()), settings, Ledger())
     after = build_rays(changed, build_keyframes(changed, settings, Ledger()), settings, ledger)

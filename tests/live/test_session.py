@@ -19,6 +19,7 @@ from objslam.core.geometry import align, inverse, lift_se2
 from objslam.core.types import Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.bearings import build_rays
+from objslam.frontend.boxes.nested_boxes import PARTS
 from objslam.frontend.keyframes import build_keyframes
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.adapters.replay import ReplayAdapter, events
@@ -205,7 +206,9 @@ def test_a_crowd_of_one_label_does_no_harm():
     log = simulate(preset("demo", frames=150), 1)
     session = drive(crowded(log, np.arange(0, 150, 10), 9_900))
     found = [o for o in session.stop().map.resolved() if o.label != "leaf"]
-    assert session.counters.dropped()["boxes beyond the 1000 surest of their label in a frame"] == 15 * 8900
+    dropped = session.counters.dropped()
+    beyond = dropped["boxes beyond the 1000 surest of their label in a frame"]
+    assert beyond + dropped[PARTS] == 15 * 8900  # A few boxes lie on others, as a second box of one thing does.
     assert session.counters.accepted()["tracks given up"] > 10 * 800  # most tracks do not become landmarks
     true = [(o.label, o.position) for o in log.truth.objects]
     near = [min(np.linalg.norm(o.position - p) for label, p in true if label == o.label) for o in found]

@@ -1,14 +1,14 @@
 """Converts the boxes of an image to bearings, from the stored calibrations and mounts of the cameras."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera, box_sizes
 from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
-from objslam.frontend.bearings import box_rays, surest
+from objslam.frontend.bearings import box_rays, parts_of_things, surest
 from objslam.frontend.corrected_log import corrected_camera, corrected_mount, lens_errors, refocused
 from objslam.frontend.surface_ranges import corrected_ranges, half_widths, range_factors, to_centres
 from objslam.live.mapper.frame_association import FrameRays
@@ -67,13 +67,10 @@ class BearingExtractor:
         base_T_camera = self._map.cameras[number].base_T_camera
         if held is not None:
             base_T_camera = corrected_mount(mount, errors, frame.camera) if errors else mount
+        frame, label = self._without_parts(frame, camera)
         kept, direction, sigma = box_rays(
             frame.boxes, frame.scores, frame.stamp, camera, settings, self._ledger, frame.whole
         )
-        for name in sorted(set(frame.labels) - self._label_number.keys()):
-            self._label_number[name] = len(self._labels)
-            self._labels.append(name)
-        label = np.array([self._label_number[name] for name in frame.labels], dtype=np.int64)
         few = surest(np.zeros(len(kept), dtype=np.int64), label[kept], frame.scores[kept], camera, self._ledger)
         kept, direction, sigma = kept[few], direction[few], sigma[few]
         same = np.zeros(len(kept), dtype=np.int64)
@@ -93,3 +90,18 @@ class BearingExtractor:
             track=frame.track_ids[kept],
         )
         return FrameView(number, mount, base_T_camera, rays)
+
+    def _without_parts(self, frame: FrameMessage, camera: Camera) -> tuple[FrameMessage, Ints]:
+        """Return the frame without boxes of parts of things, and the numbers of the labels of its boxes."""
+        for name in sorted(set(frame.labels) - self._label_number.keys()):
+            self._label_number[name] = len(self._labels)
+            self._labels.append(name)
+        label = np.array([self._label_number[name] for name in frame.labels], dtype=np.int64)
+        measured = frame.boxes, np.zeros(len(frame), dtype=np.int64), label, frame.scores, frame.stamp
+        part = parts_of_things(*measured, camera, self._settings, self._ledger, frame.whole)
+        if not part.any():
+            return frame, label
+        own = np.flatnonzero(~part)
+        labels = tuple(frame.labels[i] for i in own.tolist())
+        columns = {name: getattr(frame, name)[own] for name in ("boxes", "scores", "depths", "track_ids")}
+        return replace(frame, labels=labels, **columns), label[own]

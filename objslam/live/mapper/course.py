@@ -184,6 +184,22 @@ class Course:
             self._last, self._newest = placed, stamp
         return placed
 
+    def by_localization(self, stamp: float, piece: int) -> tuple[Floats, Floats] | None:
+        """Return map_T_base (4, 4) of a frame by the localisation, and the drift (6, 6) of the odometry since then.
+
+        The odometry of the piece of the frame leads from the newest localised pose to the frame, unless the localisation has
+        reached it. None if one of the two paths has no such poses.
+        """
+        then = min(stamp, self.localization.newest)
+        on = self.localization.at(then)
+        if on is None or then == stamp:
+            return None if on is None else (on.pose, np.zeros((6, 6)))
+        begin, end = self.odometry.at(then), self.odometry.at(stamp)
+        if begin is None or end is None or begin.stretch != end.stretch:
+            return None
+        to_start = adjoint(self._pieces[piece].start_T_path)
+        return on.pose @ inverse(begin.pose) @ end.pose, to_start @ (end.drift - begin.drift) @ to_start.T
+
     def _begin(self, stretch: int, path: PathBuffer, stamp: float, keyframes: KeyframeTable) -> _Piece:
         """Make a new piece that starts at a stamp, s. If possible, the newest localisation up to the stamp places it."""
         last = self._last

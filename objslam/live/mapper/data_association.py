@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from objslam.association.duplicates import may_be_one
 from objslam.association.landmarks import PredictedLandmarks
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.live.mapper.frame_association import FrameRays, best_of_label, match, match_by_label
 from objslam.live.mapper.landmark_table import at_box_centres, box_centres, predict_landmarks, to_centres
 from objslam.live.mapper.landmark_update import LandmarkUpdate
@@ -24,10 +25,12 @@ def associate(
     """Assign the rays of the newest keyframe to landmarks and tracks, and add the rays of landmarks to the graph.
 
     rays: of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of
-    `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks.
+    `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks. Second
+    boxes of a thing (`_first_boxes`) are only kept for the end of the session.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
-    if m.by_label and settings.method == "auto" and len(set(rays.label.tolist())) < count:
+    one = may_be_one(rays.box, rays.label)
+    if m.by_label and settings.method == "auto" and _shows_two(rays.label, one):
         m.tell_apart_within_labels()
     beside, spread = _box_centres(m, rays, map_T_camera)
     numbers = m.next_id.ray + np.arange(count)
@@ -48,11 +51,13 @@ def associate(
         if predicted is None:
             predicted = predict_landmarks(landmarks, m.tracks)
         predicted = at_box_centres(predicted, beside, spread)
-        row = match(rays, map_T_camera, predicted, uncertainty, len(m.labels), settings.gate, m.landmark_of_track, m.novelty)
+        first = _first_boxes(rays.score, one)
+        known = settings.gate, m.landmark_of_track, m.novelty
+        row[first] = match(rays.take(first), map_T_camera, predicted, uncertainty, len(m.labels), *known)
         of_track = row >= predicted.landmarks
-        m.novelty += _NOVELTY_WEIGHT * (float((of_track | (row < 0)).mean()) - m.novelty)
+        m.novelty += _NOVELTY_WEIGHT * (float((of_track | (row < 0))[first].mean()) - m.novelty)
         tracks = {i: m.tracks[row[i] - predicted.landmarks] for i in np.flatnonzero(of_track).tolist()}
-        free = np.flatnonzero(row < 0)
+        free = first[row[first] < 0]
         row[of_track] = -1
     matched = np.flatnonzero(row >= 0)
     owner[matched], used[matched] = landmarks.id[row[matched]], True
@@ -82,6 +87,24 @@ def associate(
         m.graph.add_rays(m.bearings(len(m.rays.number) - count + matched))
     m.graph.update()
     return LandmarkUpdate(turned, matched, row[matched], list(tracks.values()))
+
+
+def _shows_two(label: Ints, one: Bools) -> bool:
+    """Return whether a frame shows two things of a label. label: (n,) of its boxes. one: (n, n) as in `may_be_one`."""
+    return bool((np.triu(label[:, None] == label, 1) & ~one).any())
+
+
+def _first_boxes(score: Floats, one: Bools) -> Ints:
+    """Return the boxes that may match something or begin a track: the surest of the boxes that may show one thing.
+
+    A second box of a thing would become a second landmark, or pull the first one aside. A thing that stands behind another
+    of its label loses some boxes, but has others from where the robot sees them side by side. The end of the session uses
+    all boxes. score: (n,). one: (n, n) as in `may_be_one`.
+    """
+    first = np.zeros(len(score), dtype=bool)
+    for i in np.argsort(-score, kind="stable").tolist():
+        first[i] = not (one[i] & first).any()
+    return np.flatnonzero(first)
 
 
 def _box_centres(m: MapState, rays: FrameRays, map_T_camera: Floats) -> tuple[Floats, Floats]:

@@ -21,8 +21,10 @@ from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.mapping.alternation import solve
+from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
+from objslam.mapping.checks.misfits import find_misfits, with_misfits
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.joint.doubted_labels import doubted_names
@@ -60,10 +62,12 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
         solution, log = corrected(with_held_errors(errors, solution, ledger), errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
-    solution = with_bodies(solution, cameras, settings)
+    solution = with_hidden_parts(with_bodies(solution, cameras, settings), cameras)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
     objects, residual = describe(solution, cameras, settings)
+    used = keyframes, solution.rays, solution.association
+    objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
     ids = _kept_ids(found.association, found.ids, solution.association)
     objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
     where = None

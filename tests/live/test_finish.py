@@ -1,0 +1,62 @@
+"""The end of a session gives objects the sigmas that an offline run gives them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driving import feed
+from mapping.hiding_drives import hiding_drive
+
+from objslam.config import load_settings
+from objslam.live.session import finalize
+from objslam.live.session.session import Session
+
+ODD, TIMES = 1, 4.0
+
+
+@pytest.fixture(scope="module")
+def ended():
+    """The result of a session in which the rays of object `ODD` do not agree, and what its last stages got and returned."""
+    made = {}
+
+    def noted(name):
+        given = getattr(finalize, name)
+
+        def stage(first, *arguments):
+            made[name] = first, given(first, *arguments)
+            return made[name][1]
+
+        return stage
+
+    def disagreeing(objects, *more):
+        found = find_misfits(objects, *more)
+        odd = np.arange(len(objects)) == ODD
+        return replace(found, odd=odd, times=np.where(odd, TIMES, found.times))
+
+    find_misfits = finalize.find_misfits
+    session = feed(Session(load_settings(None, ("mode=joint",)), patient=True).start(), hiding_drive(0, frames=100))
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("with_bodies", "with_box_offsets", "describe"):
+            patch.setattr(finalize, name, noted(name))
+        patch.setattr(finalize, "find_misfits", disagreeing)
+        return session.stop(), made
+
+
+def test_positions_by_rays_of_hidden_boxes_are_less_sure(ended):
+    _, made = ended
+    (_, before), (after, _) = made["with_bodies"], made["with_box_offsets"]
+    used = (before.association.object >= 0) & (before.estimate.weight > 0)
+    more = np.trace(after.estimate.covariance - before.estimate.covariance, axis1=1, axis2=2)
+    hidden = [before.hidden[used & (before.association.object == j)].any() for j in range(before.association.count)]
+    assert any(hidden)
+    assert ((more > 0) == hidden).all()
+
+
+def test_an_object_whose_rays_do_not_agree_has_a_larger_sigma(ended):
+    result, made = ended
+    (described, _) = made["describe"][1]
+    for j, (before, after) in enumerate(zip(described.objects, result.map.objects, strict=True)):
+        assert (before.covariance is None) == (after.covariance is None)
+        if before.covariance is not None:
+            np.testing.assert_allclose(after.covariance, before.covariance * (TIMES**2 if j == ODD else 1.0))
+    assert described.objects[ODD].covariance is not None
