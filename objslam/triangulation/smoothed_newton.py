@@ -18,6 +18,9 @@ _ROUNDING = 1e-14
 exact to about 1e-15, and a dual is an offset divided by the smoothing. With a smaller value, rounding errors keep the
 smoothing of some objects large until the last step."""
 _ON_LINE = (1e-7, 1e-5)  # The values of `on_line` (in mean distances) that are tried where 0 does not give the optimum.
+_RIDGE = 1e-10
+"""The ridge that is added to a singular matrix, as a share of its norm. It is far above the rounding errors of the matrix. A
+larger value moves the point more slowly along rays that are nearly parallel."""
 _TINY = 1e-300  # The least divisor, so that 0 / 0 gives 0.
 
 
@@ -88,7 +91,7 @@ def _newton_step(lines: LineBlock, o: Tensor, q: Tensor, y: Tensor, epsilon: Ten
     six = lines.spread(inverse) - outer(y * (inverse / r), q, xp)
     six[:3] += 1e-14 * six[:3].sum(axis=0).clip(min=_TINY)
     gradient = (q * inverse).sum(axis=1)
-    step = -xp.linalg.solve(full(six), gradient.T[:, :, None])[:, :, 0].T
+    step = -_solved(full(six), gradient.T[:, :, None], xp)[:, :, 0].T
     slope, value, share = dot(gradient, step), (r * lines.weight).sum(axis=0), xp.ones_like(epsilon)
     for _ in range(40):  # Halve each object's step until its cost falls (Armijo), up to rounding.
         new = o + share * step
@@ -103,6 +106,20 @@ def _newton_step(lines: LineBlock, o: Tensor, q: Tensor, y: Tensor, epsilon: Ten
     a, b, c = dot(dual_step, dual_step), dot(y, dual_step), (dot(y, y) - 1).clip(max=0)
     part = (0.999 * (xp.sqrt((b * b - a * c).clip(min=0)) - b) / a.clip(min=_TINY)).clip(max=1)
     return new, new_q, y + part * dual_step
+
+
+def _solved(curvature: Tensor, gradient: Tensor, xp: ModuleType) -> Tensor:
+    """Return the solutions (B, 3, 1) for symmetric matrices (B, 3, 3), also if one of them is singular.
+
+    Rays that are parallel to 0.1 degrees have no curvature along them, up to rounding. Rounding may then cancel the small
+    ridge of `_newton_step` exactly.
+    """
+    try:
+        return xp.linalg.solve(curvature, gradient)
+    except xp.linalg.LinAlgError:
+        ridge = _RIDGE * xp.sqrt((curvature * curvature).sum(axis=(1, 2))).clip(min=_TINY)
+        held = curvature + ridge[:, None, None] * xp.eye(3, dtype=curvature.dtype, device=curvature.device)
+        return xp.linalg.solve(held, gradient)
 
 
 def _exact_optimum(lines: LineBlock, point: Tensor, dual: Tensor, on_line: float) -> tuple[Tensor, Tensor]:

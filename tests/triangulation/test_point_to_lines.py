@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize, root
 from scipy.spatial.transform import Rotation
 
 from objslam.core.array_module import array_backend, as_numpy
+from objslam.triangulation import smoothed_newton
 from objslam.triangulation.point_to_lines import least_squares
 from objslam.triangulation.triangulate import _bundle, solve_eq1
 
@@ -239,3 +241,12 @@ def test_order_motion_and_scale_carry_over(seed, size):
     rotation, translation, scale = Rotation.random(rng=rng).as_matrix(), rng.normal(scale=10, size=3), np.exp(rng.normal())
     moved, _, _ = solve_eq1(scale * m @ rotation.T + translation, n @ rotation.T * 2.0, index, 3)
     np.testing.assert_allclose(moved, scale * points @ rotation.T + translation, rtol=0, atol=1e-8 * max(1, scale))
+
+
+@pytest.mark.parametrize("xp", [np, torch])
+def test_a_singular_matrix_gives_a_finite_step(xp):
+    """Nearly parallel rays of a recorded drive once gave a matrix that rounding made exactly singular."""
+    regular, singular = np.diag([2.0, 4.0, 5.0]), np.diag([3.0, 0.0, 6.0])
+    matrices, right = xp.asarray(np.stack([regular, singular])), xp.asarray(np.array([[2.0, 4.0, 5.0], [3.0, 0.0, 6.0]]))
+    found = np.asarray(smoothed_newton._solved(matrices, right[:, :, None], xp))[..., 0]
+    np.testing.assert_allclose(found, [[1.0, 1.0, 1.0], [1.0, 0.0, 1.0]], atol=1e-8)
