@@ -199,7 +199,8 @@ class Keyframes:
     non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera.
     base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation.
     localized_every: how many keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base
-    is odometry. overlap: the share of the keyframes of one moment that can show the same thing: 1 for one camera, or for
+    is odometry. localized: (K,) whether the localisation measured the pose, False if the odometry continued it. None if it
+    measured all. overlap: the share of the keyframes of one moment that can show the same thing: 1 for one camera, or for
     cameras that look the same way, and a quarter for four cameras that look to four sides. pose_noise: the factors on
     `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. lasting: the parts of the
     errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the coordinate frame of the first
@@ -217,6 +218,7 @@ class Keyframes:
     base_T_camera: Floats
     map_T_base: Floats
     localized_every: float = 0.0
+    localized: Bools | None = None
     overlap: float = 1.0
     pose_noise: tuple[float, float] = (1.0, 1.0)
     lasting: tuple[Lasting, Lasting] = (WHITE, WHITE)

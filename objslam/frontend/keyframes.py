@@ -18,7 +18,7 @@ _DIRECTIONS = 400
 """The number of directions in which the views of several cameras are compared. A larger number is more exact and slower."""
 
 
-def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
+def build_keyframes(log: Log, settings: Settings, ledger: Ledger, measured: Trajectory | None = None) -> Keyframes:
     """Return the frames of all cameras that lie on the robot's path, in the order of time.
 
     The path is the localisation if the log has one, else the odometry. In joint mode a frame must also lie on the odometry,
@@ -26,6 +26,8 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
     that are outside the path or in one of its gaps longer than poses.max_gap. If a camera moves on the robot, the ledger
     also counts frames outside of the stamps of its mount. LogError if the log has no path, no detection frame, or no frame
     on the path.
+
+    measured: the localisation before `continued_by_odometry`, if that continued it.
     """
     path = log.robot_path
     if path is None:
@@ -82,11 +84,14 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
             where=log.name,
             hint=hint,
         )
-    localized_every = 0.0
+    localized_every, at_measured = 0.0, None
     if localized and log.localization is not None:
         known, used = log.localization.stamps, stamps[valid]
-        measured = ((known >= used[0]) & (known <= used[-1])).sum()
-        localized_every = max(1.0, len(used) / max(float(measured), 1.0))
+        if measured is not None and measured is not log.localization:
+            at_measured = interpolate(measured.stamps, measured.poses, stamps, max_gap)[1]
+            known, used = measured.stamps, stamps[valid & at_measured]
+        number = ((known >= used[0]) & (known <= used[-1])).sum() if len(used) else 0
+        localized_every = max(1.0, len(used) / max(float(number), 1.0))
     return Keyframes(
         stamps=stamps,
         camera=camera,
@@ -94,6 +99,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger) -> Keyframes:
         base_T_camera=base_T_camera,
         map_T_base=map_T_base,
         localized_every=localized_every,
+        localized=at_measured,
         overlap=_overlap(log, camera[valid]),
         odom_T_base=odom_T_base,
         drift=drift,

@@ -17,6 +17,7 @@ from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.boxes.robot_parts import without_robot_parts
+from objslam.frontend.continued_localization import continued_by_odometry, share_on_continuation
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import shared_errors, take_out_expected, take_out_known
 from objslam.graph.least_squares.libraries import load_libraries
@@ -48,6 +49,10 @@ from objslam.mapping.refuted import without_refuted
 from objslam.mapping.solution import seen_something, with_jumps
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
+
+_BEYOND = 0.1
+"""With the mode `auto`, the poses are solved if the odometry continues the localisation for this share of the boxes or more.
+A larger share leaves out more boxes, and spares more logs the time of a solve of the poses."""
 
 
 def run(
@@ -96,8 +101,14 @@ def _run(
     that an earlier map at the given poses found."""
     recorded = [c.detections for c in log.cameras if c.detections is not None]
     given = log = without_robot_parts(chosen_poses(log, settings), settings, ledger)
-    unused = settings.mode == "auto" and log.localization is not None and log.odometry is not None
+    both, open_mode = log.localization is not None and log.odometry is not None, settings.mode == "auto"
     settings = with_mode_of(log, settings)
+    if open_mode and both and settings.mode == "joint":
+        share = share_on_continuation(log, continued_by_odometry(log, settings), settings)
+        ledger.warn(
+            f"the odometry continues the localisation for {100 * share:.0f} % of the boxes, so the poses are solved "
+            "(--mode fixed leaves these boxes out)"
+        )
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
@@ -116,7 +127,10 @@ def _run(
             diagnosis = diagnosis.proven()  # No joint solve will test the other findings.
             settings = settings.model_copy(update={"mode": "fixed"})
         log = taken_out(diagnosis.jumps, log)
-        frames = build_keyframes(log, settings, ledger)
+        measured = log.localization
+        if settings.mode == "joint":
+            log = continued_by_odometry(log, settings)
+        frames = build_keyframes(log, settings, ledger, measured)
         if settings.mode == "fixed" and not frames.localized_every and not diagnosis.certain:
             cause = " and allow no calibration" if settings.calibration.use is True else ""
             ledger.warn(f"the poses are plain odometry{cause}, so the map drifts with them (--mode joint corrects both)")
@@ -227,7 +241,7 @@ def _run(
         summary={
             **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
             "part": dict(zip(("begin", "end"), log.part, strict=True)),
-            "odometry_unused": unused,
+            "odometry_unused": open_mode and both and settings.mode == "fixed",
             "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
             **({} if where is None else {"localisation": where.told}),
             **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
@@ -275,7 +289,9 @@ def with_mode_of(log: Log, settings: Settings) -> Settings:
     """Return the settings with `auto` replaced by the mode that it means for a log with the chosen poses."""
     if settings.mode != "auto":
         return settings
-    return settings.model_copy(update={"mode": "joint" if log.localization is None else "fixed"})
+    more = share_on_continuation(log, continued_by_odometry(log, settings), settings)
+    joint = log.localization is None or more >= _BEYOND
+    return settings.model_copy(update={"mode": "joint" if joint else "fixed"})
 
 
 def _doubting(progress: Progress, diagnosis: Diagnosis) -> Progress:

@@ -59,7 +59,7 @@ def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> 
     measured = replace(of.measured, keyframes=_white(of.measured.keyframes), settings=_without_places(of.measured.settings))
     loose = replace(of, measured=measured, known=None)
     system, keyframes, nominal = linearise(loose, errors, theta), measured.keyframes, errors.settings.localization
-    poses = _poses(len(keyframes))
+    poses = _poses(keyframes)
     map_T_base = (of.map_T_camera @ inverse(keyframes.base_T_camera))[poses]
     apart = inverse(keyframes.map_T_base[poses]) @ map_T_base
     place = map_T_base[:, :2, 3] - keyframes.map_T_base[poses, :2, 3]
@@ -103,9 +103,10 @@ def _without_places(settings: Settings) -> Settings:
     return settings.model_copy(update={"localization": of.model_copy(update={"xy": of.xy * _LOOSE, "yaw": of.yaw * _LOOSE})})
 
 
-def _poses(count: int) -> Ints:
-    """Return the indices of the poses that are compared, among `count` poses, in increasing order."""
-    if count <= _FIRST * len(_LAGS):
-        return np.arange(count)
-    begin = np.linspace(0, count - 1 - max(_LAGS), _FIRST).astype(np.int64)
-    return np.unique(begin[:, None] + np.array(_LAGS))
+def _poses(keyframes: Keyframes) -> Ints:
+    """Return the indices of the localised poses that are compared, in increasing order."""
+    every = np.arange(len(keyframes)) if keyframes.localized is None else np.flatnonzero(keyframes.localized)
+    if len(every) <= _FIRST * len(_LAGS):
+        return every
+    begin = np.linspace(0, len(every) - 1 - max(_LAGS), _FIRST).astype(np.int64)
+    return every[np.unique(begin[:, None] + np.array(_LAGS))]

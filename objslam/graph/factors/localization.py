@@ -24,6 +24,9 @@ from objslam.graph.variables import X0
 _UNTOLD = 10.0
 """The standard deviation (rad, m) of the parts of a motion that a localisation does not measure, such as the change of
 height. A larger value constrains less, and costs digits."""
+_CONTINUED = 1e3
+"""The standard deviation (rad, m) of an absolute pose that no localisation measured. It must be so large that thousands of
+such poses together still tell nothing. A larger value costs digits."""
 _LONGEST = 0.9999
 """The largest share of a lasting error that stays from one pose to the next. A larger share ties two poses of nearly the
 same time more closely, and costs digits."""
@@ -77,6 +80,8 @@ def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: 
     """
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
     (yaw, _), (xy, _) = _chains(keyframes, settings)
+    if keyframes.localized is not None:
+        yaw, xy = (np.where(keyframes.localized, part, _CONTINUED) for part in (yaw, xy))
     tilt, z = _of_ground(keyframes, settings)[0] if on_plane else (yaw, xy)
     parts = (tilt, tilt, yaw, xy, xy, z)
     s = np.stack([np.broadcast_to(np.square(part), len(keyframes)) for part in parts], axis=1) * keyframes.localized_every
@@ -138,6 +143,8 @@ def _in_camera(base_T_camera: Floats, variances: Floats) -> Floats:
 def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floats]]:
     """Return the standard deviations of headings (rad) and places (m): for each, (K,) of poses and (K-1,) of motions."""
     gaps = np.maximum(np.diff(keyframes.stamps), 0.0) * max(keyframes.localized_every, 1.0)
+    if keyframes.localized is not None:  # An error lasts only from one measured pose to the next.
+        gaps[~(keyframes.localized[1:] & keyframes.localized[:-1])] = np.inf
     of = settings.localization
     columns = zip((of.yaw, of.xy), keyframes.pose_noise, keyframes.lasting, strict=True)
     return [chain(gaps, nominal * factor, lasting) for nominal, factor, lasting in columns]

@@ -27,7 +27,7 @@ are in s already, the correction brings them closer together than this. A larger
 
 def check_stamps(log: Log) -> Finding | None:
     """Return a finding if the stamps of a log are not in s, or if its frames were taken at other times than its poses."""
-    path = log.localization or log.odometry
+    path = _longest(log)
     stamps = [c.detections.frame_stamps for c in log.cameras if c.detections is not None]
     if path is None or not stamps or not sum(map(len, stamps)):
         return None
@@ -55,6 +55,15 @@ def check_stamps(log: Log) -> Finding | None:
                 return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
     what = f"only {100 * here:.0f} % of the frames lie in the time of the poses ({span})"
     return Finding("stamps apart", f"{what}: the camera and the poses have different clocks", spoils=False)
+
+
+def _longest(log: Log) -> Trajectory | None:
+    """Return the localisation, or the odometry if the log has no localisation, or if its time includes the localisation's.
+    A localisation that begins late has no other clock."""
+    path, odometry = log.localization, log.odometry
+    if not path or not odometry:
+        return path or odometry
+    return odometry if odometry.stamps[0] <= path.stamps[0] and path.stamps[-1] <= odometry.stamps[-1] else path
 
 
 def _common_unit(path: Trajectory, frames: list[Floats]) -> str | None:

@@ -1,0 +1,87 @@
+"""The odometry continues a localisation: against the true path, at gaps of the odometry, and where it drifts too far."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from objslam.config import load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.core.statistics import Lasting
+from objslam.core.types import Log, Trajectory
+from objslam.frontend.continued_localization import continued_by_odometry, share_on_continuation
+from objslam.frontend.keyframes import build_keyframes
+from objslam.graph.factors.localization import localization_covariance, localized_motions
+from objslam.simulation import preset, simulate
+
+SETTINGS = load_settings(None, ("mode=joint",))
+ODOM = lift_se2(np.array([[3.0, -2.0, 1.0]]))[0]
+"""The pose of the map in the frame of the odometry."""
+
+
+def drive(keep) -> tuple[Log, Trajectory]:
+    """An arc of 20 s with exact poses, whose odometry has a frame of its own. keep: which seconds have a localisation."""
+    t = np.linspace(0.0, 20.0, 201)
+    true = lift_se2(np.column_stack([2 * np.sin(t / 20), 2 * (1 - np.cos(t / 20)), t / 20]))
+    made = simulate(preset("demo"), 0)
+    camera = replace(made.cameras[0], rgb=None)
+    found = camera.detections
+    frames = np.linspace(0.05, 19.95, len(found.frame_stamps))
+    camera = replace(camera, detections=replace(found, frame_stamps=frames))
+    kept = keep(t)
+    path = Trajectory(t, true)
+    return replace(
+        made, cameras=(camera,), odometry=Trajectory(t, ODOM @ true), localization=Trajectory(t[kept], true[kept])
+    ), path
+
+
+@pytest.mark.parametrize(
+    "keep", [lambda t: t > 8, lambda t: t < 12, lambda t: (t < 5) | (t > 12), lambda t: (t > 3) & (t < 17)]
+)
+def test_continued_poses_lie_on_the_true_path(keep):
+    log, path = drive(keep)
+    found = continued_by_odometry(log, SETTINGS).localization
+    np.testing.assert_allclose(found.stamps, path.stamps)
+    np.testing.assert_allclose(found.poses, path.poses, atol=1e-9)
+
+
+def test_a_gap_of_the_odometry_ends_the_continuation():
+    log, path = drive(lambda t: t > 8)
+    whole = (path.stamps < 3) | (path.stamps > 5)
+    log = replace(log, odometry=Trajectory(path.stamps[whole], ODOM @ path.poses[whole]))
+    assert continued_by_odometry(log, SETTINGS).localization.stamps[0] == pytest.approx(5.1)
+
+
+def test_drift_ends_the_continuation():
+    log, _ = drive(lambda t: t > 8)
+    noisy = load_settings(None, ("mode=joint", "odometry.yaw_per_m=0.3", "odometry.yaw_per_rad=0"))
+    begin = continued_by_odometry(log, noisy).localization.stamps[0]
+    # The way has 0.1 m in each second, so the heading has drifted by 0.15 rad after 0.25 m.
+    assert begin == pytest.approx(8.1 - 2.5, abs=0.11)
+
+
+@pytest.mark.parametrize("keep", [lambda t: t >= 0, lambda t: t > 15])
+def test_nothing_is_continued_if_the_localisation_is_whole_or_too_short(keep):
+    log, _ = drive(keep)
+    assert continued_by_odometry(log, SETTINGS) is log
+    assert share_on_continuation(log, log, SETTINGS) == 0
+
+
+def test_continued_keyframes_have_no_localisation():
+    log, _ = drive(lambda t: t > 8)
+    continued = continued_by_odometry(log, SETTINGS)
+    frames = build_keyframes(continued, SETTINGS, Ledger(), log.localization)
+    assert len(frames) == len(log.cameras[0].detections.frame_stamps)
+    np.testing.assert_array_equal(frames.localized, frames.stamps >= 8.1)
+    covariance = localization_covariance(frames, SETTINGS)
+    sigma = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
+    assert sigma[~frames.localized].min() > 1e3
+    assert sigma[frames.localized].max() < 1
+    lasting = replace(frames, lasting=(Lasting(1.0, 5.0), Lasting(1.0, 5.0)))
+    motions = localized_motions(lasting, SETTINGS)
+    both = frames.localized[1:] & frames.localized[:-1]
+    smallest = np.sqrt(np.linalg.eigvalsh(motions.covariance)[:, 0])  # Tilt and height are untold anyway.
+    assert smallest[~both].min() > 1
+    assert smallest[both].max() < 0.1
+    assert share_on_continuation(log, continued, SETTINGS) == pytest.approx(0.4, abs=0.1)
