@@ -1,12 +1,13 @@
 """Map recorded drives with default settings, and compare each map with its truth and with its own sigmas.
 
-    python tools/bench_recordings.py [--parts named short poses cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
+    python tools/bench_recordings.py [--parts named short poses late cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
 
 named: UTIAS MRCLAM 6 and 7 (15 landmarks, the odometry of wheels) and Lost in the Woods (17 posts, one observation a
 second), each landmark with a label of its own, from bearings and with ranges. short: parts of the MRCLAM drives of two to
-five minutes. poses: whole drives at the poses of the motion capture. cube: a cabinet of TUM fr3 at the poses of the motion
-capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with ranges, and one label
-for all landmarks.
+five minutes. poses: whole drives at the poses of the motion capture. late: drives whose motion capture begins after two
+fifths of the time, beside the odometry, with mode fixed and auto. cube: a cabinet of TUM fr3 at the poses of the motion
+capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with ranges, and one
+label for all landmarks.
 
 Maps from odometry are compared after SE(2) alignment. The truth is inside a 95 % ellipsoid in 95 % of the cases, if the
 covariances are right. Times are of the processor, for the map alone.
@@ -45,6 +46,8 @@ UNNAMED_RADIUS = 0.5
 DRIVES = (("mrclam_ds6", (1, 3, 5)), ("mrclam_ds7", (1, 3)))
 PARTS = ((0, 300), (300, 600), (600, 900), (200, 320), (800, 1000))
 """The begins and ends, s, of the parts of a drive."""
+LATE = 0.4
+"""The share of a drive after which the motion capture begins."""
 CABINET = np.array([-1.522, 0.457, 0.282])
 """The cabinet's centre, m, in the depth images, fused with the true poses: from the floor, at 0, to its top, at 0.563 m."""
 CABINET_SIZE = np.array([0.826, 0.498, 0.563])
@@ -154,6 +157,29 @@ def poses(data: Path, only: str, overrides: list[str]) -> None:
             )
 
 
+def late(data: Path, only: str, overrides: list[str]) -> None:
+    """Landmarks of drives from bearings, with the odometry of the whole drive and the motion capture from `LATE` on."""
+    print("the motion capture begins late, and the odometry does not")
+    print(
+        f"{'drive':<7}{'mode':>6}{'right':>7}{'false':>7}{'missed':>8}{'RMSE m':>8}{'inside 95 %':>13}{'keyframes':>11}"
+        f"{'s':>7}"
+    )
+    for name, log in drives(data, only, with_range=False):
+        assert log.truth is not None
+        path = log.truth.trajectory
+        kept = path.stamps >= path.stamps[0] + LATE * np.ptp(path.stamps)
+        localized = replace(log, localization=Trajectory(path.stamps[kept], path.poses[kept]))
+        for mode in ("fixed", "auto"):
+            result, seconds = solve(localized, [f"mode={mode}", *overrides])
+            found = judged(log, result, align="none")
+            inside = f"{round(found['inside_95_3d'] * found['matched'])} of {found['matched']}"
+            print(
+                f"{name:<7}{mode:>6}{found['matched']:7d}{found['false']:7d}{found['missed']:8d}{found['position_rmse']:8.3f}"
+                f"{inside:>13}{len(result.keyframes):11d}{seconds:7.1f}",
+                flush=True,
+            )
+
+
 def cube(data: Path, overrides: list[str]) -> None:
     """The cabinet against the fused surface, poses fixed, with depths and without."""
     print("TUM fr3_cabinet (cube_slam), fixed")
@@ -191,7 +217,7 @@ def ycbv(data: Path, overrides: list[str]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("named", "short", "poses", "cube", "ycbv", "unnamed")
+    parts = ("named", "short", "poses", "late", "cube", "ycbv", "unnamed")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--only", default="", help="only the drives whose name contains this, such as 6-1 or woods")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs")
@@ -204,6 +230,7 @@ def main() -> None:
         "named": lambda: compare(data, only, overrides, names=True),
         "short": lambda: short(data, only, overrides),
         "poses": lambda: poses(data, only, overrides),
+        "late": lambda: late(data, only, overrides),
         "cube": lambda: cube(data, overrides),
         "ycbv": lambda: ycbv(data, overrides),
         "unnamed": lambda: compare(data, only, overrides, names=False),
