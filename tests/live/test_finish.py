@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from driving import feed
 from mapping.hiding_drives import hiding_drive
+from mapping.test_depth_axis import driven, with_power
+from mapping.test_moved_camera import turned
 
 from objslam.config import load_settings
 from objslam.live.session import finalize
 from objslam.live.session.session import Session
+from objslam.simulation import preset, simulate
 
 ODD, TIMES = 1, 4.0
 
@@ -22,8 +25,8 @@ def ended():
     def noted(name):
         given = getattr(finalize, name)
 
-        def stage(first, *arguments):
-            made[name] = first, given(first, *arguments)
+        def stage(first, *arguments, **named):
+            made[name] = first, given(first, *arguments, **named)
             return made[name][1]
 
         return stage
@@ -60,3 +63,21 @@ def test_an_object_whose_rays_do_not_agree_has_a_larger_sigma(ended):
         if before.covariance is not None:
             np.testing.assert_allclose(after.covariance, before.covariance * (TIMES**2 if j == ODD else 1.0))
     assert described.objects[ODD].covariance is not None
+
+
+@pytest.mark.parametrize(("power", "words"), [(0, ""), (-1, "distances along the ray")])
+def test_the_end_names_depths_that_are_distances_along_the_ray(power, words):
+    """An offline run names them too (`test_depth_axis`)."""
+    log = with_power(driven(localization=None), power)
+    result = feed(Session(load_settings(None, ("mode=joint", "bodies.use=false")), patient=True).start(), log).stop()
+    assert [one["name"] for one in result.summary["wrong_input"]] == ["depth axis"] * bool(words)
+    assert any(words in line for line in result.summary["warnings"]) or not words
+
+
+def test_the_end_trusts_no_object_of_a_camera_that_somebody_turned():
+    log = simulate(preset("demo", frames=200, objects=12, classes=12, localization=None), 3)
+    settings = load_settings(None, ("mode=joint", "bodies.use=false"))
+    for degrees, names in ((0.0, []), (10.0, ["camera moved"])):
+        result = feed(Session(settings, patient=True).start(), turned(log, 0, degrees)).stop()
+        assert [one["name"] for one in result.summary["wrong_input"]] == names
+        assert bool(result.map.resolved()) == (not names)

@@ -24,13 +24,19 @@ from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
 from objslam.mapping.bodies.fitting import with_bodies
 from objslam.mapping.box_offsets import with_box_offsets
+from objslam.mapping.checks.depth_axis import check_depth_axis
+from objslam.mapping.checks.diagnosis import Diagnosis
+from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.misfits import find_misfits, with_misfits
+from objslam.mapping.checks.shared_errors import at_bounds
+from objslam.mapping.checks.verdict import say
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.joint.doubted_labels import doubted_names
-from objslam.mapping.joint.held_errors import with_held_errors
+from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.joint.labels import labels_tell
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
+from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.solution import Solution, without_errors
 
 
@@ -58,15 +64,26 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         warn_of_others(m.calibration, log, settings, ledger)
     cameras = tuple(one.camera for one in log.cameras)
     solution = _solved(found, m.by_label, cameras, settings, ledger)
+    findings: list[Finding] = []
     if solution.errors is not None:
         errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
+        if settings.checks.use:
+            findings += check_turned_camera(errors, solution)
         solution, log = corrected(with_held_errors(errors, solution, ledger), errors, ledger)
         cameras = tuple(one.camera for one in log.cameras)
+        if settings.checks.use:
+            findings += at_bounds(solution.estimate, errors.bounds)
     solution = with_hidden_parts(with_bodies(solution, cameras, settings), cameras)
     solution = with_box_offsets(solution, cameras, settings)
     keyframes, estimate = solution.keyframes, solution.estimate
-    objects, residual = describe(solution, cameras, settings)
     used = keyframes, solution.rays, solution.association
+    trusted = not any(finding.spoils for finding in findings)
+    objects, residual = describe(solution, cameras, settings, trusted=trusted)
+    if settings.checks.use:
+        near = check_neighbours(solution, found.errors, settings)
+        depths = check_depth_axis(objects, estimate.map_T_base @ keyframes.base_T_camera, *used)
+        findings += [finding for finding in (near, depths) if finding is not None]
+    say(Diagnosis(tuple(findings)), ledger)
     objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
     ids = _kept_ids(found.association, found.ids, solution.association)
     objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
@@ -74,7 +91,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     if known is not None:
         where = localize(solution, objects, known, errors, settings, ledger)
         if where.solution is not None and where.map_T_drive is not None:
-            solution, objects, residual = describe_in_map(where, known, cameras, settings, ids)
+            solution, objects, residual = describe_in_map(where, known, cameras, settings, ids, trusted=trusted)
             log = moved_log(log, where.map_T_drive)
             keyframes, estimate = solution.keyframes, solution.estimate
     accepted = m.counters.accepted()
@@ -90,6 +107,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         residual,
         summary={
             **summary,
+            "wrong_input": [finding.to_dict() for finding in findings],
             "live": {**accepted, "rebuilds": m.graph.rebuilds},
             **({} if where is None else {"localisation": where.told}),
             **({"map_frame": "map"} if where is not None and where.solution is not None else {}),
