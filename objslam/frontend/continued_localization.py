@@ -40,11 +40,12 @@ def continued_by_odometry(log: Log, settings: Settings) -> Log:
         return log
     known = localization.stamps[covered]
     map_T_odom = localization.poses[covered] @ inverse(at[covered])
-    free = ~_between(localization.stamps, odometry.stamps, max_gap) & _sure(odometry, known, settings)
+    sure, times = _near_localization(odometry, known, settings)
+    free = sure & ~_between(localization.stamps, odometry.stamps, max_gap)
     if not free.any():
         return log
     stamps = odometry.stamps[free]
-    offset, _ = interpolate(known, map_T_odom, np.clip(stamps, known[0], known[-1]), np.inf)
+    offset, _ = interpolate(known, map_T_odom, times[free], np.inf)
     every = np.concatenate([localization.stamps, stamps])
     poses = np.concatenate([localization.poses, offset @ odometry.poses[free]])
     order = np.argsort(every)
@@ -73,17 +74,21 @@ def _between(poses: Floats, stamps: Floats, max_gap: float) -> Bools:
     return (next_ == stamps) | ((before <= stamps) & (stamps <= next_) & (next_ - before <= max_gap))
 
 
-def _sure(odometry: Trajectory, known: Floats, settings: Settings) -> Bools:
-    """Return which poses of an odometry (N,) drifted little since, or until, the nearest localised stamp (L,), without a
-    gap of the odometry in between."""
+def _near_localization(odometry: Trajectory, known: Floats, settings: Settings) -> tuple[Bools, Floats]:
+    """Return which poses of an odometry (N,) drifted little since, or until, the nearest localised stamp (L,), s, without a
+    gap of the odometry in between. Also return the times (N,), s, at which the offset of the odometry from the map holds for
+    them. It is their own time between two localised stamps, unless one of the two lies beyond a gap or does not exist.
+    """
     stamps = odometry.stamps
     turned = gathered_drift(odometry, np.concatenate([stamps, known]), settings.odometry)[:, 2, 2]
     drift, at_known = turned[: len(stamps)], turned[len(stamps) :]
     stretch = np.concatenate([[0], np.cumsum(np.diff(stamps) > settings.poses.max_gap)])
     of_known = stretch[np.clip(np.searchsorted(stamps, known), 0, len(stamps) - 1)]
-    sure = np.zeros(len(stamps), dtype=bool)
     after = np.searchsorted(known, stamps)
+    sure, joined, at = [], [], []
     for end in (after - 1, after):
-        end_ = np.clip(end, 0, len(known) - 1)
-        sure |= (end == end_) & (stretch == of_known[end_]) & (np.abs(drift - at_known[end_]) < _DRIFT**2)
-    return sure
+        at.append(np.clip(end, 0, len(known) - 1))
+        joined.append((end == at[-1]) & (stretch == of_known[at[-1]]))
+        sure.append(joined[-1] & (np.abs(drift - at_known[at[-1]]) < _DRIFT**2))
+    own = np.where(joined[0], known[at[0]], known[at[1]])
+    return sure[0] | sure[1], np.where(joined[0] & joined[1], stamps, own)

@@ -72,7 +72,15 @@ def run(
     calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
-    result, wrong, lasting = _run(log, settings, ledger, progress, known)
+    try:
+        result, wrong, lasting = _run(log, settings, ledger, progress, known)
+    except SolveError as error:
+        chosen = chosen_poses(log, settings)
+        if settings.mode != "auto" or chosen.localization is None or with_mode_of(chosen, settings).mode == "fixed":
+            raise
+        ledger.restore(before)
+        ledger.warn(f"the poses cannot be solved: {error}")
+        return _run(log, settings.model_copy(update={"mode": "fixed"}), ledger, progress, known)[0]
     # Without odometry, the second solve takes the noise of the localisation from the rays.
     untold = lasting is not None and settings.finds_localization_noise
     if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
@@ -103,12 +111,6 @@ def _run(
     given = log = without_robot_parts(chosen_poses(log, settings), settings, ledger)
     both, open_mode = log.localization is not None and log.odometry is not None, settings.mode == "auto"
     settings = with_mode_of(log, settings)
-    if open_mode and both and settings.mode == "joint":
-        share = share_on_continuation(log, continued_by_odometry(log, settings), settings)
-        ledger.warn(
-            f"the odometry continues the localisation for {100 * share:.0f} % of the boxes, so the poses are solved "
-            "(--mode fixed leaves these boxes out)"
-        )
     expected = take_out_expected(log, settings)
     log = take_out_known(log, settings, ledger)
     seconds: dict[str, float] = {}
@@ -127,10 +129,16 @@ def _run(
             diagnosis = diagnosis.proven()  # No joint solve will test the other findings.
             settings = settings.model_copy(update={"mode": "fixed"})
         log = taken_out(diagnosis.jumps, log)
-        measured = log.localization
+        localized = log
         if settings.mode == "joint":
             log = continued_by_odometry(log, settings)
-        frames = build_keyframes(log, settings, ledger, measured)
+        if open_mode and log is not localized:
+            share = share_on_continuation(localized, log, settings)
+            ledger.warn(
+                f"the odometry continues the localisation for {100 * share:.0f} % of the boxes, so the poses are solved "
+                "(--mode fixed leaves these boxes out)"
+            )
+        frames = build_keyframes(log, settings, ledger, localized.localization)
         if settings.mode == "fixed" and not frames.localized_every and not diagnosis.certain:
             cause = " and allow no calibration" if settings.calibration.use is True else ""
             ledger.warn(f"the poses are plain odometry{cause}, so the map drifts with them (--mode joint corrects both)")

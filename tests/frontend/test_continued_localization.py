@@ -53,6 +53,19 @@ def test_a_gap_of_the_odometry_ends_the_continuation():
     assert continued_by_odometry(log, SETTINGS).localization.stamps[0] == pytest.approx(5.1)
 
 
+def test_both_sides_of_a_gap_of_the_odometry_follow_their_own_end():
+    """Somebody restarts the odometry in its gap, while the localisation pauses."""
+    log, path = drive(lambda t: (t < 5) | (t > 12))
+    t = path.stamps
+    later = t > 9
+    odometry = np.where(later[:, None, None], path.poses, ODOM @ path.poses)
+    whole = (t < 7) | later
+    log = replace(log, odometry=Trajectory(t[whole], odometry[whole]))
+    found = continued_by_odometry(log, SETTINGS).localization
+    np.testing.assert_allclose(found.stamps, t[whole])
+    np.testing.assert_allclose(found.poses, path.poses[whole], atol=1e-9)
+
+
 def test_drift_ends_the_continuation():
     log, _ = drive(lambda t: t > 8)
     noisy = load_settings(None, ("mode=joint", "odometry.yaw_per_m=0.3", "odometry.yaw_per_rad=0"))

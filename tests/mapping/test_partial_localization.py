@@ -8,6 +8,7 @@ import pytest
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log, Trajectory
+from objslam.errors import SolveError
 from objslam.mapping import pipeline
 from objslam.mapping.checks.stamps import check_stamps
 from objslam.simulation import preset, simulate
@@ -54,3 +55,19 @@ def test_a_late_localisation_has_no_other_clock():
     assert check_stamps(log) is None
     other = replace(log, odometry=None)
     assert check_stamps(other).name == "stamps apart"
+
+
+def test_a_log_whose_poses_cannot_be_solved_is_mapped_at_the_localised_ones(monkeypatch):
+    solve = pipeline.solve
+
+    def failing(frames, rays, cameras, settings, *more, **named):
+        if settings.mode == "joint":
+            raise SolveError("singular")
+        return solve(frames, rays, cameras, settings, *more, **named)
+
+    monkeypatch.setattr(pipeline, "solve", failing)
+    ledger = Ledger()
+    result = pipeline.run(partial(lambda t: t > 0.4), load_settings(None, QUIET), ledger)
+    assert result.summary["mode"] == "fixed"
+    assert result.map.resolved()
+    assert any("the poses cannot be solved: singular" in line for line in ledger.lines())

@@ -25,8 +25,8 @@ def associate(
     """Assign the rays of the newest keyframe to landmarks and tracks, and add the rays of landmarks to the graph.
 
     rays: of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of
-    `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks. Second
-    boxes of a thing (`_first_boxes`) are only kept for the end of the session.
+    `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks. Second boxes of
+    a thing (`_first_boxes`) are only kept for the end of the session.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
     one = may_be_one(rays.box, rays.label)
