@@ -21,6 +21,7 @@ from objslam.errors import LogError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes, with_mounts
 from objslam.mapping.checks.meeting_points import fit_points
+from objslam.mapping.standstills import repeated_views
 
 FRAMES = 600
 """The most frames that are examined. More frames give a more certain answer and take longer."""
@@ -89,7 +90,10 @@ class Part:
 
 
 def bounded_part(log: Log, settings: Settings) -> Part:
-    """Return at most `FRAMES` frames of a log. They are spread evenly, or in short windows if the poses are odometry."""
+    """Return at most `FRAMES` frames of a log. They are spread evenly, or in short windows if the poses are odometry.
+
+    A robot that stands shows the same view again. Of such frames, only the first counts (`standstills.repeated_views`).
+    """
     stamps = np.sort(np.concatenate([c.detections.frame_stamps for c in log.cameras if c.detections is not None]))
     drifts = log.localization is None
     if not drifts:
@@ -113,6 +117,9 @@ def bounded_part(log: Log, settings: Settings) -> Part:
         for number in range(len(starts)):
             mine = np.flatnonzero((window == number) & filled)
             kept[mine[:: max(1, -(-len(mine) * len(log.cameras) // most))]] = True
+        if one.mount is None:
+            examined = np.flatnonzero(kept)
+            kept[examined[repeated_views(log, found.frame_stamps[examined], settings)]] = False
         cameras.append(replace(one, detections=take_frames(one, kept), rgb=None, depth=None))
         windows.append(window[kept])
     return Part(replace(log, cameras=tuple(cameras), truth=None), tuple(windows), drifts)
