@@ -10,6 +10,7 @@ from objslam.io.camera_yaml import Mount
 
 ROLES = ("odometry", "localization", "detections", "image", "depth", "camera_info")  # The roles of topics in a bag.
 TF, NONE = "tf", "none"  # Words for --topic in place of a topic. TF: transforms supply the role. NONE: nothing does.
+TF_ROLES = ("tf", "tf_static")  # The roles of the topics of transforms.
 FROM_TF = ("odometry", "localization")  # The roles that transforms can supply.
 LISTED = 8  # The limit of topics listed in a message. The limit keeps the message readable.
 
@@ -28,10 +29,10 @@ class Choices:
 def parse_topics(texts: Sequence[str], *, live: bool = False) -> Choices:
     """Parse the values of --topic. Raises ConfigError for a wrong value.
 
-    A value is "role=/topic", or for a bag also "camera.role=/topic". With `live`, a value names no camera, the roles also
-    include tf and tf_static, and a topic may lack its "/".
+    A value is "role=/topic", or for a bag also "camera.role=/topic". With `live`, a value names no camera, and a topic may
+    lack its "/".
     """
-    choices, roles = Choices(), (*ROLES, "tf", "tf_static") if live else ROLES
+    choices, roles = Choices(), (*ROLES, *TF_ROLES)
     for text in texts:
         left, _, name = (part.strip() for part in text.partition("="))
         camera, _, role = ("", "", left) if live else left.rpartition(".")
@@ -49,6 +50,11 @@ def warn_of_choice(ledger: Ledger, role: str, taken: str, others: Iterable[str])
     names = list(others)
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     ledger.warn(f"several fit {role}: {taken} is taken, not {', '.join(names[:LISTED])}{more} (--topic {role}=... chooses)")
+
+
+def namespace(topic: str) -> str:
+    """Return the name of a topic up to its last slash: "/robot1" of /robot1/tf, and "" of /tf."""
+    return topic.rpartition("/")[0]
 
 
 def is_rectified(name: str) -> bool:

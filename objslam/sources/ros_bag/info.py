@@ -8,7 +8,7 @@ import numpy as np
 
 from objslam.core.camera import Camera, spoken_name
 from objslam.core.diagnostics import Ledger
-from objslam.ros.messages.topic_types import COMPRESSED, TRANSFORMS
+from objslam.ros.messages.topic_types import COMPRESSED
 from objslam.sources.ros_bag.log import Assembly, assemble
 from objslam.sources.ros_bag.options import BagOptions
 from objslam.sources.ros_bag.places import CameraPlace, camera_places
@@ -108,8 +108,8 @@ def _missing(assembly: Assembly) -> tuple[str, ...]:
 
 def _roles(assembly: Assembly) -> dict[str, str]:
     roles = {}
-    for name, topic in assembly.survey.topics.items():
-        if topic.type in TRANSFORMS:
+    for name in assembly.survey.topics:
+        if name in assembly.tf_topics:
             roles[name] = "tf_static" if name.endswith("tf_static") else "tf"
     if assembly.paths is not None:
         roles.update(assembly.paths.roles)

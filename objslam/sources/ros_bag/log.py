@@ -31,6 +31,7 @@ from objslam.sources.ros_bag.cameras import CameraTopics, build_camera, find_cam
 from objslam.sources.ros_bag.options import BagOptions
 from objslam.sources.ros_bag.places import camera_places
 from objslam.sources.ros_bag.survey import Survey, take_survey
+from objslam.sources.ros_bag.tf_topics import choose_transforms
 from objslam.sources.ros_bag.topic_roles import TopicPool, check_choices
 from objslam.sources.ros_bag.trajectories import Paths, read_paths
 
@@ -47,13 +48,15 @@ Detection2DArray, AprilTag detections, or images with CameraInfo"""  # The advic
 class Assembly:
     """A recording after each topic got its role, for example the odometry or the images of a camera.
 
-    tree: the tree of tf. paths: the robot's paths, None without any. cast: the topics of every camera. cameras: the topics,
-    the camera and its mount for each usable camera. The mount is base_T_camera over time, None if the camera does not move.
+    tree: the tree of tf. tf_topics: the names of its topics. paths: the robot's paths, None without any. cast: the topics of
+    every camera. cameras: the topics, the camera and its mount for each usable camera. The mount is base_T_camera over time,
+    None if the camera does not move.
     problems: the errors that make a run impossible. left_out: the errors of the unusable cameras, if others are usable.
     """
 
     survey: Survey
     tree: TfTree
+    tf_topics: frozenset[str]
     paths: Paths | None
     cast: tuple[CameraTopics, ...]
     cameras: tuple[tuple[CameraTopics, Camera, Trajectory | None], ...]
@@ -109,7 +112,9 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
     for topic in survey.topics.values():
         for reason, count in topic.refused.items():
             ledger.drop(f"message that cannot be used: {reason}", count, topic.name)
-    tree, pool = TfTree(survey.tf, ledger), TopicPool(survey, choices, ledger)
+    pool = TopicPool(survey, choices, ledger)
+    transforms, tf_topics = choose_transforms(pool)
+    tree = TfTree(transforms, ledger)
     problems: list[LogError] = []
     found: Paths | None = None
     base = options.base_frame or ""
@@ -138,7 +143,7 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
             problems.append(NoCamera(message, where, _NO_BOXES, found.odometry, found.localization, known, logs))
     if not cameras:
         problems += refused
-    return Assembly(survey, tree, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ()))
+    return Assembly(survey, tree, tf_topics, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ()))
 
 
 def _extract(assembly: Assembly, options: BagOptions, ledger: Ledger) -> dict[str, Images]:

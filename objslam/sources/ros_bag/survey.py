@@ -23,6 +23,7 @@ from objslam.ros.messages.detections import WRONG_LAYOUT, find_boxes, track_numb
 from objslam.ros.messages.poses import PoseRows, choose_times
 from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, POSES, TRANSFORMS, is_boxes
 from objslam.ros.tf.tree import TfRows
+from objslam.ros.topics import namespace
 
 _MAX_TOPICS = 10_000  # The most topics that are read. Messages of other topics count as lost. A larger number costs memory.
 _Decoder = Callable[[bytes], Any]
@@ -74,11 +75,11 @@ class Topic:
 
 @dataclass(frozen=True)
 class Survey:
-    """The topics of a recording by name, the transforms of its tf topics, and a report on each file."""
+    """The topics of a recording by name, the transforms of its tf topics by namespace, and a report on each file."""
 
     recording: Recording
     topics: dict[str, Topic]
-    tf: TfRows
+    tf: dict[str, TfRows]
     reports: tuple[FileReport, ...]
 
     def damage(self) -> tuple[str, ...]:
@@ -92,7 +93,7 @@ def take_survey(recording: Recording, label: str) -> Survey:
     Damage is counted in the reports, and unusable messages in the topics. Raises LogError if no file can be read.
     """
     topics: dict[str, Topic] = {}
-    tf = TfRows()
+    tf: dict[str, TfRows] = {}
     handlers: dict[int, tuple[Connection, Topic, _Handler]] = {}
     reports: list[FileReport] = []
     for connection, logged, data in read_messages(recording, lambda connection: True, reports):
@@ -112,7 +113,7 @@ def take_survey(recording: Recording, label: str) -> Survey:
     return Survey(recording, topics, tf, tuple(reports))
 
 
-def _make_handler(connection: Connection, topic: Topic, tf: TfRows, label: str) -> _Handler:
+def _make_handler(connection: Connection, topic: Topic, tf: dict[str, TfRows], label: str) -> _Handler:
     kind = connection.type
     makers = {ODOMETRY: _add_pose, CAMERA_INFO: _add_info, IMAGE: _add_image, COMPRESSED: _add_image}
     makers |= dict.fromkeys(POSES, _add_pose)
@@ -125,7 +126,7 @@ def _make_handler(connection: Connection, topic: Topic, tf: TfRows, label: str) 
     except DecodeError as error:
         return partial(_refuse, str(error))
     if kind in TRANSFORMS:
-        return partial(_add_transforms, connection, decode, tf)
+        return partial(_add_transforms, connection, decode, tf.setdefault(namespace(connection.topic), TfRows()))
     if is_boxes(kind):
         return partial(_add_boxes, connection, topic, decode, label)
     return partial(makers[kind], connection, topic, decode)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from objslam.core.diagnostics import Ledger
 from objslam.errors import ConfigError
-from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, ODOMETRY, POSES, is_boxes
-from objslam.ros.topics import FROM_TF, LISTED, NONE, TF, Choices, warn_of_choice
+from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, ODOMETRY, POSES, TRANSFORMS, is_boxes
+from objslam.ros.topics import FROM_TF, LISTED, NONE, TF, TF_ROLES, Choices, warn_of_choice
 from objslam.sources.ros_bag.survey import Survey, Topic
 
 _DEPTH_ENCODINGS = ("16uc1", "32fc1")  # The encodings of depth images only. Grey images also have mono16.
@@ -73,6 +73,8 @@ def _fits(topic: Topic, role: str) -> bool:
         return (topic.type == ODOMETRY or topic.type in POSES) and bool(topic.poses)
     if role == "detections":
         return is_boxes(topic.type) and bool(topic.boxes.stamps)
+    if role in TF_ROLES:
+        return topic.type in TRANSFORMS
     if role == "camera_info":
         return topic.type == CAMERA_INFO and bool(topic.infos)
     return topic.type in IMAGES and topic.image is not None and _is_depth(topic) == (role == "depth")

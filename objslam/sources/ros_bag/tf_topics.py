@@ -1,0 +1,80 @@
+"""Choose the tf topics of one robot. Robots in namespaces often have frames of the same names, each on its own tf topic."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from objslam.ros.messages.poses import PoseRows
+from objslam.ros.messages.topic_types import TRANSFORMS
+from objslam.ros.tf.tree import TfRows
+from objslam.ros.topics import NONE, TF, TF_ROLES, namespace, warn_of_choice
+from objslam.sources.ros_bag.topic_roles import TopicPool, candidates
+
+_REPEATED = 0.5
+"""If both topics have this share of the samples of a transform, counted on the topic with fewer samples, one topic repeats
+the other, as a relay does. Otherwise they belong to two robots. It lies halfway between two robots, which hardly share a
+sample, and a relay, which shares nearly all. With a larger value, a relay that alters some samples counts as a robot."""
+
+
+def choose_transforms(pool: TopicPool) -> tuple[TfRows, frozenset[str]]:
+    """Return the transforms of one robot, and the names of the topics that have them.
+
+    All namespaces of tf topics are used, unless two of them have other samples of the same moving transform. Then the user's
+    choice (`--topic tf=...`) decides, else the namespace of the topics that the user chose for other roles, else that of the
+    first topic of odometry, boxes or images. A warning names the others.
+    """
+    by_space = pool.survey.tf
+    chosen = [name for role in TF_ROLES for name in pool.choices.of(role)]
+    taken = sorted({namespace(name) for name in chosen if name != NONE})
+    if not chosen:
+        for space in _by_priority(pool, by_space):
+            if not any(_differ(by_space[space], by_space[other]) for other in taken):
+                taken.append(space)
+        if left := sorted(by_space.keys() - set(taken)):
+            warn_of_choice(pool.ledger, TF, f"{taken[0]}/tf", (f"{space}/tf" for space in left))
+    transforms = (topic.name for topic in pool.survey.topics.values() if topic.type in TRANSFORMS)
+    names = frozenset(name for name in transforms if namespace(name) in taken)
+    return _merged([by_space[space] for space in taken]), names
+
+
+def _by_priority(pool: TopicPool, by_space: Mapping[str, TfRows]) -> list[str]:
+    """Return the namespaces, the robot's first: the longest that contains a topic of the robot."""
+    named = [name for (_, role), names in pool.choices.names.items() if role not in TF_ROLES for name in names]
+    named = [name for name in named if name not in (NONE, TF)]
+    found = [found[0].name for role in ("odometry", "detections", "image") if (found := candidates(pool.survey, role))]
+    robot = (named or found or [""])[0]
+    holds = {space: robot.startswith(f"{space}/") for space in by_space}
+    return sorted(by_space, key=lambda space: (not holds[space], -len(space) if holds[space] else 0, space))
+
+
+def _differ(one: TfRows, other: TfRows) -> bool:
+    """Return whether two namespaces give the same moving transform with other samples."""
+    return any(not _repeats(one.moving[pair], other.moving[pair]) for pair in one.moving.keys() & other.moving.keys())
+
+
+def _repeats(one: PoseRows, other: PoseRows) -> bool:
+    a, b = _samples(one), _samples(other)
+    return len(np.intersect1d(a, b)) >= _REPEATED * min(len(a), len(b))
+
+
+def _samples(rows: PoseRows) -> NDArray[np.void]:
+    """Return the different samples (N,) of a transform, each as the bytes of its stamp and pose."""
+    stamps, values = np.frombuffer(rows.stamps, dtype=np.int64), np.frombuffer(rows.values).reshape(-1, 7)
+    table = np.column_stack([stamps.view(np.float64), values])
+    return np.unique(table.view(np.dtype((np.void, table.strides[0])))[:, 0])
+
+
+def _merged(parts: Sequence[TfRows]) -> TfRows:
+    if len(parts) == 1:
+        return parts[0]
+    merged = TfRows()
+    for part in parts:
+        merged.refused.update(part.refused)
+        merged.static.update(part.static)
+        for pair, rows in part.moving.items():
+            into = merged.moving.setdefault(pair, PoseRows())
+            into.stamps.extend(rows.stamps)
+            into.logged.extend(rows.logged)
+            into.values.extend(rows.values)
+    return merged
