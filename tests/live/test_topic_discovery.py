@@ -63,6 +63,18 @@ def test_namespaces_are_chosen():
     assert TopicChoice(messages.chosen).wanted(offered, messages, True) == {"/robot1/tf", "/robot1/tf_static"}
 
 
+def test_a_chosen_topic_that_nobody_publishes_is_said_once_with_those_that_fit():
+    messages = RosMessages(Recorder(), RosOptions(topics=("detections=/boxes", "odometry=tf", "tf=/r1/tf", "depth=none")))
+    choice = TopicChoice(messages.chosen)
+    for _ in range(2):
+        choice.warn_of_absent(OFFERED, messages.ledger)
+    choice.warn_of_absent({}, messages.ledger)
+    assert messages.ledger.warnings == [
+        "--topic detections=/boxes: nobody publishes /boxes (topics that fit detections: /front/detections, /tags)",
+        "--topic tf=/r1/tf: nobody publishes /r1/tf (topics that fit tf: /tf, /tf_old, /tf_static)",
+    ]
+
+
 def test_one_of_several_is_taken_when_all_are_known_and_that_is_said():
     assert wanted(settled=False) == (ALWAYS | {"/front/detections", "/tags"}, [])
     _, warnings = wanted()

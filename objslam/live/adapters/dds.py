@@ -10,13 +10,12 @@ from objslam.live.dds.network import AUTO, LOOPBACK, Network, receive_buffer
 from objslam.live.dds.publications import MOST, Kind, Publication, Publications
 from objslam.live.dds.types import dds_topic, layouts_of, ros_topic, ros_type
 from objslam.live.ros.message_handler import RosMessages
-from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
+from objslam.live.ros.topic_discovery import HEAD_START, LONELY, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
 from objslam.ros.bag.records import Connection, plain
 from objslam.ros.message_limits import check_size
 from objslam.ros.messages.decode import DecodeError, make_decoder
 from objslam.ros.messages.topic_types import IMAGES, LATCHED, is_read
 
-_LONELY = 5.0  # The time without a matching publisher, s, after which the user is warned. A larger value warns later.
 _TAKE = 50
 """The most messages that are taken from one reader before the next reader's turn. With a larger number, a flood of one topic
 delays the other topics more, and each message costs a little less."""
@@ -226,7 +225,9 @@ class DdsAdapter:
 
     def _say_what_is_missing(self, age: float) -> None:
         now = time.monotonic()
-        if age > _LONELY and not self._readers:
+        if age > LONELY:
+            self.choice.warn_of_absent({p.topic: p.type for p in self._publications}, self.ledger)
+        if age > LONELY and not self._readers:
             more = f"; --interface {AUTO} searches the network; docs/live.md has a CYCLONEDDS_URI for ROS nodes on loopback"
             hint = more if self.network.where == LOOPBACK else ""
             where = f"{self.network.where}, domain {self.network.domain}{hint}"
@@ -235,7 +236,7 @@ class DdsAdapter:
             # The session's own tf is no publisher that a reader could be matched with.
             others = (p for p in self._publications if not p.own)
             present = any((p.topic, p.kind) == (reader.of.topic, reader.of.kind) for p in others)
-            if not reader.warned and present and now - reader.since > _LONELY:
+            if not reader.warned and present and now - reader.since > LONELY:
                 reader.warned = True
                 if not reader.entity.get_matched_publications():
                     self.ledger.warn(

@@ -8,7 +8,7 @@ from typing import Any
 
 from objslam.errors import ObjslamError
 from objslam.live.ros.message_handler import RosMessages
-from objslam.live.ros.topic_discovery import HEAD_START, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
+from objslam.live.ros.topic_discovery import HEAD_START, LONELY, LOOK_EVERY, QUEUE, STOP_WAIT, TopicChoice
 from objslam.ros.messages.topic_types import IMAGES, LATCHED
 
 _Kind = tuple[bool, bool]  # A QoS: whether it is reliable, and whether it is transient-local.
@@ -53,17 +53,20 @@ class RclpyAdapter:
                 now = time.monotonic()
                 if now - looked >= LOOK_EVERY:
                     looked = now
-                    self._look_around(node, settled=now - begin >= HEAD_START)
+                    self._look_around(node, now - begin)
                     self.messages.tick()
             executor.shutdown()
             node.destroy_node()
         finally:
             rclpy.shutdown(context=context)
 
-    def _look_around(self, node: Any, settled: bool) -> None:
-        """Subscribe to the wanted topics. Subscribe again if the QoS of their publishers has changed."""
+    def _look_around(self, node: Any, age: float) -> None:
+        """Subscribe to the wanted topics. Subscribe again if the QoS of their publishers has changed.
+
+        age: the time since the start, s.
+        """
         offered = {name: types[0] for name, types in node.get_topic_names_and_types() if types}
-        for topic in sorted(self.choice.wanted(offered, self.messages, settled)):
+        for topic in sorted(self.choice.wanted(offered, self.messages, settled=age >= HEAD_START)):
             type_ = offered[topic]
             profiles = [publisher.qos_profile for publisher in node.get_publishers_info_by_topic(topic)]
             if not profiles or type_ in self._unknown:
@@ -77,6 +80,8 @@ class RclpyAdapter:
                 node.destroy_subscription(old)
             entity = node.create_subscription(message, topic, partial(self._take, type_, topic), _profile(kind, type_))
             self._open[topic] = entity, kind
+        if age > LONELY:
+            self.choice.warn_of_absent(offered, self.ledger)
 
     def _message(self, type_: str) -> Any:
         from rosidl_runtime_py.utilities import get_message

@@ -3,14 +3,16 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from objslam.core.diagnostics import Ledger
 from objslam.live.ros.message_handler import RosMessages
 from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, ODOMETRY, POSES, TRANSFORMS, is_boxes
-from objslam.ros.topics import NONE, TF, Choices, closeness, warn_of_choice
+from objslam.ros.topics import LISTED, NONE, TF, TF_ROLES, Choices, closeness, warn_of_choice
 
 _NO_COLOUR = ("depth", "infra", "theora", "disparity")  # Words in the names of image topics without readable colour images.
 LOOK_EVERY = 0.2  # The time between two searches of an adapter for topics, s. A larger value finds a new topic later.
 HEAD_START = 1.0  # The time to find all publishers before one of several is chosen, s. A larger value starts sessions later.
 STOP_WAIT = 0.05  # The time until an adapter notices a stop, s. A smaller value wakes it more often without need.
+LONELY = 5.0  # The time without a publisher of a topic, s, after which a warning says so. A larger value warns later.
 QUEUE = 1000  # The most waiting messages of a topic, except images: 5 s of odometry at 200 Hz. A larger number costs memory.
 
 
@@ -20,6 +22,7 @@ class TopicChoice:
 
     chosen: Choices = field(default_factory=Choices)
     images: bool = False
+    _absent: set[str] = field(default_factory=set)
 
     def wanted(self, offered: Mapping[str, str], messages: RosMessages, settled: bool) -> set[str]:
         """Return the wanted topics. offered: the types of all topics, by name.
@@ -37,6 +40,15 @@ class TopicChoice:
         if settled and self.images and not self.chosen.of("image"):
             picked |= self._one("image", _colour(names, offered), messages)
         return picked
+
+    def warn_of_absent(self, offered: Mapping[str, str], ledger: Ledger) -> None:
+        """Warn once of each chosen topic that nobody publishes. The warning names the topics that fit its role."""
+        for (_, role), names in self.chosen.names.items():
+            for name in set(names) - {NONE, TF} - offered.keys() - self._absent:
+                self._absent.add(name)
+                fitting = sorted(topic for topic, type_ in offered.items() if _fits(role, type_))
+                listed = ", ".join(fitting[:LISTED]) or "none"
+                ledger.warn(f"--topic {role}={name}: nobody publishes {name} (topics that fit {role}: {listed})")
 
     def _plain(self, name: str, type_: str) -> bool:
         """Return whether a topic is wanted regardless of the other topics."""
@@ -64,6 +76,15 @@ class TopicChoice:
         if len(fitting) > 1:
             warn_of_choice(messages.ledger, role, first, (name for name in fitting if name != first))
         return {first}
+
+
+def _fits(role: str, type_: str) -> bool:
+    if role in TF_ROLES:
+        return type_ in TRANSFORMS
+    if role == "detections":
+        return is_boxes(type_)
+    types = {"odometry": (ODOMETRY,), "localization": (ODOMETRY, *POSES), "camera_info": (CAMERA_INFO,)}
+    return type_ in types.get(role, IMAGES)
 
 
 def _colour(names: list[str], offered: Mapping[str, str]) -> list[str]:
