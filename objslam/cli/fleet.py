@@ -210,5 +210,6 @@ def _say(found: FleetResult, summary: dict[str, Any]) -> None:
         say(f"{one.site}: {one.objects} objects ({one.gone} gone) from {sessions}{more}{state}")
     for failure in found.failures[:20]:
         say(f"failed ({failure.kind}): {failure.name}: {failure.error.removeprefix(f'{failure.name}: ')}", stderr=True)
-    say(f"{len(found.mapped)} logs mapped, {found.new} of them now, in {summary['seconds']:.0f} s")
+    logs = "log" if len(found.mapped) == 1 else "logs"
+    say(f"{len(found.mapped)} {logs} mapped, {found.new} of them now, in {summary['seconds']:.0f} s")
     say(f"wrote {summary['out']}")

@@ -1025,6 +1025,7 @@ def test_doctor_names_what_is_wrong_and_leaves_the_log_alone(objslam, tmp_path):
         right.out,
     )
     assert "base_T_camera is probably camera_T_base" in wrong.out
+    assert re.search(r"with base_T_camera inverted, \d+ % of the boxes fit instead of \d+ %", wrong.out)
     assert "the log as it is" in wrong.out
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 

@@ -16,6 +16,9 @@ from objslam.mapping.doubts.pairs import Pairs
 from objslam.mapping.doubts.splits import Splits
 
 _CLOSE = np.log(20.0)  # Log odds below this are called close. With larger odds, more are.
+_SURE = 1000
+"""Larger odds are said to be more than this, because the model of the boxes is not exact enough for a number. With a larger
+number, more odds are named."""
 _DISAGREE = 2.0
 """The rays of an object disagree if they pass it at more than this multiple of their noise (root mean square). With a larger
 number, fewer objects are said to have rays that disagree."""
@@ -203,9 +206,11 @@ def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> s
         case "chance":
             return ": as many rays of other boxes of this label would meet there by chance"
         case _:
-            odds = f"{np.exp(np.abs(groups.odds[g])):.1f} to 1 {'for' if groups.odds[g] > 0 else 'against'}"
-            odds = f"{'close, ' if abs(groups.odds[g]) < _CLOSE else ''}{odds}"
-            return f": their rays meet within {miss}, and the odds of an object are {odds}"
+            odds = min(float(np.exp(np.abs(groups.odds[g]))), _SURE)
+            number = f"more than {_SURE}" if odds == _SURE else f"{odds:.0f}" if odds >= 10 else f"{odds:.1f}"
+            close = "close, " if abs(groups.odds[g]) < _CLOSE else ""
+            side = "for" if groups.odds[g] > 0 else "against"
+            return f": their rays meet within {miss}, and the odds are {close}{number} to 1 {side} an object"
 
 
 def _frames(count: int) -> str:

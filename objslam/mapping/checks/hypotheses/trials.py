@@ -152,7 +152,7 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
     fit = f"{100 * best.share:.0f} % of the boxes fit instead of {100 * first.share:.0f} %"
     if _is_crooked(first) and best.straight is not None and best.straight > _STRAIGHT:
         fit += ", and the robot drives where it heads"
-    message = f"with {best.hypothesis.what} {fit}: {', or '.join(causes)}"
+    message = f"with {best.hypothesis.what}, {fit}: {', or '.join(causes)}"
     if taken:
         message += f". The run takes this error for {unusual}, and corrects it"
     return Finding(best.hypothesis.name, message, spoils=not taken, basis="log" if _is_crooked(first) else "boxes")
