@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from objslam.sources.summary import Contents, Timing
 
 _NUMERIC = ("messages", "Hz", "gap s", "from s", "to s")  # The right-aligned columns of numbers.
+_OTHER_CLOCK = 86400.0
+"""Header stamps that begin farther from the recording than this, s, are on another clock. The stamps of a simulation are
+decades off, and those of a robot whose clock is wrong mostly minutes. With a larger value, more clocks count as the same."""
 _SPARE = ("from s", "to s", "frame", "what", "gap s", "type")
 """The columns that are left out on a narrow terminal, in this order. `--json` has them all."""
 
@@ -84,11 +87,20 @@ def _show_bag(bag: BagInfo, part: Contents | None) -> None:
     parts = (("base frame", bag.base), ("odometry", bag.odometry), ("localisation", bag.localization))
     say("; ".join(f"{name} {value or 'none'}" for name, value in parts))
     topics = sorted(bag.topics, key=lambda topic: (not topic.role, topic.name))
+    other = {t.name: t.timing.start for t in topics if t.timing.count and abs(t.timing.start - bag.start) > _OTHER_CLOCK}
+    begins = {name: min(other.values()) for name in other}
     rows = [
-        (t.name, t.role, t.type.replace("/msg/", "/"), str(t.messages), *_numbers(t.timing, bag.start), t.frame, t.detail)
+        (
+            *(t.name, t.role, t.type.replace("/msg/", "/"), str(t.messages)),
+            *_numbers(t.timing, begins.get(t.name, bag.start)),
+            *(t.frame, t.detail),
+        )
         for t in topics
     ]
     _table(("topic", "role", "type", *_NUMERIC, "frame", "what"), rows)
+    if other:
+        clock = f"are on another clock than the recording (simulated time?), from {min(other.values()):.3f} s on"
+        say(f"the stamps of {', '.join(other)} {clock}")
     _show_cameras(bag.cameras)
     for place in bag.places:
         where = "moves" if place.base_T_frame is None else _place(place.base_T_frame)

@@ -114,7 +114,7 @@ def read_messages(recording: Recording, wanted: Wanted, reports: list[FileReport
     if recording.expected is not None and len(reports) == len(recording.files):
         gone = recording.expected - sum(report.messages + report.lost for report in reports)
         if gone > 0:
-            reports.append(FileReport(_METADATA, 0, gone, problems=[f"{_METADATA} counts {recording.expected} messages"]))
+            reports.append(FileReport(recording.name, 0, gone, recording.expected, of_folder=True))
 
 
 def _bag_file(path: Path) -> BagFile | None:

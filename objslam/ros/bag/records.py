@@ -27,7 +27,7 @@ Wanted = Callable[[Connection], bool]  # The function returns whether the caller
 
 @dataclass
 class FileReport:
-    """The result of reading one file."""
+    """The result of reading one file. of_folder: whether it is about the messages that no file of a folder has instead."""
 
     file: str
     messages: int = 0  # The number of messages read.
@@ -35,6 +35,7 @@ class FileReport:
     expected: int | None = None  # The message count that the file states, None if unknown.
     complete: bool = True  # False if an unknown number of messages is lost.
     problems: list[str] = field(default_factory=list)  # One text per kind of damage.
+    of_folder: bool = False
 
     def damage(self, problem: str, lost: int | None = None) -> None:
         """Add damage of the kind `problem`. lost: the number of messages that this damage lost, None if unknown."""
@@ -58,6 +59,8 @@ class FileReport:
         """Return the report as a list of at most one line. The list is empty for an intact file."""
         if not self.problems and not self.lost:
             return []
+        if self.of_folder:
+            return [f"{self.file}: {self.lost} messages are missing, because metadata.yaml counts {self.expected}"]
         known = f"at least {self.lost}" if self.lost else "an unknown number"
         why = "; ".join(self.problems) or "no reason seen"
         return [f"{self.file}: damaged, {self.messages} messages read, {self.lost if self.complete else known} lost: {why}"]

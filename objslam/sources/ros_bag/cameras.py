@@ -109,6 +109,10 @@ def build_camera(
         hint = f"give --topic {topics.name}.camera_info=/name, or --camera-info FILE"
         what = f"no CameraInfo belongs to this camera (frame {topics.frame!r})"
         raise LogError(what, where=f"camera {topics.name}", hint=hint)
+    if not topics.frame:
+        what = "its messages have no frame_id, so tf cannot place it on the robot"
+        hint = "set it to the optical frame of the camera, or give --camera-info FILE: base_T_camera with translation and "
+        raise LogError(what, where=f"camera {topics.name}", hint=hint + "rotation_xyzw")
     base_T_frame = tree.still(base, topics.frame)
     if base_T_frame is not None:
         return replace(camera, base_T_camera=base_T_frame @ correction), None

@@ -70,7 +70,6 @@ def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) ->
     ledger = Ledger()
     assembly = assemble(paths, ledger, options)
     survey, found, roles = assembly.survey, assembly.paths, _roles(assembly)
-    base = found.base if found else options.base_frame or ""
     logged = [np.frombuffer(topic.logged, dtype=np.int64) for topic in survey.topics.values()]
     return BagInfo(
         name=survey.recording.name,
@@ -81,11 +80,11 @@ def describe(paths: Path | Sequence[Path], options: BagOptions | None = None) ->
         messages=sum(report.messages for report in survey.reports),
         lost=sum(report.lost for report in survey.reports),
         topics=tuple(_topic_info(topic, roles.get(topic.name, "")) for _, topic in sorted(survey.topics.items())),
-        base=found.base if found else "",
+        base=assembly.base if found or assembly.tree.frames else "",
         odometry=found.odometry_from if found else "",
         localization=found.localization_from if found else "",
         cameras=tuple(camera for _, camera, _ in assembly.cameras),
-        places=camera_places(assembly.tree, base),
+        places=camera_places(assembly.tree, assembly.base),
         missing=_missing(assembly),
         damage=survey.damage(),
         warnings=tuple(ledger.lines()),

@@ -24,6 +24,7 @@ from objslam.ros.messages.decode import DecodeError, make_decoder, read_head
 from objslam.ros.messages.detections import boxes_of_points
 from objslam.ros.messages.images import DEPTH_SCALE, image_file
 from objslam.ros.messages.topic_types import IMAGES, is_tags
+from objslam.ros.tf.frames import find_base
 from objslam.ros.tf.tree import TfTree
 from objslam.ros.topics import parse_topics
 from objslam.sources.no_camera import NoCamera
@@ -48,15 +49,16 @@ Detection2DArray, AprilTag detections, or images with CameraInfo"""  # The advic
 class Assembly:
     """A recording after each topic got its role, for example the odometry or the images of a camera.
 
-    tree: the tree of tf. tf_topics: the names of its topics. paths: the robot's paths, None without any. cast: the topics of
-    every camera. cameras: the topics, the camera and its mount for each usable camera. The mount is base_T_camera over time,
-    None if the camera does not move.
+    tree: the tree of tf. tf_topics: the names of its topics. base: the base frame. paths: the robot's paths, None if absent.
+    cast: the topics of every camera. cameras: the topics, the camera and its mount for each usable camera. The mount is
+    base_T_camera over time, None if the camera does not move.
     problems: the errors that make a run impossible. left_out: the errors of the unusable cameras, if others are usable.
     """
 
     survey: Survey
     tree: TfTree
     tf_topics: frozenset[str]
+    base: str
     paths: Paths | None
     cast: tuple[CameraTopics, ...]
     cameras: tuple[tuple[CameraTopics, Camera, Trajectory | None], ...]
@@ -117,7 +119,7 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
     tree = TfTree(transforms, ledger)
     problems: list[LogError] = []
     found: Paths | None = None
-    base = options.base_frame or ""
+    base = find_base(tree.frames, options.base_frame, "")
     try:
         found = read_paths(pool, tree, options.base_frame)
         base = found.base
@@ -143,7 +145,21 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
             problems.append(NoCamera(message, where, _NO_BOXES, found.odometry, found.localization, known, logs))
     if not cameras:
         problems += refused
-    return Assembly(survey, tree, tf_topics, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ()))
+    _warn_of_unset_stamps(survey, found, cast, ledger)
+    return Assembly(
+        survey, tree, tf_topics, base, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ())
+    )
+
+
+def _warn_of_unset_stamps(survey: Survey, paths: Paths | None, cast: Sequence[CameraTopics], ledger: Ledger) -> None:
+    used = [survey.topics[name] for name in (paths.roles if paths else ())]
+    used += [topic for topics in cast for topic in (topics.detections, topics.image, topics.depth) if topic is not None]
+    for topic in used:
+        if topic.stamps and not any(topic.stamps):
+            ledger.warn(
+                f"{topic.name}: all header stamps are zero. The times of recording are used instead, and the delay of each "
+                "message makes them late"
+            )
 
 
 def _extract(assembly: Assembly, options: BagOptions, ledger: Ledger) -> dict[str, Images]:

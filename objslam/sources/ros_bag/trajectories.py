@@ -72,8 +72,10 @@ def read_paths(pool: TopicPool, tree: TfTree, base_frame: str | None) -> Paths:
     if topic is not None:
         paths = replace(paths, roles={topic.name: "odometry", **paths.roles})
     if paths.odometry is None and paths.localization is None:
+        odom = find_odom(tree.frames)
+        apart = f": tf has {odom!r}, but not its transform to {base!r}" if odom and base != odom else ""
         raise LogError(
-            "there is neither odometry nor localisation",
+            f"there is neither odometry nor localisation{apart}",
             where=pool.survey.recording.name,
             hint="record a nav_msgs/Odometry topic, tf from odom or map to base, or poses in map",
         )

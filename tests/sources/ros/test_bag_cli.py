@@ -60,6 +60,20 @@ def test_info_describes_the_part_that_is_asked_for(objslam, bag, log):
     assert part["part"] == [begin, None]
 
 
+def test_stamps_of_a_simulation_in_a_recording_by_the_wall_clock(objslam, rows, makers, tmp_path):
+    """Gazebo's clock starts at zero. Without --use-sim-time, `ros2 bag record` writes the times of the wall clock."""
+    late = 1_700_000_000 * 10**9
+    bag = write_bag(tmp_path / "sim", "mcap-none", makers["4"], [(topic, t + late, message) for topic, t, message in rows])
+    code, out, err = objslam("info", bag)
+    assert (code, err) == (0, "")
+    (line,) = [line for line in out.splitlines() if "on another clock" in line]
+    assert "/odom" in line
+    assert "/tf_static" not in line
+    (odometry,) = [line.split() for line in out.splitlines() if line.startswith("/odom ")]
+    assert float(odometry[6]) == 0.0
+    assert 0 < float(odometry[7]) < 1000
+
+
 def test_info_takes_the_same_choices_as_a_run(objslam, bag):
     _, out, _ = objslam("info", bag, "--topic", "odometry=/wheels/far/odom", "--topic", "detections=none")
     words = {line.split()[0]: line.split() for line in out.splitlines()}

@@ -327,7 +327,10 @@ def test_a_folder_tells_what_is_gone_by_its_metadata(tmp_path, makers, rows):
     info = describe(folder)
     assert info.messages + info.lost == COUNT
     assert info.messages > 0.45 * COUNT
-    assert any("pages are missing" in line for line in info.damage)
+    cut, gone = info.damage
+    assert "pages are missing" in cut
+    assert gone.startswith("drive: ")
+    assert gone.endswith(f"messages are missing, because metadata.yaml counts {COUNT}")
     (folder / "metadata.yaml").write_text("{")
     info = describe(folder)
     assert info.messages > 0.45 * COUNT

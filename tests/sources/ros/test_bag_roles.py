@@ -104,7 +104,10 @@ def test_times_of_recording_where_nobody_set_the_stamps(bag, makers, tmp_path):
     bag.rows = [row for row in bag.rows if "detections" not in row[0]]
     for t in range(1, 10):
         bag.add("/front/detections", t, makers["4"].detections(0, [(0, 1, 2, 3, "cup", 0.5)], _FRAME))
-    assert _read(bag, tmp_path).cameras[0].detections.frame_stamps.tolist() == list(range(1, 10))
+    ledger = Ledger()
+    assert _read(bag, tmp_path, ledger).cameras[0].detections.frame_stamps.tolist() == list(range(1, 10))
+    (warning,) = ledger.warnings
+    assert warning.startswith("/front/detections: all header stamps are zero. The times of recording are used instead")
 
 
 def test_base_is_what_the_odometry_moves_unless_it_is_given(bag, tmp_path):
@@ -390,6 +393,22 @@ def test_what_is_missing_is_named(bag, tmp_path, without, message):
     with pytest.raises(LogError, match=message):
         read_bag(path, Ledger())
     assert any(message.split(".*")[0] in line for line in describe(path).missing)
+
+
+def test_a_map_without_odometry_in_tf_is_named_and_the_base_is_still_found(makers, tmp_path):
+    bag = Bag(makers["4"]).tf("base_link", _FRAME, _OPTICAL, static=True).camera().boxes()
+    info = describe(bag.tf("map", "odom", _correction, times=range(11)).write(tmp_path))
+    (line,) = info.missing
+    assert "neither odometry nor localisation: tf has 'odom', but not its transform to 'base_link'" in line
+    assert info.base == "base_link"
+    np.testing.assert_allclose(info.cameras[0].base_T_camera, _OPTICAL, atol=1e-12)
+
+
+def test_boxes_without_a_frame_say_so(makers, tmp_path):
+    bag = Bag(makers["4"]).odometry().tf("base_link", _FRAME, _OPTICAL, static=True).camera(frame="").boxes(frame="")
+    with pytest.raises(LogError, match="its messages have no frame_id, so tf cannot place it") as caught:
+        _read(bag, tmp_path)
+    assert "--camera-info" in caught.value.hint
 
 
 def test_stamps_that_go_back_are_dropped(bag, makers, tmp_path):
