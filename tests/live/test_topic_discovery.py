@@ -63,6 +63,47 @@ def test_namespaces_are_chosen():
     assert TopicChoice(messages.chosen).wanted(offered, messages, True) == {"/robot1/tf", "/robot1/tf_static"}
 
 
+def _of_robots(*robots):
+    types = {
+        "tf": OFFERED["/tf"],
+        "tf_static": OFFERED["/tf"],
+        "odom": OFFERED["/odom"],
+        "nn/boxes": OFFERED["/front/detections"],
+    }
+    return {f"/{robot}/{name}": type_ for robot in robots for name, type_ in types.items()}
+
+
+@pytest.mark.parametrize(
+    ("choices", "robot"),
+    [
+        ((), "r1"),
+        (("odometry=/r2/odom",), "r2"),
+        (("tf=/r2/tf", "tf_static=/r2/tf_static", "odometry=/r2/odom"), "r2"),
+    ],
+)
+def test_of_several_robots_all_topics_of_one_are_taken(choices, robot):
+    """They have frames of the same names. The second robot may be the first that is heard."""
+    messages = RosMessages(Recorder(), RosOptions(topics=choices))
+    choice = TopicChoice(messages.chosen)
+    if not choices:
+        assert choice.wanted(_of_robots("r2"), messages, settled=False) == set()
+    offered = {**_of_robots("r2", "r1"), "/camera_info": OFFERED["/front/camera_info"]}
+    assert choice.wanted(offered, messages, settled=True) == {*_of_robots(robot), "/camera_info"}
+    other = "r1" if robot == "r2" else "r2"
+    said = f"several fit tf: /{robot}/tf is taken, not /{other}/tf (--topic tf=... chooses)"
+    assert (said in messages.ledger.warnings) == (choices[:1] != ("tf=/r2/tf",))
+
+
+def test_one_robot_in_a_namespace_needs_no_choice_and_one_that_starts_later_changes_nothing():
+    messages = RosMessages(Recorder())
+    choice = TopicChoice()
+    assert choice.wanted(_of_robots("robot9"), messages, settled=True) == set(_of_robots("robot9"))
+    assert not messages.ledger.warnings
+    assert choice.wanted(_of_robots("r1", "robot9"), messages, settled=True) == set(_of_robots("robot9"))
+    both = {**_of_robots("r1"), "/tf": OFFERED["/tf"]}  # a relay, or transforms in both
+    assert choice.wanted(both, messages, settled=True) == set(both)
+
+
 def test_a_chosen_topic_that_nobody_publishes_is_said_once_with_those_that_fit():
     messages = RosMessages(Recorder(), RosOptions(topics=("detections=/boxes", "odometry=tf", "tf=/r1/tf", "depth=none")))
     choice = TopicChoice(messages.chosen)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from objslam.core.diagnostics import Ledger
 from objslam.live.ros.message_handler import RosMessages
 from objslam.ros.messages.topic_types import CAMERA_INFO, COMPRESSED, IMAGES, ODOMETRY, POSES, TRANSFORMS, is_boxes
-from objslam.ros.topics import LISTED, NONE, TF, TF_ROLES, Choices, closeness, warn_of_choice
+from objslam.ros.topics import LISTED, NONE, TF, TF_ROLES, Choices, closeness, namespace, warn_of_choice
 
 _NO_COLOUR = ("depth", "infra", "theora", "disparity")  # Words in the names of image topics without readable colour images.
 LOOK_EVERY = 0.2  # The time between two searches of an adapter for topics, s. A larger value finds a new topic later.
@@ -23,13 +23,16 @@ class TopicChoice:
     chosen: Choices = field(default_factory=Choices)
     images: bool = False
     _absent: set[str] = field(default_factory=set)
+    _robot: str = ""
 
     def wanted(self, offered: Mapping[str, str], messages: RosMessages, settled: bool) -> set[str]:
         """Return the wanted topics. offered: the types of all topics, by name.
 
         settled: whether probably all topics are known. Only then, if the user did not choose, one topic is chosen for the
-        odometry (the shortest name) and one for the images (`_colour`). A warning names the other topics that fit.
+        odometry (the shortest name) and one for the images (`_colour`). A warning names the other topics that fit. Topics of
+        other robots are left out.
         """
+        offered = self._of_one_robot(offered, messages.ledger, settled)
         names = sorted(offered, key=lambda name: (len(name), name))
         picked = {name for name in names if self._plain(name, offered[name])}
         if settled and not self.chosen.of("odometry"):
@@ -40,6 +43,30 @@ class TopicChoice:
         if settled and self.images and not self.chosen.of("image"):
             picked |= self._one("image", _colour(names, offered), messages)
         return picked
+
+    def _of_one_robot(self, offered: Mapping[str, str], ledger: Ledger, settled: bool) -> Mapping[str, str]:
+        """Return the topics without those of other robots.
+
+        If each tf topic is in a namespace, each of these namespaces is a robot. Two may have frames of the same names.
+        Then the namespaces of the tf topics that the user chose are used. Without such a choice, the first with a topic that
+        the user chose is used, else the one with the shortest name. Until all is settled, none of them is used.
+        """
+        chosen = [name for role in TF_ROLES for name in self.chosen.of(role)]
+        spaces = {namespace(name) for name, type_ in offered.items() if type_ in TRANSFORMS and _leaf(name) in TF_ROLES}
+        robots = sorted(spaces, key=lambda space: (len(space), space))
+        if "" in robots or not robots or (chosen and NONE in chosen):
+            return offered
+        mine = {namespace(name) for name in chosen}
+        if not mine and settled:
+            named = [name for names in self.chosen.names.values() for name in names]
+            holds = [space for space in robots if any(name.startswith(f"{space}/") for name in named)]
+            self._robot = self._robot or next(iter(holds or robots))
+            mine = {self._robot}
+            if len(robots) > 1:
+                others = (f"{space}/tf" for space in robots if space not in mine)
+                warn_of_choice(ledger, TF, f"{self._robot}/tf", others)
+        left = [space for space in robots if space not in mine]
+        return {name: type_ for name, type_ in offered.items() if not any(name.startswith(f"{space}/") for space in left)}
 
     def warn_of_absent(self, offered: Mapping[str, str], ledger: Ledger) -> None:
         """Warn once of each chosen topic that nobody publishes. The warning names the topics that fit its role."""
@@ -53,7 +80,7 @@ class TopicChoice:
     def _plain(self, name: str, type_: str) -> bool:
         """Return whether a topic is wanted regardless of the other topics."""
         if type_ in TRANSFORMS:
-            last = name.rpartition("/")[2]
+            last = _leaf(name)
             return last in ("tf", "tf_static") and self._allows(last, name, default=True)
         if is_boxes(type_):
             return self._allows("detections", name, default=not self.images)
@@ -76,6 +103,10 @@ class TopicChoice:
         if len(fitting) > 1:
             warn_of_choice(messages.ledger, role, first, (name for name in fitting if name != first))
         return {first}
+
+
+def _leaf(name: str) -> str:
+    return name.rpartition("/")[2]
 
 
 def _fits(role: str, type_: str) -> bool:

@@ -23,7 +23,7 @@ from objslam.ros.bag.records import Connection, FileReport
 from objslam.ros.messages.decode import DecodeError, make_decoder, read_head
 from objslam.ros.messages.detections import boxes_of_points
 from objslam.ros.messages.images import DEPTH_SCALE, image_file
-from objslam.ros.messages.topic_types import IMAGES, is_tags
+from objslam.ros.messages.topic_types import IMAGES, TRANSFORMS, is_tags
 from objslam.ros.tf.frames import find_base
 from objslam.ros.tf.tree import TfTree
 from objslam.ros.topics import parse_topics
@@ -32,7 +32,7 @@ from objslam.sources.ros_bag.cameras import CameraTopics, build_camera, find_cam
 from objslam.sources.ros_bag.options import BagOptions
 from objslam.sources.ros_bag.places import camera_places
 from objslam.sources.ros_bag.survey import Survey, take_survey
-from objslam.sources.ros_bag.tf_topics import choose_transforms
+from objslam.sources.ros_bag.tf_topics import choose_robot
 from objslam.sources.ros_bag.topic_roles import TopicPool, check_choices
 from objslam.sources.ros_bag.trajectories import Paths, read_paths
 
@@ -114,8 +114,8 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
     for topic in survey.topics.values():
         for reason, count in topic.refused.items():
             ledger.drop(f"message that cannot be used: {reason}", count, topic.name)
-    pool = TopicPool(survey, choices, ledger)
-    transforms, tf_topics = choose_transforms(pool)
+    transforms, pool = choose_robot(TopicPool(survey, choices, ledger))
+    tf_topics = frozenset(topic.name for topic in pool.survey.topics.values() if topic.type in TRANSFORMS)
     tree = TfTree(transforms, ledger)
     problems: list[LogError] = []
     found: Paths | None = None

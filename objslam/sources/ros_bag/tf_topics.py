@@ -1,6 +1,7 @@
 """Choose the tf topics of one robot. Robots in namespaces often have frames of the same names, each on its own tf topic."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from objslam.ros.messages.poses import PoseRows
 from objslam.ros.messages.topic_types import TRANSFORMS
 from objslam.ros.tf.tree import TfRows
 from objslam.ros.topics import NONE, TF, TF_ROLES, namespace, warn_of_choice
+from objslam.sources.ros_bag.survey import Topic
 from objslam.sources.ros_bag.topic_roles import TopicPool, candidates
 
 _REPEATED = 0.5
@@ -17,14 +19,14 @@ the other, as a relay does. Otherwise they belong to two robots. It lies halfway
 sample, and a relay, which shares nearly all. With a larger value, a relay that alters some samples counts as a robot."""
 
 
-def choose_transforms(pool: TopicPool) -> tuple[TfRows, frozenset[str]]:
-    """Return the transforms of one robot, and the names of the topics that have them.
+def choose_robot(pool: TopicPool) -> tuple[TfRows, TopicPool]:
+    """Return the transforms of one robot, and the topics without those of other robots.
 
     All namespaces of tf topics are used, unless two of them have other samples of the same moving transform. Then the user's
     choice (`--topic tf=...`) decides, else the namespace of the topics that the user chose for other roles, else that of the
-    first topic of odometry, boxes or images. A warning names the others.
+    first topic of odometry, boxes or images. A warning names the others. Topics that the user chose always stay.
     """
-    by_space = pool.survey.tf
+    by_space, topics = pool.survey.tf, pool.survey.topics
     chosen = [name for role in TF_ROLES for name in pool.choices.of(role)]
     taken = sorted({namespace(name) for name in chosen if name != NONE})
     if not chosen:
@@ -33,9 +35,16 @@ def choose_transforms(pool: TopicPool) -> tuple[TfRows, frozenset[str]]:
                 taken.append(space)
         if left := sorted(by_space.keys() - set(taken)):
             warn_of_choice(pool.ledger, TF, f"{taken[0]}/tf", (f"{space}/tf" for space in left))
-    transforms = (topic.name for topic in pool.survey.topics.values() if topic.type in TRANSFORMS)
-    names = frozenset(name for name in transforms if namespace(name) in taken)
-    return _merged([by_space[space] for space in taken]), names
+    named = {name for names in pool.choices.names.values() for name in names}
+    mine = {name: topic for name, topic in topics.items() if name in named or _space_of(topic, by_space) in (None, *taken)}
+    return _merged([by_space[space] for space in taken]), replace(pool, survey=replace(pool.survey, topics=mine))
+
+
+def _space_of(topic: Topic, spaces: Iterable[str]) -> str | None:
+    """Return the namespace of tf that a topic is in, None for a topic in no namespace."""
+    if topic.type in TRANSFORMS:
+        return namespace(topic.name)
+    return max((space for space in spaces if space and topic.name.startswith(f"{space}/")), key=len, default=None)
 
 
 def _by_priority(pool: TopicPool, by_space: Mapping[str, TfRows]) -> list[str]:

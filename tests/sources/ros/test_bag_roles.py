@@ -214,28 +214,36 @@ def test_of_several_that_fit_one_is_taken_and_all_are_listed(bag, tmp_path):
     assert not ledger.lines()
 
 
+def _moved(shift):
+    return make_pose(np.eye(3), np.array([shift, 0, 0]))
+
+
 def _robot(maker, space, shift):
-    """A robot in a namespace, whose frames have the names of any other robot. Its map lies `shift` m from its odometry."""
-    bag = Bag(maker).odometry().camera().boxes().tf("base_link", _FRAME, _OPTICAL, static=True)
-    correction = make_pose(np.eye(3), np.array([shift, 0, 0]))
-    bag.tf("map", "odom", lambda t: correction @ make_pose(np.eye(3), np.array([0, t, 0])), times=range(11))
-    bag.tf("odom", "base_link", lambda t: _drive(t)[0], times=range(11))
+    """A robot in a namespace, whose frames have the names of any other robot.
+
+    Its map lies `shift` m from its odometry, which begins `shift` m from its start.
+    """
+    bag = Bag(maker).odometry(move=lambda pose: _moved(shift) @ pose).camera().boxes(label=space[1:])
+    bag.tf("base_link", _FRAME, _OPTICAL, static=True)
+    bag.tf("map", "odom", lambda t: _moved(shift) @ make_pose(np.eye(3), np.array([0, t, 0])), times=range(11))
+    bag.tf("odom", "base_link", lambda t: _moved(shift) @ _drive(t)[0], times=range(11))
     return [(space + topic, stamp, message) for topic, stamp, message in bag.rows]
 
 
-@pytest.mark.parametrize(("topics", "shift"), [((), 3), (("odometry=/r2/odom",), 8), (("tf=/r2/tf",), 8)])
-def test_robots_in_namespaces_do_not_share_their_transforms(makers, tmp_path, topics, shift):
+@pytest.mark.parametrize(("topics", "robot"), [((), 1), (("odometry=/r2/odom",), 2), (("tf=/r2/tf",), 2)])
+def test_robots_in_namespaces_do_not_share_their_topics(makers, tmp_path, topics, robot):
     bag = Bag(makers["4"])
     bag.rows = _robot(makers["4"], "/r1", 3) + _robot(makers["4"], "/r2", 8)
     ledger = Ledger()
     log = _read(bag, tmp_path, ledger, topics=topics)
-    expected = _drive(range(11))[:, 0, 3] + shift
-    np.testing.assert_allclose(log.localization.poses[:, 0, 3], expected, atol=1e-9)
-    taken, other = ("/r1", "/r2") if shift == 3 else ("/r2", "/r1")
-    warning = f"several fit tf: {taken}/tf is taken, not {other}/tf (--topic tf=... chooses)"
-    assert (warning in ledger.warnings) is not any("tf=" in topic for topic in topics)
-    used = {topic.name for topic in describe(bag.write(tmp_path), BagOptions(topics=topics)).topics if "tf" in topic.role}
-    assert used == {f"{taken}/tf", f"{taken}/tf_static"}
+    shift, other = (3, 2) if robot == 1 else (8, 1)
+    np.testing.assert_allclose(log.odometry.poses[:, 0, 3], _drive(range(11))[:, 0, 3] + shift, atol=1e-9)
+    np.testing.assert_allclose(log.localization.poses[:, 0, 3], _drive(range(11))[:, 0, 3] + 2 * shift, atol=1e-9)
+    assert [camera.detections.label_names for camera in log.cameras] == [(f"r{robot}",)]
+    warning = f"several fit tf: /r{robot}/tf is taken, not /r{other}/tf (--topic tf=... chooses)"
+    assert ledger.warnings == ([] if "tf=/r2/tf" in topics else [warning])
+    used = {topic.name for topic in describe(bag.write(tmp_path), BagOptions(topics=topics)).topics if topic.role}
+    assert used == {name for name, *_ in bag.rows if name.startswith(f"/r{robot}/")}
 
 
 def test_transforms_of_one_robot_on_several_topics_belong_together(makers, tmp_path):
@@ -243,7 +251,7 @@ def test_transforms_of_one_robot_on_several_topics_belong_together(makers, tmp_p
     rows = _robot(makers["4"], "/r1", 3)
     relay = [("/tf", stamp, message) for topic, stamp, message in rows if topic == "/r1/tf"][::2]
     apart = [("/tf_static" if "static" in topic else topic, stamp, message) for topic, stamp, message in rows]
-    bag, expected = Bag(makers["4"]), _drive(range(11))[:, 0, 3] + 3
+    bag, expected = Bag(makers["4"]), _drive(range(11))[:, 0, 3] + 6
     for bag.rows in (rows + relay, apart):
         ledger = Ledger()
         np.testing.assert_allclose(_read(bag, tmp_path, ledger).localization.poses[:, 0, 3], expected, atol=1e-9)
