@@ -172,3 +172,10 @@ def test_rgbd_uses_depth_with_fixed_poses_too(drive_with_depth: Log) -> None:
     result = run(drive_with_depth, settings("rgbd.yaml", "mode=fixed"), Ledger())
     plain = run(drive_with_depth, settings("rgbd.yaml", "mode=fixed", "depth.use=false"), Ledger())
     assert rmse(result, drive_with_depth) < rmse(plain, drive_with_depth)
+
+
+def test_the_models_that_headers_name_are_there():
+    """A header shows a command to type in a checkout."""
+    named = {path for file in CONFIGS.glob("*.yaml") for path in re.findall(r"--detector (objslam/\S+)", file.read_text())}
+    assert named
+    assert all((CONFIGS.parent / path).is_file() for path in named)
