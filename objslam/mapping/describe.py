@@ -3,6 +3,7 @@
 import importlib.metadata
 import platform
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -215,13 +216,14 @@ def summarise(
         "cost_after": estimate.cost_after,
         "iterations": estimate.iterations,
         "seconds": seconds,
-        "versions": _versions(),
+        "versions": dict(_versions()),
         "warnings": ledger.lines(),
     }
 
 
+@cache
 def _versions() -> dict[str, str]:
-    """Return the versions of Python and of the installed packages that can change a result."""
+    """Return the versions of Python and of the installed packages that can change a result. They are looked up once."""
     found = {"python": platform.python_version()}
     for package in ("objslam", "gtsam", "torch", "numpy", "opencv-python-headless", "open3d"):
         with suppress(importlib.metadata.PackageNotFoundError):

@@ -8,7 +8,7 @@ rays together. So poses that show several things reveal how uneven the ground is
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import combinations_with_replacement, product
 from typing import Self
 
 import numpy as np
@@ -103,16 +103,32 @@ class _Poses:
         logarithms: (3,) of three numbers: the factor on the noise of rays, the tilt, rad, and the height, m. alike: (K, K)
         the correlation of the errors of two poses, None if they are independent. SolveError if the system is not finite.
         """
+        return self.solved(logarithms, None if alike is None else self.independent(alike))
+
+    def independent(self, alike: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return what of `solve` depends on the correlation (K, K) of the errors of two poses alone.
+
+        All poses become one, in which the errors of each kind are sums of independent numbers. Returned are the factors
+        (K, K) of these numbers, and `_told` (n, 1 + P, K) and `shared` (n, n, K, K) of them.
+        """
+        root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(alike)))
+        count = len(self._shared)
+        shared = np.empty((count, count, *root.shape))
+        for i, j in combinations_with_replacement(range(count), 2):
+            shared[i, j] = shared[j, i] = root.T @ (self._shared[i, j, :, None] * root)
+        return root, self._told @ root, shared
+
+    def solved(self, logarithms: Floats, independent: tuple[Floats, Floats, Floats] | None) -> tuple[float, Floats, Floats]:
+        """Return the same as `solve`. independent: of the method of this name, None if the errors of poses are new in each."""
         factor, tilt, height = np.exp(logarithms)
         sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[: self.pulled.shape[1]] / factor
-        if alike is None:
+        if independent is None:
             white, logarithm, back = _of_each(
                 self._shared * np.outer(sigma, sigma)[..., None], self._told * sigma[:, None, None]
             )
-        else:  # All poses become one, in which the errors of each kind are sums of independent numbers.
-            root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(alike)))
-            told = sigma[:, None, None] * (self._told @ root)
-            inner = np.outer(sigma, sigma)[..., None, None] * (root.T @ (self._shared[:, :, :, None] * root))
+        else:
+            root, told, inner = independent
+            told, inner = sigma[:, None, None] * told, np.outer(sigma, sigma)[..., None, None] * inner
             count = told.shape[0] * told.shape[2]
             inner = inner.swapaxes(1, 2).reshape(count, count)
             white, logarithm, back = _of_all(inner, told.swapaxes(1, 2).reshape(count, -1))
@@ -124,7 +140,7 @@ class _Poses:
         cost = squares + logarithm + np.linalg.slogdet(total)[1]
         cost += 2 * (self.rays - len(found)) * logarithms[0] + self.prior * (2 * logarithms[0] + factor**-2.0)
         errors = back(white[:, 0] - white[:, 1:] @ found).reshape(len(sigma), -1)
-        if alike is not None:
+        if independent is not None:
             errors = errors @ root.T
         return float(cost), found, (sigma[:, None] * errors).T
 
@@ -181,9 +197,9 @@ class CommonTilt:
         gaps = np.abs(stamps[:, None] - stamps)
         tried = [(sums.solve(self.logarithms)[0], 0.0, 1.0)]
         for seconds in _TIMES:
-            alike = np.exp(-gaps / seconds)
+            independent = sums.independent(np.exp(-gaps / seconds))  # All tried sizes share it.
             larger = [self.logarithms + np.log([1.0, times, times]) for times in _LARGER]
-            costs = [sums.solve(logarithms, alike)[0] for logarithms in larger]
+            costs = [sums.solved(logarithms, independent)[0] for logarithms in larger]
             tried += [(cost, seconds, times) for cost, times in zip(costs, _LARGER, strict=True)]
         _, seconds, times = min(tried)
         return replace(self.ground, tilt=self.ground.tilt * times, height=self.ground.height * times, seconds=seconds)
