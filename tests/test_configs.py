@@ -45,12 +45,12 @@ def test_each_comes_with_the_package_and_is_taken_by_its_name(tmp_path: Path, mo
 
 @pytest.fixture(scope="module")
 def drive() -> Log:
-    return simulate(preset("demo", frames=250), 0)
+    return simulate(preset("demo", frames=200), 0)
 
 
 @pytest.fixture(scope="module")
 def drive_with_depth() -> Log:
-    return simulate(preset("demo", frames=250, depth=DepthNoise()), 0)
+    return simulate(preset("demo", frames=200, depth=DepthNoise()), 0)
 
 
 def settings(name: str, *overrides: str) -> Settings:
@@ -101,7 +101,7 @@ def test_no_page_takes_ready_settings_by_a_path_that_only_a_checkout_has() -> No
 @pytest.fixture(scope="module")
 def drive_among_tags() -> Log:
     """Every object has a label of its own."""
-    return simulate(preset("demo", frames=250, classes=12), 0)
+    return simulate(preset("demo", frames=200, classes=12), 0)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -159,7 +159,7 @@ def test_several_objects_of_a_label(tmp_path):
 def hall():
     """60 objects of 5 labels in 16 x 12 m: by dead reckoning the robot comes back metres beside where it was."""
     room = {"room": (16.0, 12.0), "path": (2, 3), "objects": 60, "classes": 5, "laps": None, "min_view_share": 0.01}
-    rates = {"frames": 1200, "frame_rate": 10.0, "odometry_rate": 50.0, "speed": 0.8}
+    rates = {"frames": 600, "frame_rate": 5.0, "odometry_rate": 50.0, "speed": 0.8}
     return simulate(preset("large", localization=None, odometry=Odometry(), **room, **rates), 5)
 
 
@@ -202,14 +202,14 @@ def test_a_hall_of_objects_that_look_alike_from_odometry_alone(hall):
 
 
 def test_a_crowd_of_one_label_does_no_harm():
-    """9,900 boxes of a label in every tenth frame, in a room where labels do not tell objects apart."""
+    """3,900 boxes of a label in every thirtieth frame, in a room where labels do not tell objects apart."""
     log = simulate(preset("demo", frames=150), 1)
-    session = drive(crowded(log, np.arange(0, 150, 10), 9_900))
+    session = drive(crowded(log, np.arange(0, 150, 30), 3_900))
     found = [o for o in session.stop().map.resolved() if o.label != "leaf"]
     dropped = session.counters.dropped()
     beyond = dropped["boxes beyond the 1000 surest of their label in a frame"]
-    assert beyond + dropped[PARTS] == 15 * 8900  # A few boxes lie on others, as a second box of one thing does.
-    assert session.counters.accepted()["tracks given up"] > 10 * 800  # most tracks do not become landmarks
+    assert beyond + dropped[PARTS] == 5 * 2900  # A few boxes lie on others, as a second box of one thing does.
+    assert session.counters.accepted()["tracks given up"] > 4 * 800  # most tracks do not become landmarks
     true = [(o.label, o.position) for o in log.truth.objects]
     near = [min(np.linalg.norm(o.position - p) for label, p in true if label == o.label) for o in found]
     assert len(found) >= 11
@@ -350,7 +350,7 @@ def test_growth_is_bounded_where_objects_are_too_many_for_it(hall):
     snapshot = session.snapshot()
     session.abort()
     assert len(snapshot.path) <= 1.35 * 120
-    assert snapshot.keyframes > 1000
+    assert snapshot.keyframes > 500
     assert 55 <= len(snapshot.map.resolved()) <= 65
     assert snapshot.counters["merged objects"] > 0  # the maintenance had time for other tasks
 

@@ -52,7 +52,7 @@ def test_wrong_labels_and_other_errors_hide_neither_turns_nor_clock():
 
 def test_tracks_show_the_bias_of_a_gyroscope():
     log, true = robot(5008, "gyro")
-    values = found(begin(without_names(part(log, 0.0, 250.0))))  # Two thirds of the drive.
+    values = found(begin(without_names(part(log, 0.0, 150.0))))  # Two fifths of the drive.
     assert true[TURN_BIAS] < -0.006  # rad/s
     assert values[TURN_BIAS] == pytest.approx(true[TURN_BIAS], abs=0.002)
     assert values[CLOCK] == pytest.approx(true[CLOCK], abs=0.015)  # s
@@ -77,7 +77,7 @@ def test_a_log_without_tracks_keeps_what_is_expected():
 
 
 def test_turns_that_are_held_stay():
-    log = part(add_shared_errors(drive(), {TURN_SCALE: 0.08}), 0.0, 15.0)
+    log = part(add_shared_errors(drive(), {TURN_SCALE: 0.08}), 0.0, 8.0)
     assert TURN_SCALE not in found(begin(log, "calibration.turn_scale=0"))
     state = begin(log, "calibration.use=false")
     assert with_errors_of_tracks(state)[0] is state

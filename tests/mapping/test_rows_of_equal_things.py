@@ -36,9 +36,9 @@ def shelf(yaw: float = 0.0, pixels: float = 0.5) -> tuple[Log, np.ndarray]:
     way = np.where(there, 0.2 * stamps, 7.6 - 0.2 * stamps)
     away = -0.5 * np.clip((stamps - 17.0) / 4.0, 0.0, 1.0)
     path = lift_se2(np.stack([way, away, np.zeros_like(stamps)], axis=1))
-    taken = stamps[::4]
+    taken = stamps[::6]
     frame, boxes, label = [], [], []
-    for number, pose in enumerate(path[::4]):
+    for number, pose in enumerate(path[::6]):
         in_camera = np.linalg.inv(pose @ true.base_T_camera)
         at = places @ in_camera[:3, :3].T + in_camera[:3, 3]
         ahead = at[:, 2] > 0.1

@@ -114,6 +114,7 @@ def test_frames_off_the_path_are_left_to_the_run(noise):
     assert with_sparse_noise(log, said, accused(), Ledger(), silent) == (said, accused())
 
 
+@pytest.mark.usefixtures("few_tried")
 def test_boxes_without_a_ray_are_no_street():
     street = simulate_street(2)
     cameras = [
