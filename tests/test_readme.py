@@ -27,6 +27,7 @@ import objslam
 from objslam import ObjectMap
 from objslam.cli.commands import build_app
 from objslam.config import Settings, load_settings
+from objslam.mapping import joint_solve
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -142,13 +143,14 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(ROOT / "configs", folder / "configs")
-    with chdir(folder):
+    with chdir(folder), pytest.MonkeyPatch.context() as patch:
         for kind, text in steps():
             done = typed(kind, text)
             assert done.code == 0, f"{text}\n{done.out}\n{done.err}"
             assert "Traceback" not in done.err
             if text.startswith("objslam demo --boxes"):
                 thinned(folder / "demo_boxes" / "log" / "detections.jsonl")
+                patch.setattr(joint_solve, "_unclear", lambda state: False)  # As `one_start` does.
     return folder
 
 

@@ -93,7 +93,7 @@ def test_rows_of_equal_objects_in_maps_of_uncertain_size_match_their_partners():
     """Five rows of three equal objects, 17 cm apart. A size that is 3 % wrong moves far objects by nearly as much."""
     rng, right = np.random.default_rng(4), []
     shared = np.diag(np.array([0.05, 0.05, 0, 0, 0, 0.02, 0.03]) ** 2)
-    for own in np.repeat([0.02, 0.03], 60):
+    for own in np.repeat([0.02, 0.03], 40):
         turn, step = rng.uniform(0, np.pi, 5), 0.17 * (np.arange(3) - 1)
         rows = rng.uniform(-4, 4, (5, 1, 2)) + step[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, None]
         points, spread = np.column_stack([rows.reshape(-1, 2), np.zeros(15)]), np.array([own, own, 0.01])
@@ -105,5 +105,5 @@ def test_rows_of_equal_objects_in_maps_of_uncertain_size_match_their_partners():
         found = register_maps(a, b, shared, shared)
         if found.accepted:
             right.append(np.array_equal(found.matches[:, 0], found.matches[:, 1]))
-    assert len(right) > 40
+    assert len(right) > 26
     assert np.mean(right) > 0.95, np.mean(right)  # 0.76 if the matches of each object are judged alone.

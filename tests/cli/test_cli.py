@@ -978,7 +978,7 @@ def test_a_calibration_of_before_is_no_news(objslam, tmp_path, late_camera):
 
 
 def test_calibrate_in_joint_mode_needs_no_odometry(objslam, tmp_path):
-    log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
+    log = simulate(preset("demo", objects=8, classes=8, frames=120, odometry=None), 1)
     write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / "log")
     file = tmp_path / "robot.yaml"
     done = objslam("calibrate", str(tmp_path / "log"), "-o", str(file))
@@ -989,7 +989,7 @@ def test_calibrate_in_joint_mode_needs_no_odometry(objslam, tmp_path):
 
 
 def test_calibrate_at_known_poses_and_run_with_what_it_found(objslam, tmp_path):
-    log = simulate(preset("demo", classes=12, frames=200, odometry=None), 1)
+    log = simulate(preset("demo", objects=8, classes=8, frames=120, odometry=None), 1)
     write_log_folder(add_shared_errors(log, {"front.clock": 0.15}), tmp_path / "log")
     file, fast = tmp_path / "robot.yaml", BY_LABEL
     done = objslam("calibrate", str(tmp_path / "log"), "--mode", "fixed", "-o", str(file), *fast)

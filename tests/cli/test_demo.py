@@ -80,7 +80,7 @@ def test_demo_from_images(objslam: Objslam, attempts: list[object], tmp_path: Pa
     quarter as many, so that the room is that of the whole demo. The objects do not depend on the surface, so it is made of
     fewer depth images.
     """
-    monkeypatch.setattr(render, "RenderSettings", partial(RenderSettings, frames=60, min_views=5))
+    monkeypatch.setattr(render, "RenderSettings", partial(RenderSettings, frames=48, min_views=4))
     monkeypatch.setattr(demo, "settings_of", lambda mode, file, told: settings_of(mode, file, [*told, FEW_DEPTHS]))
     done = objslam("demo", "-o", tmp_path / "demo")
     assert done.code == 0, done.err

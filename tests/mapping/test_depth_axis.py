@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("one_start")
 
 
 def driven(seed=0, **changes):
-    return simulate(preset("demo", frames=200, objects=12, classes=12, depth=DepthNoise(), **changes), seed)
+    return simulate(preset("demo", frames=150, objects=12, classes=12, depth=DepthNoise(), **changes), seed)
 
 
 def with_power(log, power):

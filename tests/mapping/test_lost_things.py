@@ -22,7 +22,8 @@ def mugs(*, absolute: bool, scattered: bool = False, share: float = 0.12, false:
     """A drive with 12 things, of which two are mugs. The second has a share of the boxes of mugs, in the images that are
     drawn at random. scattered: its boxes lie anywhere in these images."""
     poses = {"odometry": None} if absolute else {"localization": None}
-    log = simulate(preset("demo", objects=12, classes=12, tracks="perfect", false=false, **poses), 1)
+    frames = 400 if absolute else 260
+    log = simulate(preset("demo", objects=12, classes=12, tracks="perfect", frames=frames, false=false, **poses), 1)
     (camera,), rng = log.cameras, np.random.default_rng(1)
     found = camera.detections
     number = np.bincount(found.track_ids[found.track_ids >= 0], minlength=12)

@@ -116,10 +116,10 @@ class _Poses:
         shared = np.empty((count, count, *root.shape))
         for i, j in combinations_with_replacement(range(count), 2):
             shared[i, j] = shared[j, i] = root.T @ (self._shared[i, j, :, None] * root)
-        return root, self._told @ root, shared
+        return np.asarray(root, dtype=np.float64), np.asarray(self._told @ root), shared
 
     def solved(self, logarithms: Floats, independent: tuple[Floats, Floats, Floats] | None) -> tuple[float, Floats, Floats]:
-        """Return the same as `solve`. independent: of the method of this name, None if the errors of poses are new in each."""
+        """Return the same as `solve`. independent: of the method of this name, None if all errors are new."""
         factor, tilt, height = np.exp(logarithms)
         sigma = np.array([tilt, tilt, height, _PLACE, _PLACE])[: self.pulled.shape[1]] / factor
         if independent is None:
