@@ -24,11 +24,11 @@ HELD = "calibration.use=false"
 
 @cache
 def drive(seed: int, wrong: bool) -> tuple[Log, dict[str, float]]:
-    """A drive of 400 frames with localisation, and the errors drawn for it."""
+    """A drive of 250 frames with localisation, and the errors drawn for it."""
     rng = np.random.default_rng(seed)
     sigmas = {"clock": 0.1, "yaw": np.radians(2), "tilt": np.radians(1)}
     errors = {f"front.{kind}": float(sigma * rng.standard_normal()) for kind, sigma in sigmas.items()}
-    log = simulate(preset("demo", odometry=None), seed)
+    log = simulate(preset("demo", odometry=None, frames=250), seed)
     return (add_shared_errors(log, errors), errors) if wrong else (log, {})
 
 

@@ -36,12 +36,27 @@ def silent(stage: str, done: int, total: int) -> None:
     pass
 
 
+@pytest.fixture(scope="module")
+def searches():
+    """What a search of the noise found, by the log and the settings. The search is the same in each mode."""
+    return {}
+
+
 @pytest.fixture
-def few_tried(monkeypatch):
-    """Fewer noises than usual are tried, the true ones among them."""
+def few_tried(monkeypatch, searches):
+    """Fewer noises than usual are tried, the true ones among them. A search that another test made is not made again."""
     monkeypatch.setattr(tested, "_PLACES", (1.0, 30.0))
     monkeypatch.setattr(tested, "_RAYS", (1.0,))
     monkeypatch.setattr(tested, "_TURN", 30)
+
+    def once(log, settings, progress):
+        boxes = tuple(one.detections.boxes.tobytes() for one in log.cameras)
+        key = log.localization.poses.tobytes(), boxes, settings.model_copy(update={"mode": "fixed"}).model_dump_json()
+        if key not in searches:
+            searches[key] = sparse_noise(log, settings, progress)
+        return searches[key]
+
+    monkeypatch.setattr(tested, "sparse_noise", once)
 
 
 @pytest.mark.usefixtures("few_tried")
