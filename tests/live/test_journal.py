@@ -16,6 +16,7 @@ from objslam.core.calibration import Calibration
 from objslam.core.camera import RangeNoise
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
+from objslam.core.noise import NoiseFactors
 from objslam.core.validity import is_name
 from objslam.errors import LogError, OutputError
 from objslam.simulation import make_camera
@@ -82,11 +83,22 @@ def bodies(count):
     return st.builds(BodiesMessage, st.integers(0, 10**9), ids, shapes, sides, yaws, spread)
 
 
+SIZES, SHARES, SECONDS = st.floats(1.0, 20.0), st.floats(0.0, 1.0), st.floats(0.0, 1e3)
+NOISES = st.builds(
+    NoiseFactors,
+    heading=SIZES,
+    heading_share=SHARES,
+    heading_seconds=SECONDS,
+    place=SIZES,
+    place_share=SHARES,
+    place_seconds=SECONDS,
+)
+
 MESSAGES = st.one_of(
     st.builds(PoseMessage, st.sampled_from(["odometry", "localization"]), FINITE, POSES),
     st.builds(MountMessage, FINITE, NAMES, POSES),
     st.builds(NoteMessage, FINITE, POSES),
-    st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations)),
+    st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations), NOISES),
     st.integers(0, 4).flatmap(bodies),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
     st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),
@@ -278,3 +290,18 @@ def test_an_empty_journal_gives_way_to_the_newest_one_kept(tmp_path):
     file.write_text("my notes")
     assert restore_after_kill(file) is None
     assert file.read_text() == "my notes"
+
+
+def test_a_calibration_of_an_older_version_has_the_noise_of_the_settings():
+    message = CalibrationMessage(7, Calibration(("front.clock",), np.array([0.1]), np.eye(1) * 1e-4, np.array([0.1])))
+    kind, *parts = encode(message)[:1], *json.loads(encode(message)[1:])
+    older = kind + json.dumps(parts[:-1]).encode()
+    assert decode(older).noise == NoiseFactors()
+
+
+@pytest.mark.parametrize("noise", [[0.0, 0, 0, 1, 0, 0], [1, 1.5, 1, 1, 0, 0], [1, 0, 0, 1, 0, -1.0], [1, 0, 0, 1]])
+def test_a_calibration_with_noise_that_cannot_be_is_refused(noise):
+    message = CalibrationMessage(7, Calibration((), np.zeros(0), np.zeros((0, 0)), np.zeros(0)))
+    parts = json.loads(encode(message)[1:])
+    with pytest.raises(LogError, match="cannot be read"):
+        decode(encode(message)[:1] + json.dumps([*parts[:-1], noise]).encode())

@@ -13,6 +13,7 @@ from test_session import make_log
 from objslam.config import Odometry, load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.geometry import lift_se2, make_pose
+from objslam.core.noise import NOMINAL
 from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.corrected_log import OdometryCorrection
@@ -168,7 +169,7 @@ def test_a_map_that_is_corrected_is_that_of_a_session_that_knew(log, file):
     early = drive(log, settings_of("live.calibrate_from=0", f"calibration.file={file}"))
     early.abort()
     m, other = late._mapper.state, early._mapper.state
-    recalibrate(m, other.calibration)
+    recalibrate(m, other.calibration, NOMINAL)
     _, at, there = np.intersect1d(m.keyframes.sent, other.keyframes.sent, return_indices=True)
     # A frame whose corrected stamp is beyond the odometry takes the pose of its end, which may still be on its way.
     known = other.keyframes.stamp[there] < other.course.odometry.newest - 0.2
@@ -193,7 +194,7 @@ def test_ranges_and_focal_lengths_are_corrected_in_rays_that_came_before(log):
     before, direction = m.rays.range.copy(), m.rays.direction.copy()
     names = ("range_scale", "front.focal")
     for values in ([0.02, 0.05], [-0.01, 0.01]):
-        recalibrate(m, Calibration(names, np.array(values), np.eye(2), np.ones(2)))
+        recalibrate(m, Calibration(names, np.array(values), np.eye(2), np.ones(2)), NOMINAL)
         np.testing.assert_allclose(m.rays.range, before * (1 + values[0]), rtol=1e-9)
         longer = direction * [1, 1, 1 + values[1]]
         np.testing.assert_allclose(m.rays.direction, longer / np.linalg.norm(longer, axis=1, keepdims=True), atol=1e-9)

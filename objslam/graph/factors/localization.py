@@ -67,9 +67,14 @@ def localizations(
     """
     covariance = localization_covariance(keyframes, settings, on_plane)
     return [
-        gtsam.PriorFactorPose3(X0 + first + k, gtsam.Pose3(pose), huber(gtsam.noiseModel.Gaussian.Covariance(c)))
-        for k, (pose, c) in enumerate(zip(keyframes.map_T_camera, covariance, strict=True))
+        localization(first + k, pose, c) for k, (pose, c) in enumerate(zip(keyframes.map_T_camera, covariance, strict=True))
     ]
+
+
+def localization(k: int, map_T_camera: Floats, covariance: Floats) -> gtsam.NonlinearFactor:
+    """Return a prior on X(k) at a pose (4, 4), with Huber's loss. covariance: (6, 6) in the camera frame, rotation first."""
+    noise = huber(gtsam.noiseModel.Gaussian.Covariance(covariance))
+    return gtsam.PriorFactorPose3(X0 + k, gtsam.Pose3(map_T_camera), noise)
 
 
 def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: bool | None = None) -> Floats:

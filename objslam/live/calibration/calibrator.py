@@ -11,6 +11,7 @@ import numpy as np
 from objslam.config import Noise, Settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import OBSERVABLE, Calibration, kind
+from objslam.core.noise import NoiseFactors
 from objslam.frontend.corrected_log import LENS
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.live.calibration.collected import collect
@@ -33,6 +34,9 @@ done by then, the map does not depend on the machine's speed. A larger share sui
 _CHANGED = 1.0
 """The map is corrected if an error has changed by more than this, in standard deviations. A larger value corrects more
 rarely."""
+_LIKE = 0.2
+"""The map is also corrected if the noise of the localisation, or how long its errors last, has changed by more than this
+share. The estimates of a short drive differ by as much from round to round. A larger share corrects more rarely."""
 _NO_DELAY = 1.0
 """A session does not correct a camera clock that is behind by at most this multiple of the standard deviation of the
 estimate. With a correction, each frame would wait longer for its pose, by the offset of the clock, and the gain is small. A
@@ -74,8 +78,8 @@ def _without_late(errors: SharedErrors, theta: Floats, known: Container[str]) ->
     return replace(errors, names=names, mean=errors.mean[some], prior=errors.prior[np.ix_(some, some)]), theta[some]
 
 
-class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
-    """Estimates the shared errors in rounds, and corrects the map by them."""
+class Calibrator(Rounds[tuple[Calibration, NoiseFactors] | None, CalibrationMessage]):
+    """Estimates the shared errors and the noise of the localisation in rounds, and corrects the map by them."""
 
     growth, delay, quick = _GROWTH, _DELAY, False
 
@@ -95,7 +99,7 @@ class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
     def _request(self) -> CalibrationRequest | None:
         """Return a calibration with all keyframes, if shared errors are to be estimated and there are objects.
 
-        The noise is not estimated. It stays as in the settings until the end of the session, and so do the errors `_LATE`.
+        Other noise is not estimated. It stays as in the settings until the end of the session, and so do the errors `_LATE`.
         """
         m = self._mapper.state
         found = collect(m, self._name, count_dropped=False)
@@ -105,24 +109,26 @@ class Calibrator(Rounds[Calibration | None, CalibrationMessage]):
         errors, theta = _without_late(errors, theta, m.errors)
         if not len(theta):
             return None
-        known = Noise(rays=False, ranges=False, odometry=False, localization=False)
+        known = Noise(rays=False, ranges=False, odometry=False, localization=m.given.noise.localization)
         settings = m.given.model_copy(update={"noise": known})
         errors = replace(errors, settings=settings)
         return CalibrationRequest(errors, theta, found.association, found.map_T_camera, settings)
 
-    def _correction(self, number: int, answer: Calibration | None) -> CalibrationMessage | None:
-        """Return the calibration if it changes some error by enough to correct the map (`_CHANGED`), else None."""
+    def _correction(self, number: int, answer: tuple[Calibration, NoiseFactors] | None) -> CalibrationMessage | None:
+        """Return the calibration if it changes an error (`_CHANGED`) or the noise (`_LIKE`) enough to correct the map. Else
+        return None."""
         if answer is None:
             self._counters.accept("calibrations given up")
             return None
-        now = np.array([self._mapper.state.errors.get(name, 0.0) for name in answer.names])
-        found = observed(answer, now)
-        far = (np.abs(found.values - now) > _CHANGED * answer.sigma).any()
-        if not far:
+        m, (calibration, noise) = self._mapper.state, answer
+        now = np.array([m.errors.get(name, 0.0) for name in calibration.names])
+        found = observed(calibration, now)
+        far = (np.abs(found.values - now) > _CHANGED * calibration.sigma).any()
+        if not far and noise.like(m.localization.noise, _LIKE):
             self._counters.accept("calibrations without a change")
             return None
-        return CalibrationMessage(number, found)
+        return CalibrationMessage(number, found, noise)
 
     def _take_up(self, correction: CalibrationMessage) -> None:
-        recalibrate(self._mapper.state, correction.calibration)
+        recalibrate(self._mapper.state, correction.calibration, correction.noise)
         self._counters.accept("calibrations")

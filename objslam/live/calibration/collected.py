@@ -6,6 +6,7 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.noise import range_noise
+from objslam.core.statistics import WHITE
 from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
 from objslam.errors import ObjslamError
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
@@ -109,8 +110,9 @@ def corrections(m: MapState, errors: SharedErrors) -> Floats:
 
 
 def as_measured(m: MapState, rows: Ints) -> Keyframes:
-    """Return the keyframes in these rows (n,), with their stamps and mounts as received."""
-    return replace(m.keyframe_arrays(rows), stamps=m.keyframes.sent[rows], base_T_camera=m.keyframes.mount[rows])
+    """Return the keyframes in these rows (n,), with their stamps and mounts as received, and the noise of the settings."""
+    some = replace(m.keyframe_arrays(rows), stamps=m.keyframes.sent[rows], base_T_camera=m.keyframes.mount[rows])
+    return replace(some, pose_noise=(1.0, 1.0), lasting=(WHITE, WHITE))
 
 
 def rays_as_measured(m: MapState, rows: Ints, keyframe: Ints) -> Rays:

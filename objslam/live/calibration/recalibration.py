@@ -5,26 +5,27 @@ import numpy as np
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
 from objslam.core.geometry import inverse
+from objslam.core.noise import NoiseFactors
 from objslam.core.types import Keyframes, Log
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import corrected_ranges, measured_ranges, range_factors
-from objslam.graph.factors.localization import localizations
 from objslam.graph.factors.priors import anchor
 from objslam.live.calibration.collected import as_measured, offline_rays, recorded_log
-from objslam.live.mapper.localization import chain_keyframes
+from objslam.live.mapper.localization import chain_keyframes, place_keyframes
 from objslam.live.mapper.state import MapState
 
 
-def recalibrate(m: MapState, calibration: Calibration) -> None:
+def recalibrate(m: MapState, calibration: Calibration, noise: NoiseFactors) -> None:
     """Correct the map by a calibration, whose values replace earlier values of its errors.
 
-    The new map depends only on the old map and the calibration, so that a resumed session makes it again.
+    The new map depends only on the old map and the arguments, so that a resumed session makes it again. noise: of the
+    localisation. Its other factors do not count.
     """
     before = m.errors
     m.errors = before | dict(zip(calibration.names, calibration.values.tolist(), strict=True))
-    m.calibration = calibration
+    m.calibration, m.localization.noise = calibration, noise
     m.settings = scaled_noise(m.given, m.errors)
     if not len(m.keyframes):
         return
@@ -140,10 +141,7 @@ def _replace_factors(m: MapState, rays_changed: bool) -> None:
     for number in k.id.tolist():
         m.graph.drop_motion(number)
     chain_keyframes(m)
-    for row in np.flatnonzero(k.localized).tolist():
-        number = int(k.id[row])
-        one = m.keyframe_arrays(np.array([row]))
-        m.graph.add_absolute(number, localizations(one, m.settings, number, m.localization.planar)[0])
+    place_keyframes(m)
     used = np.flatnonzero(rays.used & (rays.owner >= 0))
     if rays_changed and len(used):
         m.graph.drop_rays(rays.number[used])

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.arrays import Floats
     from objslam.core.calibration import Calibration
+    from objslam.core.noise import NoiseFactors
     from objslam.core.types import Association
     from objslam.frontend.shared_errors import SharedErrors
 
@@ -27,9 +28,11 @@ class CalibrationRequest:
     map_T_camera: Floats
     settings: Settings
 
-    def solve(self) -> Calibration | None:
-        """Return the shared errors that fit best, None if they cannot be estimated. Raises SolveError if the solve fails."""
+    def solve(self) -> tuple[Calibration, NoiseFactors] | None:
+        """Return the shared errors and the noise that fit best, None if they cannot be estimated. Raises SolveError if the
+        solve fails."""
         from objslam.core.diagnostics import Ledger
+        from objslam.core.noise import NOMINAL
         from objslam.graph.batch_solver import solve_joint
 
         e = self.errors
@@ -43,4 +46,4 @@ class CalibrationRequest:
             errors=e,
             theta=self.theta,
         )
-        return found.calibration
+        return None if found.calibration is None else (found.calibration, found.noise or NOMINAL)

@@ -1,11 +1,14 @@
 """Factors on keyframe poses: absolute poses from localisation, and motions between consecutive keyframes."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse, is_planar
 from objslam.graph.factors import odometry
-from objslam.graph.factors.localization import localizations
+from objslam.graph.factors.localization import localization, localization_covariance, localized_motions
 from objslam.live.mapper.state import MapState
 
 
@@ -33,8 +36,7 @@ def localize(m: MapState) -> bool:
             _move_onto(m, row, found.pose)
         m.keyframes.map_T_base[row] = found.pose
         m.keyframes.localized[row] = True
-        one = m.keyframe_arrays(np.array([row]))
-        m.graph.add_absolute(k, localizations(one, m.settings, k, planar)[0])
+        _place(m, row)
         if first:
             moved = True
             if len(np.unique(m.keyframes.piece)) > 1:  # Motions across gaps of the odometry are no longer needed.
@@ -44,22 +46,68 @@ def localize(m: MapState) -> bool:
     return moved
 
 
+def _place(m: MapState, row: int) -> None:
+    """Add the absolute pose of the newest localised keyframe, and the motion that the localisation measures up to it.
+
+    If errors last, each pose has a part of the information that all poses have together. This part depends on the times of
+    the poses before and after. The time until the next pose is taken to be the time since the one before.
+    """
+    k, others = m.keyframes, m.keyframes.localized.copy()
+    others[row] = False
+    earlier = np.flatnonzero(others & (k.stamp <= k.stamp[row]))
+    before = int(earlier[k.stamp[earlier].argmax()]) if len(earlier) else None
+    gap = np.inf if before is None else k.stamp[row] - k.stamp[before]
+    amid = m.keyframe_arrays(np.full(3, row))
+    amid = replace(amid, stamps=amid.stamps + np.array([-gap, 0.0, gap]))
+    covariance = localization_covariance(amid, m.settings, m.localization.planar)[1]
+    number = int(k.id[row])
+    m.graph.add_absolute(number, localization(number, amid.map_T_camera[1], covariance))
+    if before is None or m.graph.before(number) is not None:
+        return
+    found = localized_motions(m.keyframe_arrays(np.array([before, row])), m.settings, m.localization.planar)
+    if found is not None:
+        m.graph.add_motion(int(k.id[before]), number, found.motion[0], found.covariance[0])
+
+
+def place_keyframes(m: MapState) -> None:
+    """Replace the absolute poses of all localised keyframes. The caller must rebuild the graph."""
+    rows = m.time_order()
+    rows = rows[m.keyframes.localized[rows]]
+    if not len(rows):
+        return
+    every = m.keyframe_arrays(rows)
+    covariance = localization_covariance(every, m.settings, m.localization.planar)
+    for k, pose, spread in zip(m.keyframes.id[rows].tolist(), every.map_T_camera, covariance, strict=True):
+        m.graph.add_absolute(k, localization(k, pose, spread))
+
+
 def chain_keyframes(m: MapState) -> None:
     """Connect consecutive keyframes by their motion. The caller must rebuild the graph.
 
-    If the odometry did not measure a motion, a weak factor replaces it. No factor is needed if the later keyframe and some
-    earlier keyframe are localised, because their absolute poses relate the two.
+    A motion that the odometry did not measure is from the localisation, if its errors last. If there is no such motion
+    either, a weak factor replaces it. No factor is needed if the later keyframe and some earlier keyframe are localised,
+    because their absolute poses relate the two.
     """
     k, order = m.keyframes, m.time_order()
     every = m.keyframe_arrays(order)
-    if every.odom_T_base is None:
+    by_localization = localized_motions(every, m.settings, m.localization.planar)
+    if every.odom_T_base is None and by_localization is None:
         return
     ids, localized, measured = k.id[order].tolist(), k.localized[order], every.measured
     tied = measured | ~localized[1:] | ~np.logical_or.accumulate(localized)[:-1]
-    wrong = [i for i in range(1, len(ids)) if not measured[i - 1] or m.graph.before(ids[i]) != ids[i - 1]]
+    tied &= every.odom_T_base is not None
+    lasts = ~measured & localized[1:] & localized[:-1] & (by_localization is not None)
+    chained = [m.graph.before(after) == before for before, after in pairwise(ids)]
+    wrong = [i for i in range(1, len(ids)) if not (measured[i - 1] or lasts[i - 1]) or not chained[i - 1]]
     for i in wrong:
         m.graph.drop_motion(ids[i])
-    to_tie = [i for i in wrong if tied[i - 1]]
+    if by_localization is not None:
+        for i in [i for i in wrong if lasts[i - 1]]:
+            motion, spread = by_localization.motion[i - 1], by_localization.covariance[i - 1]
+            m.graph.add_motion(ids[i - 1], ids[i], motion, spread)
+    to_tie = [i for i in wrong if tied[i - 1] and not lasts[i - 1]]
+    if not to_tie:
+        return
     pairs = np.array([[i - 1, i] for i in to_tie], dtype=np.int64).ravel()
     on_plane = m.course.odometry.planar
     motion, covariance = odometry.motions(every.take(pairs), m.settings, on_plane)

@@ -54,8 +54,8 @@ class PosePredictor:
             return PosePrediction(placed.map_T_base @ base_T_camera, camera_T_start, certain, None)
         held = k.localized.any()
         measured = placed.by_odometry and (k.piece[before] == placed.piece or not held)
-        noise = m.settings.localization
-        variance = np.diag([noise.yaw] * 3 + [noise.xy] * 3) ** 2
+        noise, found = m.settings.localization, m.localization.noise
+        variance = np.diag([noise.yaw * found.heading] * 3 + [noise.xy * found.place] * 3) ** 2
         there = m.course.localization.at(stamp) if held and not measured else None
         if there is not None:
             localized = PoseUncertainty(placed.drift, camera_from_drift, variance)
@@ -71,11 +71,11 @@ class PosePredictor:
         pose = back @ self.covariance_of(number) @ back.T + covariance
         uncertainty, map_T_camera = PoseUncertainty(placed.drift, camera_from_drift, pose), m.graph.pose(number) @ motion
         # After a way without keyframes, the localisation is better than the odometry from the last of them.
-        if held and not uncertainty.is_placed and (found := m.course.by_localization(stamp, placed.piece)) is not None:
-            spread = variance + camera_from_drift @ found[1] @ camera_from_drift.T
+        if held and not uncertainty.is_placed and (near := m.course.by_localization(stamp, placed.piece)) is not None:
+            spread = variance + camera_from_drift @ near[1] @ camera_from_drift.T
             localized = PoseUncertainty(placed.drift, camera_from_drift, spread)
             if localized.is_placed:
-                uncertainty, map_T_camera = localized, found[0] @ base_T_camera
+                uncertainty, map_T_camera = localized, near[0] @ base_T_camera
         return PosePrediction(map_T_camera, camera_T_start, uncertainty, (number, motion, covariance))
 
     def accept(self, prediction: PosePrediction) -> None:

@@ -10,7 +10,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera
-from objslam.core.noise import range_noise
+from objslam.core.noise import NOMINAL, NoiseFactors, range_noise
 from objslam.core.types import Keyframes
 from objslam.errors import SolveError
 from objslam.frontend.boxes.part_finder import RobotPartFinder
@@ -44,12 +44,14 @@ class NextIds:
 class LocalizationState:
     """The state of the localisation. pending: the ids of the keyframes that wait for a localised pose.
 
-    received: the number of poses so far. planar: whether all of them lie in one plane.
+    received: the number of poses so far. planar: whether all of them lie in one plane. noise: the noise of the localised
+    poses by the last calibration, and how long their errors last. The other factors of `noise` are 1.
     """
 
     received: int = 0
     pending: list[int] = field(default_factory=list)
     planar: bool = True
+    noise: NoiseFactors = NOMINAL
 
 
 @dataclass
@@ -147,6 +149,7 @@ class MapState:
         """Return the keyframes in these rows (n,) as `Keyframes`."""
         k = self.keyframes
         localized, reckoned = bool(k.localized.any()), bool(k.by_odometry[rows].any())
+        noise = self.localization.noise
         return Keyframes(
             stamps=k.stamp[rows],
             camera=k.camera[rows],
@@ -158,6 +161,8 @@ class MapState:
             drift=k.drift[rows] if reckoned else None,
             stretch=np.where(k.by_odometry[rows], k.piece[rows], -1) if reckoned else None,
             given_stamps=k.sent[rows],
+            pose_noise=(noise.heading, noise.place),
+            lasting=noise.lasting,
         )
 
     def rows_of(self, ids: Ints) -> Ints:

@@ -13,6 +13,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.bodies.body import SHAPES
 from objslam.core.calibration import Calibration
 from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
+from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.validity import (
     MAX_POSITION,
     box_rules,
@@ -34,6 +35,8 @@ _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
 _STOP_KIND = b"E"
 _LONGEST_REASON = 200  # The most letters of a reason that are shown. A larger number shows more of it.
+_OF_LOCALIZATION = ("heading", "heading_share", "heading_seconds", "place", "place_share", "place_seconds")
+"""The fields of `NoiseFactors` that a calibration message has."""
 CALIBRATION_KIND = b"S"
 """The first byte of a calibration message."""
 BODIES_KIND = b"B"
@@ -118,13 +121,14 @@ class NoteMessage:
 
 @dataclass(frozen=True)
 class CalibrationMessage:
-    """The shared errors that a session corrects in its map and in all later messages.
+    """The shared errors that a session corrects in its map and in all later messages, and the noise of its localisation.
 
-    keyframe: the number of keyframes in the map before the correction.
+    keyframe: the number of keyframes in the map before the correction. noise: only the fields `_OF_LOCALIZATION` count.
     """
 
     keyframe: int
     calibration: Calibration
+    noise: NoiseFactors = NOMINAL
 
 
 @dataclass(frozen=True)
@@ -180,7 +184,8 @@ def encode(message: Message) -> bytes:
     if isinstance(message, CalibrationMessage):
         found = message.calibration
         numbers = [array.tolist() for array in (found.values, found.covariance, found.prior)]
-        return CALIBRATION_KIND + json.dumps([message.keyframe, found.names, *numbers]).encode()
+        noise = [getattr(message.noise, name) for name in _OF_LOCALIZATION]
+        return CALIBRATION_KIND + json.dumps([message.keyframe, found.names, *numbers, noise]).encode()
     if isinstance(message, BodiesMessage):
         arrays = (message.ids, message.shape, message.half, message.yaw, message.covariance)
         return BODIES_KIND + json.dumps([message.keyframe, *(array.tolist() for array in arrays)]).encode()
@@ -226,13 +231,25 @@ def _read_note(data: bytes) -> NoteMessage:
 
 
 def _read_calibration(data: bytes) -> CalibrationMessage:
-    keyframe, names, values, covariance, prior = json.loads(data[1:])
+    keyframe, names, values, covariance, prior, *noise = json.loads(data[1:])
     n = len(names)
     found = Calibration(tuple(map(_name, names)), _array(values, (n,)), _array(covariance, (n, n)), _array(prior, (n,)))
     fault = covariance_fault(found.covariance)
     if fault is not None:
         raise ValueError(f"the covariance of the calibration {fault}")
-    return CalibrationMessage(_integer(keyframe), found)
+    return CalibrationMessage(_integer(keyframe), found, _noise(*noise))
+
+
+def _noise(values: list[float] | None = None) -> NoiseFactors:
+    """Return the noise of a localisation. Journals of older versions have none."""
+    if values is None:
+        return NOMINAL
+    noise = dict(zip(_OF_LOCALIZATION, _array(values, (len(_OF_LOCALIZATION),)).tolist(), strict=True))
+    if min(noise.values()) < 0 or min(noise["heading"], noise["place"]) == 0:
+        raise ValueError("the noise of the localisation is not positive")
+    if max(noise["heading_share"], noise["place_share"]) > 1:
+        raise ValueError("a share of the noise of the localisation is above 1")
+    return NoiseFactors(**noise)
 
 
 def _read_bodies(data: bytes) -> BodiesMessage:
