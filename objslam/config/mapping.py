@@ -233,9 +233,10 @@ class Live(Section):
     of less than 50 times this size, the limit is 2 % of the disk."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
     """Maximum number of boxes with which a session repeats the offline association at its end. This takes a few seconds."""
-    calibrate_from: Annotated[int, Field(ge=0)] = 200
-    """Number of keyframes at which the session first estimates the shared errors. It estimates them again whenever the
-    number of keyframes has grown by half. 0 estimates them only at the end of the session."""
+    calibrate_from: Annotated[int, Field(ge=0)] = 60
+    """Number of keyframes at which the session first estimates the shared errors and the noise of the localisation. It
+    estimates them again whenever the number of keyframes has grown by half. 0 estimates them only at the end of the
+    session."""
     forget: Positive = 5.0
     """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""
