@@ -64,12 +64,21 @@ times the score of a clean log. Larger multiples keep fewer findings that no sol
 
 @dataclass(frozen=True)
 class Trial:
-    """The test of a hypothesis. score, share: as in `Agreement`. straight: as in `path.straightness`, None if unknown."""
+    """The test of a hypothesis. score, share: as in `Agreement`. straight: as in `path.straightness`, None if unknown.
+
+    seen: the share of the boxes that have a ray. The other boxes are cut off by the image's edge, or lie outside the image.
+    """
 
     hypothesis: Hypothesis | None
     score: float
     share: float
     straight: float | None
+    seen: float = 1.0
+
+    @property
+    def of_rays(self) -> float:
+        """The score if only the boxes with a ray count."""
+        return self.score / self.seen if self.seen > 0 else 0.0
 
 
 def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Settings, progress: Progress) -> list[Trial]:
@@ -90,8 +99,8 @@ def try_hypotheses(part: Part, log: Log, before: Agreement | None, settings: Set
         changed = logs[number]
         of_path = changed.localization is not part.log.localization or changed.odometry is not part.log.odometry
         straight = _straight(changed) if of_path else first.straight
-        score, share = (found.score, found.share) if found else (0.0, 0.0)
-        trials.append(Trial(every[number], score, share, straight))
+        score, share, seen = (found.score, found.share, _seen(found)) if found else (0.0, 0.0, 0.0)
+        trials.append(Trial(every[number], score, share, straight, seen))
     return [first, *sorted(trials, key=lambda trial: -trial.score)]
 
 
@@ -101,11 +110,20 @@ def _unchanged(before: Agreement | None, log: Log) -> Trial:
     if before is None:
         return Trial(None, 0.0, 0.0, _straight(log))
     narrow = float(before.narrow.sum() / before.boxes)
-    return Trial(None, before.score + narrow, before.share, _straight(log))
+    return Trial(None, before.score + narrow, before.share, _straight(log), _seen(before))
+
+
+def _seen(found: Agreement) -> float:
+    """Return the share of the boxes that have a ray."""
+    return len(found.rays) / max(found.boxes, 1)
 
 
 def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = "") -> Finding | None:
     """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log.
+
+    Two scores must be better: the score of all boxes, and the score of the boxes with a ray. A box that the image's edge
+    cuts off has no ray. If x and y of right boxes are swapped, many boxes that were cut off get a ray, and some fit by
+    chance.
 
     corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
     better than this: a mount with another order of its quaternion may look like a mount that is tilted a little. unusual:
@@ -119,7 +137,8 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
 
     def holds(trial: Trial, before: float) -> bool:
         times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
-        more = trial.score > max(times * before, before + least)
+        of_rays = before / first.seen if first.seen > 0 else 0.0
+        more = all(now > max(times * old, old + least) for now, old in ((trial.score, before), (trial.of_rays, of_rays)))
         more &= (trial.score - before) * part.boxes > _MORE_BOXES and (part.drifts or trial.share >= _HALF)
         more &= trial.score >= least_score
         # Better boxes are no reason to make a straight path crooked.
