@@ -39,7 +39,7 @@ from objslam.mapping.joint.labels import (
     warn_of_noise,
 )
 from objslam.mapping.moves.missed_loops import with_missed_loops
-from objslam.mapping.moves.moving_things import without_moving_things
+from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
 from objslam.mapping.solution import seen_something
 
@@ -165,7 +165,8 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         state.ledger.warn(f"the association still changes {changed} after {rounds} rounds (joint.max_rounds)")
     if state.hold:  # The covariances now contain the shared errors, so that more pairs may be one object.
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
-    return without_moving_things(_with_few_rays(state))
+    # The search for objects from few rays leaves out the rays of dropped objects.
+    return without_moving_things(_with_few_rays(associated_at_rest(state)))
 
 
 def _searched(state: JointState) -> JointState:

@@ -1,5 +1,7 @@
 """Carts that drive around in a room: they become no objects, and things at rest stay."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from more_boxes import with_boxes
@@ -8,13 +10,13 @@ from objslam.config import load_settings
 from objslam.core.camera import project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse
-from objslam.core.types import Log
+from objslam.core.types import Association, Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import pipeline
 from objslam.mapping.joint.joint_alternation import JointState
-from objslam.mapping.moves.moving_things import without_moving_things
+from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
 
@@ -75,6 +77,39 @@ def test_objects_of_things_that_move_are_dropped(seed: int) -> None:
     np.testing.assert_allclose(places(after), at_rest, atol=0.03)
 
 
+def test_copies_of_things_at_rest_are_merged_when_moving_things_no_longer_bend_the_path() -> None:
+    """Each thing has one object in the first half of the drive and another one in the second half."""
+    log = simulate(preset("rooms", missed=0.1, false=0.0), 1)
+    state = solved(with_carts(log, 10, 1))
+    assert state.association is not None
+    late = state.rays.keyframe > len(state.keyframes) // 2
+    owner, count = state.association.object, state.association.count
+    both = late & (owner >= 0) & (state.rays.label != state.rays.label_names.index("cart"))
+    label = np.append(state.association.label, state.association.label)
+    number, inverse_of = np.unique(np.where(both, owner + count, owner), return_inverse=True)
+    halves = Association(inverse_of - 1, label[number[1:]])
+    bent = state.solve("association", halves, state.solved_poses)
+    assert len(places(bent)) > 15
+    assert len(places(associated_at_rest(bent))) == 15
+
+
+def test_rays_that_a_bent_path_rejected_are_taken_back_when_nothing_bends_it() -> None:
+    log = simulate(preset("rooms", missed=0.1, false=0.0), 2)
+    state = solved(with_carts(log, 10, 2))
+    assert state.association is not None
+    at_rest = state.rays.label != state.rays.label_names.index("cart")
+    lost = at_rest & (state.rays.keyframe > len(state.keyframes) // 2)
+    few = replace(state.association, object=np.where(lost, -1, state.association.object))
+    after = associated_at_rest(state.solve("association", few, state.solved_poses))
+    assert after.association is not None
+    kept = (after.association.object[lost] >= 0).sum()
+    assert kept > 0.95 * (state.association.object[lost] >= 0).sum()
+    assert len(carts(after)) == 0
+    gone = (state.association.object >= 0) & ~at_rest & (after.association.object < 0)
+    assert after.association.refuted is not None
+    assert after.association.refuted[gone].all()
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 @pytest.mark.parametrize("seed", [3])
 def test_at_given_poses_things_that_move_are_no_objects_either(seed: int, calibrated: bool) -> None:
@@ -92,6 +127,7 @@ def test_a_map_of_things_at_rest_stays_the_same() -> None:
     row = tuple(("cup", (-1.5 + 0.3 * number, 1.0, 0.5)) for number in range(10))
     state = solved(simulate(preset("rooms", placed=row, objects=6, classes=3, missed=0.3, false=0.1), 3))
     assert without_moving_things(state) is state
+    assert associated_at_rest(state) is state
 
 
 def solved(log: Log) -> JointState:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from objslam.core.geometry import angles_off
 from objslam.core.types import Association
+from objslam.errors import SolveError
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
 
 if TYPE_CHECKING:
-    from objslam.core.arrays import Bools, Floats
+    from objslam.core.arrays import Bools, Floats, Ints
     from objslam.core.estimate import Estimate
     from objslam.core.types import Keyframes, Rays
     from objslam.mapping.joint.joint_alternation import JointState
@@ -39,16 +41,56 @@ label does not seem to move. With a larger number, fewer maps are judged."""
 
 def without_moving_things(state: JointState) -> JointState:
     """Return the state without objects of things that move (`things_at_rest`), else the state itself."""
+    return _dropped(state, np.zeros(0, dtype=np.int64))[0]
+
+
+def associated_at_rest(state: JointState) -> JointState:
+    """Return the state without objects of things that move, after new rounds of association, else the state itself.
+
+    The solve bent the path to rays that meet by chance. At a bent path, a thing at rest may have one object for each visit,
+    and some of its rays are at no object or at a wrong one. So objects that appear twice are merged at the new path. Rounds
+    of association follow, and count if they explain the log better. Of the labels that move, these rounds find no objects
+    either.
+    """
+    left, labels = _dropped(state, np.zeros(0, dtype=np.int64))
+    if left is state:
+        return state
+    left = left.merged()
+    assert left.association is not None
+    assert left.estimate is not None
+    try:
+        rounds = left.attempt().alternated(left.estimate.map_T_base, (left.association, left.estimate.positions))
+        rounds = _dropped(rounds, labels)[0].merged()
+    except SolveError:  # The map before the rounds is there.
+        return left
+    best, refuted = left.better(rounds), left.association.refuted
+    if best is left or refuted is None:
+        return best
+    found = best.association
+    assert found is not None
+    refuted = refuted & (found.object < 0)
+    return replace(best, association=replace(found, refuted=refuted if found.refuted is None else refuted | found.refuted))
+
+
+def _dropped(state: JointState, known: Ints) -> tuple[JointState, Ints]:
+    """Return the state without objects of things that move, and their labels. known: as in `things_at_rest`."""
     assert state.association is not None
     assert state.estimate is not None
-    left = things_at_rest(state.keyframes, state.rays, state.association, state.estimate, state.solved_poses)
-    if left is state.association:
-        return state
-    return state.counted(left).solve("association", left, state.solved_poses)
+    before = state.association
+    left = things_at_rest(state.keyframes, state.rays, before, state.estimate, state.solved_poses, known)
+    if left is before:
+        return state, known
+    gone = (before.object >= 0) & (left.object < 0)
+    return state.counted(left).solve("association", left, state.solved_poses), np.unique(before.label[before.object[gone]])
 
 
 def things_at_rest(
-    keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    estimate: Estimate,
+    map_T_camera: Floats,
+    known: Ints | None = None,
 ) -> Association:
     """Return the association without objects of things that move, else the association itself.
 
@@ -57,9 +99,9 @@ def things_at_rest(
     passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
     because tracks of a few things at rest also pass on to equal things beside them. Of a label that moves, objects stay only
     if long tracks show that they are at rest. If all things have one label, the usual scatter is unknown, and all objects
-    stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses.
+    stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses. known: labels that are known to move.
     """
-    moving = _moving(keyframes, rays, association, estimate, map_T_camera)
+    moving = _moving(keyframes, rays, association, estimate, map_T_camera, known)
     if not moving.any():
         return association
     number = np.append(np.where(moving, -1, np.cumsum(~moving) - 1), -1)
@@ -74,7 +116,14 @@ def things_at_rest(
     )
 
 
-def _moving(keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats) -> Bools:
+def _moving(
+    keyframes: Keyframes,
+    rays: Rays,
+    association: Association,
+    estimate: Estimate,
+    map_T_camera: Floats,
+    known: Ints | None,
+) -> Bools:
     """Return which objects (N,) are of things that move. The parameters are as in `things_at_rest`."""
     owner = np.where(estimate.weight > 0, association.object, -1)
     track, length = tracks_of_rays(keyframes, rays, map_T_camera)
@@ -96,10 +145,10 @@ def _moving(keyframes: Keyframes, rays: Rays, association: Association, estimate
     all_told, all_pure, all_squares, all_rays = sums
     passed = all_pure < _PASSED * all_told
     rest = (many > 0) & (pure >= _PURE) & ~passed[label]
-    if rest.sum() < _USUAL:
-        return np.zeros(association.count, dtype=bool)
-    usual = np.median(squares[rest] / number[rest])
-    moves = passed & (all_squares > _SCATTER**2 * usual * all_rays)
+    moves = np.isin(np.arange(len(passed)), [] if known is None else known)
+    if rest.sum() >= _USUAL:
+        usual = np.median(squares[rest] / number[rest])
+        moves |= passed & (all_squares > _SCATTER**2 * usual * all_rays)
     # An object without long tracks, such as one whose rays are all rejected, would take up rays of the dropped objects.
     long = length[track[told]] >= _LONG
     rests = np.bincount(owner[told[long]], minlength=association.count) > 0
