@@ -128,6 +128,47 @@ def past_a_row() -> Log:
     return looking(path, 60.0, row)
 
 
+def circling_two() -> Log:
+    """The robot drives three times around one thing, and then three times around another one."""
+    turn = np.linspace(0, 6 * np.pi, 300)
+    circle = np.column_stack([2 * np.cos(turn), 2 * np.sin(turn), turn + np.pi])
+    return looking(
+        np.concatenate([circle, circle + np.array([9.0, 0.0, 0.0])]), 120.0, np.array([[0.0, 0.0, 0.5], [9.0, 0.0, 0.5]])
+    )
+
+
+def on_curves(frames: int) -> tuple[Log, np.ndarray]:
+    """A robot drives left and right on curves of changing radii. Its camera looks to its left side, and each second image
+    shows a part of the robot. Also the boxes of this part."""
+    rng = np.random.default_rng(0)
+    seconds = np.linspace(0.0, 60.0, frames)
+    yaw = np.cumsum(1.2 * np.sin(0.9 * seconds) + 0.6 * np.sin(0.37 * seconds)) * 60.0 / frames
+    way = 0.5 * 60.0 / frames
+    path = np.column_stack([way * np.cumsum(np.cos(yaw)), way * np.cumsum(np.sin(yaw)), yaw])
+    clean = looking(path, 60.0, rng.uniform([-6, -6, 0.2], [6, 6, 1.0], (30, 3)), yaw=np.pi / 2)
+    shown = np.arange(0, len(path), 2)
+    part = np.array([280.0, 300, 350, 360]) + rng.normal(0, 1.5, (len(shown), 4))
+    return with_boxes(clean, shown, part, "part"), part
+
+
+@pytest.mark.parametrize("frames", [600, 120])
+def test_a_part_beside_a_camera_that_looks_to_the_side_is_dropped(frames):
+    """On a left curve, the rays of the part meet in the middle of the curve, as if the robot drove around a thing. With 2
+    images a second, few windows have more than two boxes of the part."""
+    log, part = on_curves(frames)
+    label = log.cameras[0].detections.label_names.index("part")
+    left, number = dropped(log)
+    assert number > 0.95 * len(part)
+    assert (left.cameras[0].detections.label == label).sum() == len(part) - number
+    assert found_online(log)[0].sum() > 0.5 * len(part)
+
+
+def test_two_things_that_a_robot_drives_around_stay():
+    log = circling_two()
+    assert len(log.cameras[0].detections.boxes) > 580
+    assert dropped(log)[1] == 0
+
+
 def test_a_thing_in_the_middle_of_a_circle_stays():
     """It stays at one place of the image, but its rays meet."""
     log = circling()
@@ -195,7 +236,9 @@ def test_a_session_forgets_an_arm_that_has_moved_away():
 
 
 @pytest.mark.parametrize(
-    "log", [circling(), past_a_row(), after_a_wait(), turning_slowly()], ids=["circle", "row", "wait", "slow"]
+    "log",
+    [circling(), circling_two(), past_a_row(), after_a_wait(), turning_slowly()],
+    ids=["circle", "two", "row", "wait", "slow"],
 )
 def test_a_session_keeps_boxes_of_things_at_rest(log):
     part, finder = found_online(log)

@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.association.observations import overlap
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.frontend.boxes.robot_parts import AGREE, FEWEST, LIKE_BOX, SAME_BOX, STEADY, TURN, WINDOWS, misses
+from objslam.frontend.boxes.robot_parts import AGREE, FEWEST, LIKE_BOX, NEXT, SAME_BOX, STEADY, TURN, WINDOWS, misses
 
 _PLACES = 16
 """The most places of the image that are followed for each label. A place stays among them if more than one in 17 boxes of
@@ -25,8 +25,9 @@ number, boxes of things are dropped at its place for longer."""
 class _Place:
     """A place of the image where boxes of a label are. hits: the number of boxes there, less the number of times when a box
     found no place. at, near: the numbers of boxes at the place, and near it. last: the last frame with a box there. ahead,
-    origin, direction: of the rays of the present window. missed, windows: how many windows show that no thing at rest is
-    there, and how many windows there were.
+    origin, direction: of the rays of the present window. open: those of the last `NEXT` windows whose rays meet until now:
+    the number of the window, and the origins and directions of the rays since its begin. missed, windows: how many windows
+    show that no thing at rest is there, and how many windows there were.
     """
 
     box: Floats
@@ -39,6 +40,7 @@ class _Place:
     ahead: list[Floats] = field(default_factory=list)
     origin: list[Floats] = field(default_factory=list)
     direction: list[Floats] = field(default_factory=list)
+    open: list[tuple[int, list[Floats], list[Floats]]] = field(default_factory=list)
 
     @property
     def is_part(self) -> bool:
@@ -57,12 +59,19 @@ class _Place:
         for values, value in ((self.ahead, ahead), (self.origin, pose[:3, 3]), (self.direction, direction)):
             values.append(value)
         if ahead @ self.ahead[0] < np.cos(TURN):
-            if len(self.ahead) > 2:
-                self.windows += 1
-                self.missed += misses(np.array(self.origin), np.array(self.direction))
+            self._end_window()
             self._keep(slice(-1, None))
         elif len(self.ahead) > _OF_WINDOW:
             self._keep(slice(None, None, 2))
+
+    def _end_window(self) -> None:
+        """Count the window, and those windows before it whose rays met until now, but do not meet the rays of this one."""
+        self.windows += 1
+        begun = [*self.open, (self.windows, [], [])]
+        longer = [(first, origin + self.origin, direction + self.direction) for first, origin, direction in begun]
+        meet = [one for one in longer if not misses(np.array(one[1]), np.array(one[2]))]
+        self.missed += len(longer) - len(meet)
+        self.open = [one for one in meet if self.windows - one[0] < NEXT]
 
     def _keep(self, some: slice) -> None:
         self.ahead, self.origin, self.direction = self.ahead[some], self.origin[some], self.direction[some]
