@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,14 @@ def log_of(
 )
 def test_a_camera_that_stands_sees_things_that_stand_beside_people_and_false_boxes(seed, more):
     assert not boxes_move(log_of(seed, **more), 0.0, 20.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_people_who_walk_past_two_cameras_are_one_label_that_moves(seed):
+    """Things at rest were in view before the robot stood."""
+    front, back = (log_of(number, things=0, walking=True).cameras[0] for number in (seed, seed + 10))
+    back = replace(back, camera=replace(back.camera, name="back"))
+    assert not boxes_move(Log("log", (front, back)), 0.0, 20.0)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -30,9 +30,10 @@ def boxes_move(log: Log, start: float, end: float) -> bool:
 
     A label stands if more of its boxes stay than move. It may have several things, each at its own place. A box moves if it
     does not stay, and if a box of the image before or after is near it. So false boxes, which are somewhere else in each
-    image, do not move. Two labels must move if the log has several, because people also move past a robot that waits.
+    image, do not move. Two labels must move if the log has several, because people also move past a robot that waits. All
+    cameras see the same people, so a label counts once, however many cameras see it move.
     """
-    moving, still, labels = 0, 0, set[str]()
+    moving, still, labels = list[str](), 0, set[str]()
     for one in log.cameras:
         found = one.detections
         if found is None or one.mount is not None:  # An arm moves a camera while the base stands still.
@@ -44,8 +45,9 @@ def boxes_move(log: Log, start: float, end: float) -> bool:
             mine = in_time & (found.label == label)
             if mine.sum() >= _FEWEST:
                 stays, moves = _stays_and_moves(found.take(mine), one.camera.width * _STEP)
-                moving, still = moving + bool(moves.mean() > 0.5), still + bool(stays.sum() > moves.sum())
-    return moving > 2 * still and moving >= min(2, len(labels))
+                moving += [found.label_names[int(label)]] * bool(moves.mean() > 0.5)
+                still += bool(stays.sum() > moves.sum())
+    return len(moving) > 2 * still and len(set(moving)) >= min(2, len(labels))
 
 
 def _stays_and_moves(boxes: Detections, step: float) -> tuple[Bools, Bools]:
