@@ -18,7 +18,7 @@ from objslam.core.geometry import is_planar
 from objslam.core.ground.flattening import LEVEL, flat_scale, flattened_lines, noise_of_ground, raised_points
 from objslam.core.types import CameraLog, Detections, Keyframes, Log, Rays
 from objslam.errors import LogError
-from objslam.frontend.bearings import build_rays
+from objslam.frontend.bearings import CUT_OFF, build_rays
 from objslam.frontend.keyframes import build_keyframes, with_mounts
 from objslam.mapping.checks.meeting_points import fit_points
 from objslam.mapping.standstills import repeated_views
@@ -45,7 +45,8 @@ class Agreement:
     """How well boxes agree. share: the share of the boxes that fit a point. score: the share with weights and costs. A box
     that fits worse has less weight, and each point costs three boxes.
 
-    boxes: the number of boxes, including boxes without a ray. keyframes, rays: the measurements. point: (R,) the index into
+    boxes: the number of boxes, including boxes without a ray. cut: the number of boxes that the image's edge cuts off.
+    keyframes, rays: the measurements. point: (R,) the index into
     points of each ray, -1 for none. points: (N, 3) m. fit: (R,) how well each ray fits, 0 to 1. narrow: (R,) whether a ray
     neither fits nor misses, because the robot saw its thing from one direction only (`Meeting.narrow`).
     """
@@ -53,6 +54,7 @@ class Agreement:
     share: float
     score: float
     boxes: int
+    cut: int
     keyframes: Keyframes
     rays: Rays
     point: Ints
@@ -128,8 +130,9 @@ def bounded_part(log: Log, settings: Settings) -> Part:
 @dataclass(frozen=True)
 class _Measured:
     """The measurements of a log, as input of `fit_points`. origins, directions: (R, 3) in a world that is flattened by the
-    factor `scale`. label: (R,) a number for each label and window."""
+    factor `scale`. label: (R,) a number for each label and window. cut: the number of boxes cut off by the image's edge."""
 
+    cut: int
     keyframes: Keyframes
     rays: Rays
     origins: Floats
@@ -151,7 +154,7 @@ def agreements(
     window: for each camera, the windows of its frames, if they differ from the windows of the part.
     """
     waiting: list[_Measured | None] = []
-    built: tuple[Log, Keyframes, Rays] | None = None
+    built: tuple[Log, Keyframes, Rays, int] | None = None
     for log in logs:
         built = _built(log, settings, built)
         waiting.append(None if built is None else _measure(part, *built[1:], settings, window))
@@ -161,15 +164,19 @@ def agreements(
     yield from _fitted(part, waiting, settings)
 
 
-def _built(log: Log, settings: Settings, before: tuple[Log, Keyframes, Rays] | None) -> tuple[Log, Keyframes, Rays] | None:
-    """Return a log with its keyframes and rays, None if no frame has a pose. before: what this function returned for the log
-    before. Its rays are taken if the two logs differ only in the cameras' poses on the robot."""
+def _built(
+    log: Log, settings: Settings, before: tuple[Log, Keyframes, Rays, int] | None
+) -> tuple[Log, Keyframes, Rays, int] | None:
+    """Return a log with its keyframes and rays, and the number of boxes that the image's edge cuts off. None if no frame has
+    a pose. before: what this function returned for the log before. Its rays are taken if the two logs differ only in the
+    cameras' poses on the robot."""
     if before is not None and _differ_in_mounts(before[0], log):
-        return log, with_mounts(before[1], log), before[2]
-    free = settings.model_copy(update={"mode": "fixed"})
+        return log, with_mounts(before[1], log), *before[2:]
+    free, ledger = settings.model_copy(update={"mode": "fixed"}), Ledger()
     try:
         keyframes = build_keyframes(log, free, Ledger())
-        return log, keyframes, build_rays(log, keyframes, free, Ledger())
+        rays = build_rays(log, keyframes, free, ledger)
+        return log, keyframes, rays, ledger.dropped.get(CUT_OFF, 0)
     except LogError:
         return None
 
@@ -188,7 +195,9 @@ def _differ_in_mounts(one: Log, other: Log) -> bool:
     )
 
 
-def _measure(part: Part, keyframes: Keyframes, rays: Rays, settings: Settings, window: tuple[Ints, ...] | None) -> _Measured:
+def _measure(
+    part: Part, keyframes: Keyframes, rays: Rays, cut: int, settings: Settings, window: tuple[Ints, ...] | None
+) -> _Measured:
     windows = part.window if window is None else window
     of_keyframe = np.zeros(len(keyframes), dtype=np.int64)
     for index, mine in enumerate(windows):
@@ -197,7 +206,7 @@ def _measure(part: Part, keyframes: Keyframes, rays: Rays, settings: Settings, w
     label = rays.label + len(rays.label_names) * of_keyframe[rays.keyframe]
     scale = flat_scale(rays, _level_noise(part, settings), settings) if is_planar(keyframes.map_T_base) else LEVEL
     lines = flattened_lines(*rays.in_map(keyframes.map_T_camera), scale)
-    return _Measured(keyframes, rays, *lines[:2], scale, label)
+    return _Measured(cut, keyframes, rays, *lines[:2], scale, label)
 
 
 def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Iterator[Agreement | None]:
@@ -222,7 +231,7 @@ def _fitted(part: Part, logs: list[_Measured | None], settings: Settings) -> Ite
         fit = met.fit[mine]
         score = (fit.sum() - _COST * len(number)) / total
         share = float((own >= 0).sum() / total)
-        of_log = total, one.keyframes, one.rays
+        of_log = total, one.cut, one.keyframes, one.rays
         points = raised_points(met.points[number], one.scale)
         yield Agreement(share, float(score), *of_log, own, points, fit, met.narrow[mine])
 

@@ -66,7 +66,7 @@ times the score of a clean log. Larger multiples keep fewer findings that no sol
 class Trial:
     """The test of a hypothesis. score, share: as in `Agreement`. straight: as in `path.straightness`, None if unknown.
 
-    seen: the share of the boxes that have a ray. The other boxes are cut off by the image's edge, or lie outside the image.
+    seen: the share of the boxes that the image's edge does not cut off.
     """
 
     hypothesis: Hypothesis | None
@@ -76,8 +76,8 @@ class Trial:
     seen: float = 1.0
 
     @property
-    def of_rays(self) -> float:
-        """The score if only the boxes with a ray count."""
+    def of_whole(self) -> float:
+        """The score if boxes that the image's edge cuts off do not count."""
         return self.score / self.seen if self.seen > 0 else 0.0
 
 
@@ -114,16 +114,16 @@ def _unchanged(before: Agreement | None, log: Log) -> Trial:
 
 
 def _seen(found: Agreement) -> float:
-    """Return the share of the boxes that have a ray."""
-    return len(found.rays) / max(found.boxes, 1)
+    """Return the share of the boxes that the image's edge does not cut off."""
+    return 1 - found.cut / max(found.boxes, 1)
 
 
 def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = "") -> Finding | None:
     """Return a finding if a hypothesis explains the boxes, or the path, much better than the unchanged log.
 
-    Two scores must be better: the score of all boxes, and the score of the boxes with a ray. A box that the image's edge
-    cuts off has no ray. If x and y of right boxes are swapped, many boxes that were cut off get a ray, and some fit by
-    chance.
+    Two scores must be better: the score of all boxes, and the score without the boxes that the image's edge cuts off. They
+    have no ray, so they cannot fit. If x and y of right boxes are swapped, many of them get a ray, and some fit by chance.
+    A box with its centre outside the image has no ray either, but it counts as a box that does not fit.
 
     corrected: the score of the log without the errors that a run estimates. A hypothesis must also explain the boxes much
     better than this: a mount with another order of its quaternion may look like a mount that is tilted a little. unusual:
@@ -137,8 +137,8 @@ def verdict(trials: list[Trial], part: Part, corrected: float, unusual: str = ""
 
     def holds(trial: Trial, before: float) -> bool:
         times, least = (_CROWD_TIMES, _CROWD_MORE) if part.crowd > _CROWD else (_TIMES, _MORE)
-        of_rays = before / first.seen if first.seen > 0 else 0.0
-        more = all(now > max(times * old, old + least) for now, old in ((trial.score, before), (trial.of_rays, of_rays)))
+        whole = before / first.seen if first.seen > 0 else 0.0
+        more = all(now > max(times * old, old + least) for now, old in ((trial.score, before), (trial.of_whole, whole)))
         more &= (trial.score - before) * part.boxes > _MORE_BOXES and (part.drifts or trial.share >= _HALF)
         more &= trial.score >= least_score
         # Better boxes are no reason to make a straight path crooked.
