@@ -44,6 +44,7 @@ def recalibrate(m: MapState, calibration: Calibration, noise: NoiseFactors) -> N
         at = np.searchsorted(m.rays.number, track.numbers())
         track.remeasure(m.rays.direction[at], m.rays.range[at], m.rays.range_sigma[at], spread)
     m.landmarks.drift[:] = drift[: len(m.landmarks)]
+    m.pairs.apart.clear()  # Two objects that looked apart by the old noise may be one.
     m.schedule.relinearise_soon()
     m.solve_corrected()
 
