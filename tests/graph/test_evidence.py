@@ -8,6 +8,7 @@ import pytest
 from drives import ODOMETRY_ALONE, make_drive
 from scipy.stats import multivariate_normal
 
+from objslam.core.statistics import CAUCHY_K
 from objslam.core.types import Association
 from objslam.graph.assembly import Measurements
 from objslam.graph.posterior.evidence import log_evidence, shared_bias_density
@@ -83,3 +84,16 @@ def test_one_object_as_two_has_less_evidence_and_two_as_one_too():
     near = int(np.argmin(np.linalg.norm(drive.points[1:] - drive.points[0], axis=1))) + 1
     as_one = Association(np.where(true.object == near, 0, true.object), true.label)
     assert replace(drive, association=as_one).joint().log_evidence < right - 10
+
+
+def test_one_wrong_error_does_not_move_the_bias_of_a_group():
+    """The reference is the integral over the bias, with Cauchy's loss on each error."""
+    rng = np.random.default_rng(4)
+    off, group = rng.normal(0, 0.03, 20) + 0.02, np.zeros(20, dtype=np.int64)
+    off[3] = 50.0
+    variance, bias = np.full(20, 0.03**2), np.full(20, 0.02**2)
+    shared = np.linspace(-0.1, 0.1, 4001)
+    squares = CAUCHY_K**2 * np.log1p((off[:, None] - shared) ** 2 / variance[:, None] / CAUCHY_K**2)
+    squares = squares.sum(axis=0) + shared**2 / bias[0] + np.log(2 * np.pi * variance).sum() + np.log(2 * np.pi * bias[0])
+    expected = np.log(np.trapezoid(np.exp(-squares / 2 + squares.min() / 2), shared)) - squares.min() / 2
+    assert shared_bias_density(off, variance, bias, group, 1) == pytest.approx(expected, abs=0.5)

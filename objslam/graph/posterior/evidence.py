@@ -19,6 +19,9 @@ _VIEW = 1.0
 """The solid angle (sr) in which a stray ray may lie: about the view of a camera. With a larger value, the number of agreeing
 rays counts more, and their noise less."""
 
+_ITERATIONS = 10
+"""How often the bias that errors share is computed with new robust weights. Five are usual. More are slower."""
+
 
 def log_evidence(
     measured: Measurements, association: Association, used: Bools, distance: Floats, solved: Solved, cost: float
@@ -72,6 +75,9 @@ def _of_ranges(measured: Measurements, association: Association, used: Bools, di
 def shared_bias_density(off: Floats, variance: Floats, bias: Floats, group: Ints, count: int) -> float:
     """Return the log density of errors that share an unknown bias in each group, with Cauchy's loss.
 
+    The bias of a group has its most likely value, with the robust weights of the errors. So one error of many metres, which
+    Cauchy's loss allows, does not move it.
+
     Args:
         off: (n,) m, the errors.
         variance: (n,) m^2, of each error without the bias.
@@ -81,8 +87,11 @@ def shared_bias_density(off: Floats, variance: Floats, bias: Floats, group: Ints
     """
     number = np.maximum(np.bincount(group, minlength=count), 1)
     prior = np.bincount(group, bias, count) / number
-    wider = 1 + prior * np.bincount(group, 1 / variance, count)
-    shared = prior * np.bincount(group, off / variance, count) / wider
+    weight = 1 / (1 + off**2 / (variance + prior[group]) / CAUCHY_K**2)
+    for _ in range(_ITERATIONS):
+        wider = 1 + prior * np.bincount(group, weight / variance, count)
+        shared = prior * np.bincount(group, weight * off / variance, count) / wider
+        weight = 1 / (1 + (off - shared[group]) ** 2 / variance / CAUCHY_K**2)
     squares = CAUCHY_K**2 * np.log1p((off - shared[group]) ** 2 / variance / CAUCHY_K**2).sum()
     some = prior > 0
     squares += (shared[some] ** 2 / prior[some]).sum()
