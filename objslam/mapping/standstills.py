@@ -35,7 +35,7 @@ def repeated_views(log: Log, stamps: Floats, settings: Settings) -> Bools:
             turned = poses[:, :3, :3].reshape(-1, 9) / (np.sqrt(8) * np.sin(_TURN / 2))
             motion.append(np.concatenate([poses[:, :3, 3] / _STEP, turned], axis=1))
     repeated = np.zeros(len(stamps), dtype=bool)
-    begin = 0
+    begin = 0  # Each standstill begins where the one before ends, so the frames follow in a loop. They are a few hundred.
     while begin < len(stamps) and motion:
         end = begin + 1
         at = [path[begin] for path in motion]

@@ -83,7 +83,7 @@ def bodies(count):
     return st.builds(BodiesMessage, st.integers(0, 10**9), ids, shapes, sides, yaws, spread)
 
 
-SIZES, SHARES, SECONDS = st.floats(1.0, 20.0), st.floats(0.0, 1.0), st.floats(0.0, 1e3)
+SIZES, SHARES, SECONDS = st.floats(1.0, 300.0), st.floats(0.0, 1.0), st.floats(0.1, 1e3)
 NOISES = st.builds(
     NoiseFactors,
     heading=SIZES,
@@ -299,7 +299,14 @@ def test_a_calibration_of_an_older_version_has_the_noise_of_the_settings():
     assert decode(older).noise == NoiseFactors()
 
 
-@pytest.mark.parametrize("noise", [[0.0, 0, 0, 1, 0, 0], [1, 1.5, 1, 1, 0, 0], [1, 0, 0, 1, 0, -1.0], [1, 0, 0, 1]])
+IMPOSSIBLE = (
+    *([0.0, 0, 0, 1, 0, 0], [1e9, 0, 0, 1, 0, 0], [1, 1.5, 1, 1, 0, 0], [1, 0.5, 0, 1, 0, 0]),
+    *([1, 0, 0, 1, 0, -1.0], [1, 0, 0, 1], "noise", [[1, 0, 0, 1, 0, 0]] * 2, [1, 0, 0, "a", 0, 0]),
+)
+"""Too small, too large, a share above 1, a part that lasts for no time, a time below 0, and lists that are none."""
+
+
+@pytest.mark.parametrize("noise", IMPOSSIBLE)
 def test_a_calibration_with_noise_that_cannot_be_is_refused(noise):
     message = CalibrationMessage(7, Calibration((), np.zeros(0), np.zeros((0, 0)), np.zeros(0)))
     parts = json.loads(encode(message)[1:])

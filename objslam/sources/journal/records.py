@@ -13,7 +13,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.bodies.body import SHAPES
 from objslam.core.calibration import Calibration
 from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
-from objslam.core.noise import NOMINAL, NoiseFactors
+from objslam.core.noise import MOST_POSE_NOISE, NOMINAL, NoiseFactors
 from objslam.core.validity import (
     MAX_POSITION,
     box_rules,
@@ -245,10 +245,10 @@ def _noise(values: list[float] | None = None) -> NoiseFactors:
     if values is None:
         return NOMINAL
     noise = dict(zip(_OF_LOCALIZATION, _array(values, (len(_OF_LOCALIZATION),)).tolist(), strict=True))
-    if min(noise.values()) < 0 or min(noise["heading"], noise["place"]) == 0:
-        raise ValueError("the noise of the localisation is not positive")
-    if max(noise["heading_share"], noise["place_share"]) > 1:
-        raise ValueError("a share of the noise of the localisation is above 1")
+    for name in ("heading", "place"):
+        share, seconds = noise[f"{name}_share"], noise[f"{name}_seconds"]
+        if not 0 < noise[name] <= MOST_POSE_NOISE or not 0 <= share <= 1 or seconds < 0 or (share > 0 and seconds == 0):
+            raise ValueError(f"the noise of localised {name}s cannot be")
     return NoiseFactors(**noise)
 
 
