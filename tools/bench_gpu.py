@@ -1,13 +1,16 @@
-"""Measure Eq. 1 and the consensus of triangulation on a CUDA device, beside the card's own copy bandwidth.
+"""Measure the three kinds of work of objslam that run on a CUDA device, beside the card's own copy bandwidth.
 
     python tools/bench_gpu.py                # says so in one line, and ends with 0, if there is no device
     python tools/bench_gpu.py --device cpu   # the same rows on the CPU
 
-Three kinds of work run on CUDA: Eq. 1 (`minimise_distances`), the score of one point for each object by the rays that agree
-with it (`consensus_about`), and the search for the best of many pairs of rays (`best_pair`). A row has the time of one call,
-and the bytes that the call must move at the least, as a share of what the card copies in that time. The least is the input
-of each step once, and no intermediate result. So a small share can mean a slow kernel, or a kernel that computes much with
-each number. The association of a log is in numpy, so its scores are not in the table.
+They are Eq. 1 (`minimise_distances`), the consensus of triangulation, and the scores of association. A consensus scores one
+point for each object by the rays that agree with it (`consensus_about`), or the best of many pairs of rays (`best_pair`).
+Association scores many points by all rays (`supports`). A row has the time of one call, and the bytes that the call must
+move at the least, as a share of what the card copies in that time. The least is the input of each step once, or the scores
+once if there are more of them, and no other intermediate result. So a small share can mean a slow kernel, or a kernel that
+computes much with each number.
+
+The last rows have the time of a whole triangulation, from and to arrays of numpy, beside that of numpy on one core.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -24,12 +28,15 @@ import numpy as np
 from bench_triangulation import scene
 
 from objslam import config
+from objslam.association.hypothesis_search import Search, _Scorer
+from objslam.association.observations import Observations
 from objslam.core.array_module import Backend, as_tensor, module_of
 from objslam.triangulation import ac_ransac
 from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.point_to_lines import minimise_distances
+from objslam.triangulation.triangulate import triangulate
 
-SIZES = ((1_000, 50), (20_000, 50), (100_000, 50))
+SIZES = ((1_000, 50), (4_000, 50), (20_000, 50), (100_000, 50))
 """The numbers of objects, and of rays of each."""
 HYPOTHESES = config.Triangulation().hypotheses
 """The pairs of rays that are tried for each object."""
@@ -39,6 +46,14 @@ REPEATS = 5
 """The timed calls of each kind, of which the median counts, after one call that warms up."""
 RAY = 7 * 8
 """The bytes of a ray in a step of Eq. 1: a foot, a direction and a weight, in double precision."""
+NOISE = 0.006
+"""The noise of the rays, rad."""
+POINTS = 2_000
+"""The points that association scores by all rays."""
+SCORED = 200_000
+"""The most rays by which association scores points, so that the scores fit into the memory of a small card."""
+WHOLE = 1_000_000
+"""The most rays of a whole triangulation, which takes numpy 10 s."""
 
 
 def seconds(work: Callable[[], Any], wait: Callable[[], Any]) -> float:
@@ -55,12 +70,33 @@ def seconds(work: Callable[[], Any], wait: Callable[[], Any]) -> float:
 
 def bundle_of(objects: int, rays: int, device: Backend) -> Bundle:
     """Return the rays of `bench_triangulation.scene`, seen from the mean origin of each object, on a device."""
-    origins, directions, index = scene(objects, rays, 0.2, 0.006)
+    origins, directions, index = scene(objects, rays, 0.2, NOISE)
     origins -= origins.reshape(objects, rays, 3).mean(axis=1)[index]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    noise, number = np.full(len(index), 0.006), np.full(objects, rays)
+    noise, number = np.full(len(index), NOISE), np.full(objects, rays)
     origin, direction, sigma, owner, count = (as_tensor(one, device) for one in (origins, directions, noise, index, number))
     return Bundle(origin, direction, sigma, 0.0, owner, count, module_of(origin))
+
+
+def scorer_of(objects: int, rays: int, device: Backend) -> Any:
+    """Return the scorer of association for the rays of `bench_triangulation.scene`, with a frame for each five rays."""
+    origins, directions, index = scene(objects, rays, 0.2, NOISE)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    noise, unknown = np.full(len(index), NOISE), np.full(len(index), np.nan)
+    seen = Observations.of_lines(origins, directions, noise, unknown, unknown)
+    search = Search(hypotheses=POINTS, support=3.0, gate=13.8, parallax=0.03, device=device)
+    return _Scorer(replace(seen, frame=np.arange(len(index)) // 5), search, device)
+
+
+def whole(objects: int, rays: int, device: str) -> float:
+    """Return the time, s, of a whole triangulation from arrays of numpy, after one that warms up."""
+    lines = scene(objects, rays, 0.2, NOISE)
+    settings = config.Triangulation.model_validate({"device": device})
+    for _ in range(2):
+        begin = time.perf_counter()
+        triangulate(*lines, objects, NOISE, settings)
+        took = time.perf_counter() - begin
+    return took
 
 
 def main() -> int:
@@ -105,6 +141,12 @@ def main() -> int:
                 2 * 4 * number * HYPOTHESES,  # The score of each ray and pair is written and read once, in single precision.
             ),
         }
+        if number <= SCORED:
+            scorer = scorer_of(objects, rays, device)
+            points = scorer.load(np.random.default_rng(0).uniform(-20, 20, (POINTS, 3)))
+            # The score of each ray and point is written, in single or double precision.
+            least = scorer.ahead.dtype.itemsize * number * POINTS
+            work[f"{POINTS:,} points' support"] = (lambda: scorer.supports(points), least)  # noqa: B023
         for kind, (call, least) in work.items():
             took = seconds(call, wait)
             rate = least / took
@@ -112,6 +154,13 @@ def main() -> int:
                 f"{kind:<24}{objects:>9,}{number:>12,}{1e3 * took:>9.2f} ms{number / took:>12.3g}{rate / 1e9:>6.1f} GB/s"
                 f"{100 * rate / bandwidth:>9.1f} %",
                 flush=True,
+            )
+    for objects, rays in SIZES:
+        if device == "cuda" and objects <= asked.most and objects * rays <= WHOLE:
+            card, core = whole(objects, rays, "cuda"), whole(objects, rays, "cpu")
+            print(
+                f"{'whole triangulation':<24}{objects:>9,}{objects * rays:>12,}{1e3 * card:>9.2f} ms,"
+                f" numpy {1e3 * core:.0f} ms: {core / card:.1f} times as fast"
             )
     return 0
 

@@ -8,8 +8,12 @@ from objslam.association.observations import MIN_DEPTH, Observations, closest_ap
 from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, as_tensor, module_of
 from objslam.core.arrays import Floats, Ints
 
-_PAIRS_AT_ONCE = 1 << 18  # The most pairs of a ray and a point scored together, which fit into the processor's cache.
-_LARGE = 1 << 26  # With at least this many pairs of a ray and a point, torch is used. It can use CUDA, numpy cannot.
+_PAIRS_AT_ONCE = {"numpy": 1 << 18, "cpu": 1 << 18, "cuda": 1 << 24}
+"""The most pairs of a ray and a point scored together, for each backend. On a CPU they fit into the cache. On CUDA, fewer
+need more calls: on an H100, 400,000,000 pairs took 141 ms with 2^18, and 12 ms with 2^22 to 2^28."""
+_LARGE = 1 << 26
+"""With at least this number of pairs of a ray and a point, CUDA scores them, if there is a card. With fewer, the start of
+CUDA costs more than it saves. An H100 scores 2^26 pairs in 2 ms, and numpy in 0.2 s."""
 _DRAWS_EACH = 8  # The number of ray pairs drawn for each hypothesis. Most pairs of rays do not meet.
 _REFINEMENTS = 2  # The number of least-squares refinements of each hypothesis. A larger value costs time.
 _MIN_LEFT = 0.6
@@ -161,7 +165,7 @@ class _Scorer:
         xp = self.xp
         p = xp.concat([points, (points**2).sum(axis=1)[:, None], xp.ones_like(points[:, :1])], axis=1)
         out = xp.empty((len(p), self.ahead.shape[1]), dtype=p.dtype, device=p.device)
-        step = max(1, _PAIRS_AT_ONCE // self.ahead.shape[1])
+        step = max(1, _PAIRS_AT_ONCE[self.backend] // self.ahead.shape[1])
         for i in range(0, len(p), step):
             depth = (p[i : i + step] @ self.ahead).clip(min=1e-3)  # No ray supports a point behind its camera.
             depth2 = depth * depth

@@ -27,7 +27,8 @@ from objslam.triangulation.smoothed_newton import finish
 _PLACES = {"numpy": 1 << 14, "cpu": 1 << 16, "cuda": 1 << 24}
 """The most rays, with fillers, in one block, for each backend. Smaller blocks need more calls, and a call of torch costs
 more than one of numpy. Larger blocks do not fit into the cache of a CPU: blocks four times as large take 1.1 (numpy) and 1.2
-times (torch) as long. On CUDA, a ray needs 1 kB. The number for CUDA was not measured."""
+times (torch) as long. On CUDA, a ray needs 0.5 kB. On an H100, 5,000,000 rays took 497 ms with 2^18, 161 ms with 2^22, and
+as long with up to 2^26."""
 _ROUNDS = 3
 """The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest.
 More rounds leave fewer objects for it."""

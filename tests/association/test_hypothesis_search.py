@@ -82,10 +82,13 @@ def test_a_search_among_few_rays_tries_each_pair_once(count, most, monkeypatch):
         assert sorted(map(tuple, pairs.tolist())) == [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
-def test_torch_finds_the_same_points_and_gives_its_threads_back(monkeypatch):
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_torch_finds_the_same_points_and_gives_its_threads_back(monkeypatch, device):
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("torch sees no CUDA device")
     obs = observed(watch(THREE, circle(20), pixel_sigma=1.0))
     small = discover(obs, SEARCH, np.random.default_rng(0))
-    monkeypatch.setattr("objslam.association.hypothesis_search._LARGE", 0)
+    monkeypatch.setattr("objslam.core.array_module.chosen_backend", lambda *_: device)
     before = torch.get_num_threads()
     large = discover(obs, SEARCH, np.random.default_rng(0))
     assert torch.get_num_threads() == before

@@ -5,12 +5,10 @@ from __future__ import annotations
 import importlib.util
 import sys
 
-import numpy as np
 import pytest
 
 from objslam.core.array_module import array_backend
 from objslam.errors import ConfigError, ObjslamError
-from objslam.triangulation.triangulate import solve_eq1
 
 
 @pytest.fixture
@@ -34,20 +32,6 @@ def test_a_large_batch_runs_in_numpy() -> None:
     assert [backend(device, large=large) for device in ("auto", "cpu") for large in (False, True)] == ["numpy"] * 4
     with pytest.raises(ConfigError, match="needs torch"):
         backend("cuda", large=True)
-
-
-def test_numpy_places_objects_as_torch_does(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    rng = np.random.default_rng(0)
-    objects = np.repeat(np.arange(40), 30)
-    points = rng.uniform(-3, 3, (40, 3))
-    origins = rng.uniform(-5, 5, (len(objects), 3))
-    directions = points[objects] - origins + 0.01 * rng.normal(size=origins.shape)
-    monkeypatch.setattr("objslam.triangulation.triangulate._LARGE", 1)
-    by_torch = solve_eq1(origins, directions, objects, 40)[0]
-    request.getfixturevalue("small")
-    by_numpy = solve_eq1(origins, directions, objects, 40)[0]
-    np.testing.assert_allclose(by_numpy, by_torch, atol=1e-6)
-    np.testing.assert_allclose(by_numpy, points, atol=0.05)
 
 
 @pytest.mark.usefixtures("small")

@@ -5,8 +5,10 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from objslam import config
+from objslam.core.array_module import chosen_backend
 from objslam.core.geometry import widest_angle
 from objslam.errors import ConfigError
 from objslam.triangulation.triangulate import solve_eq1, triangulate
@@ -255,9 +257,12 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch):
         triangulate([[0, 0, 0]], [[0, 0, 1]], [0], 1, 0.1, config.Triangulation(device="cuda"))
 
 
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
 @pytest.mark.parametrize("ranged", [False, True])
-def test_numpy_and_torch_agree(monkeypatch, ranged):
-    """A large batch goes to torch. It is the same code, so the results are the same up to rounding."""
+def test_numpy_and_torch_agree(monkeypatch, ranged, device):
+    """CUDA runs the code of torch, which a CPU can run too. The results are those of numpy up to rounding."""
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("torch sees no CUDA device")
     rng = np.random.default_rng(12)
     m, n, index, truth = approaching(rng, 30, 25, 0.004)
     n[::5] += 0.5 * rng.normal(size=(150, 3))
@@ -269,7 +274,7 @@ def test_numpy_and_torch_agree(monkeypatch, ranged):
         return whole, solve_eq1(m, n, index, 31)
 
     small, eq1 = results()
-    monkeypatch.setattr("objslam.triangulation.triangulate._LARGE", 0)
+    monkeypatch.setattr("objslam.core.array_module.chosen_backend", lambda *_: device)
     large, eq1_large = results()
     for name in ("ok", "weight", "counts"):
         np.testing.assert_array_equal(getattr(large, name), getattr(small, name))
@@ -280,13 +285,24 @@ def test_numpy_and_torch_agree(monkeypatch, ranged):
     assert np.nanmax(eq1_large[2]) < 1e-9
 
 
-def test_a_small_batch_does_not_import_torch():
-    code = """
+@pytest.mark.parametrize("limit", ["", "module._LARGE = 0; array_module._has_driver = lambda: False"])
+def test_neither_a_small_batch_nor_one_without_a_card_imports_torch(limit):
+    code = f"""
 import sys
 from objslam import config
-from objslam.triangulation.triangulate import triangulate
+from objslam.core import array_module
+from objslam.triangulation import triangulate as module
+{limit}
 rays = [[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[1, 0, 3], [0, 0, 3], [-1, 0, 3.0]]
-assert triangulate(*rays, [0, 0, 0], 1, 0.01, config.Triangulation()).ok.all()
+assert module.triangulate(*rays, [0, 0, 0], 1, 0.01, config.Triangulation()).ok.all()
 sys.exit("torch" in sys.modules)
 """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(("card", "chosen"), [(True, "cuda"), (False, "numpy")])
+def test_a_large_batch_runs_on_a_card_or_in_numpy(monkeypatch, card, chosen):
+    monkeypatch.setattr("objslam.core.array_module._has_driver", lambda: True)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: card)
+    assert chosen_backend("auto", large=True) == chosen
+    assert chosen_backend("auto", large=False) == chosen_backend("cpu", large=True) == "numpy"
