@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from types import ModuleType
 
-from objslam.core.array_module import Tensor, backend_of, indices_of
+import numpy as np
+
+from objslam.core.array_module import Tensor, as_numpy, as_tensor, backend_of, indices_of
 from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.line_block import (
     LineBlock,
@@ -32,6 +34,9 @@ as long with up to 2^26."""
 _ROUNDS = 3
 """The most rounds of `off_nearest_line` for the objects with a line near the solution. `smoothed_newton` solves the rest.
 More rounds leave fewer objects for it."""
+_FEW = 1 << 16
+"""The most rays, with fillers, of objects that `smoothed_newton` solves in numpy instead of torch. It takes hundreds of
+calls for each step, and usually a few objects of many thousands are left for it. A larger number calls CUDA less often."""
 _LEAST_REGULAR = 1e-6
 """If a matrix is less regular than this (from 0 to 1), its eigenvalues decide whether the lines fix a point. A larger value
 computes eigenvalues more often."""
@@ -94,7 +99,7 @@ def minimise_distances(bundle: Bundle) -> PointSolution:
             start, near = point[objects].T, guess[objects].T
             lines, unit, _ = _unit_lines(origin - start[:, None], direction, weight, xp)
             if last:
-                step, rest, steps = finish(lines)
+                step, rest, steps = _finish(lines)
                 solved = xp.ones_like(rest, dtype=xp.bool)
             else:
                 step, rest, solved, steps = off_nearest_line(lines, near)
@@ -105,6 +110,15 @@ def minimise_distances(bundle: Bundle) -> PointSolution:
         # Lines in one plane cross in their solution. Then no round would solve any object.
         turn = turn + 1 if number < before else _ROUNDS + 1
     return PointSolution(point, determined, gradient, sum(iterations))
+
+
+def _finish(lines: LineBlock) -> tuple[Tensor, Tensor, int]:
+    """Return the result of `smoothed_newton.finish`. The lines of few objects are solved in numpy."""
+    backend = backend_of(lines.weight)
+    if backend == "numpy" or lines.weight.numel() > _FEW:
+        return finish(lines)
+    step, rest, steps = finish(LineBlock(as_numpy(lines.foot), as_numpy(lines.direction), as_numpy(lines.weight), np))
+    return as_tensor(step, backend), as_tensor(rest, backend), steps
 
 
 def _unsolved(bundle: Bundle) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from scipy.optimize import brentq, minimize, root
 from scipy.spatial.transform import Rotation
 
 from objslam.core.array_module import array_backend, as_numpy
-from objslam.triangulation import smoothed_newton
+from objslam.triangulation import point_to_lines, smoothed_newton
 from objslam.triangulation.point_to_lines import least_squares
 from objslam.triangulation.triangulate import _bundle, solve_eq1
 
@@ -250,3 +250,20 @@ def test_a_singular_matrix_gives_a_finite_step(xp):
     matrices, right = xp.asarray(np.stack([regular, singular])), xp.asarray(np.array([[2.0, 4.0, 5.0], [3.0, 0.0, 6.0]]))
     found = np.asarray(smoothed_newton._solved(matrices, right[:, :, None], xp))[..., 0]
     np.testing.assert_allclose(found, [[1.0, 1.0, 1.0], [1.0, 0.0, 1.0]], atol=1e-8)
+
+
+@pytest.mark.parametrize("few", [0, 1 << 16])
+def test_torch_leaves_few_hard_objects_to_numpy_with_the_same_solutions(monkeypatch, few):
+    """No round solves lines in one plane, so `smoothed_newton` gets them."""
+    rng = np.random.default_rng(5)
+    m, n, index, places = rays_around(rng, 6, 7, noise=0.1)
+    m[:, 2], n[:, 2] = places[index, 2], 0.0
+    expected = solve_eq1(m, n, index, 6)[0]
+    libraries = []
+    monkeypatch.setattr(point_to_lines, "_FEW", few)
+    monkeypatch.setattr(point_to_lines, "finish", lambda lines: libraries.append(lines.xp) or smoothed_newton.finish(lines))
+    monkeypatch.setattr("objslam.core.array_module.chosen_backend", lambda *_: "cpu")
+    found, _, gradient = solve_eq1(m, n, index, 6)
+    assert set(libraries) == {np if few else torch}
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    assert gradient.max() < 1e-9
