@@ -45,7 +45,7 @@ from objslam.mapping.joint.held_errors import check_turned_camera, with_held_err
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.progress import Progress
-from objslam.mapping.refuted import without_refuted
+from objslam.mapping.refuted import with_known_labels, without_refuted
 from objslam.mapping.solution import seen_something, with_jumps
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
@@ -156,6 +156,8 @@ def _run(
         # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.
         spoilt = diagnosis.spoilt and settings.mode == "fixed"
         errors = None if spoilt else shared_errors(log, *seen_something(frames, rays), settings)
+        if settings.mode == "joint" and diagnosis.refutable:
+            settings = with_known_labels(diagnosis, log, settings, of_solve)
         try:
             solution = solve(frames, rays, cameras, settings, ledger, of_solve, errors=errors)
         except SolveError:

@@ -22,7 +22,7 @@ from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.hypothesis import Hypothesis
 from objslam.mapping.checks.hypotheses.trials import Trial, clear
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
-from objslam.mapping.refuted import without_refuted
+from objslam.mapping.refuted import with_known_labels, without_refuted
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
 
 pytestmark = pytest.mark.usefixtures("one_start")
@@ -242,3 +242,30 @@ def test_an_object_is_seen_in_both_halves_unless_by_chance():
     # Two rays of 52 are chance.
     assert seen_in_both(late, fits, np.append(np.zeros(52, dtype=int), np.ones(48, dtype=int))) == 0.0
     assert seen_in_both(late, ~fits, np.zeros(100, dtype=int)) == 0.0
+
+
+def test_labels_that_a_corrected_log_shows_as_names_are_names_in_the_wrong_log(clean):
+    """So the boxes of a wrong log are not associated without their labels."""
+    log = MISTAKES["base_T_camera inverted"](clean)
+    diagnosis = diagnose(log, SETTINGS, Ledger())
+    assert [one.name for one in diagnosis.findings] == ["mount inverted"]
+    assert with_known_labels(diagnosis, log, SETTINGS, nothing).association.method == "by_label"
+    given = load_settings(None, ("mode=joint", "output.recording=false", "association.method=global"))
+    assert with_known_labels(diagnosis, log, given, nothing) is given
+    assert with_known_labels(Diagnosis(), log, SETTINGS, nothing) is SETTINGS
+
+
+def test_labels_of_several_objects_are_no_names():
+    """Neither in the given log nor in the corrected one. A camera sees at most one object of a label at once."""
+    whole = simulate(preset("demo", frames=200, objects=8, classes=8, false=0.0, localization=None), 0)
+    found = whole.cameras[0].detections
+    pairs = replace(found, label=found.label // 2)
+    apart = np.unique(np.stack([pairs.frame, pairs.label]), axis=1, return_index=True)[1]
+    kept = np.sort(apart)
+    columns = {name: getattr(pairs, name)[kept] for name in ("frame", "boxes", "label", "scores", "depths", "track_ids")}
+    log = MISTAKES["base_T_camera inverted"](
+        replace(whole, cameras=(replace(whole.cameras[0], detections=replace(pairs, **columns)),))
+    )
+    diagnosis = diagnose(log, SETTINGS, Ledger())
+    assert diagnosis.spoilt
+    assert with_known_labels(diagnosis, log, SETTINGS, nothing) is SETTINGS
