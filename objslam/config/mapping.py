@@ -237,6 +237,10 @@ class Live(Section):
     """Number of keyframes at which the session first estimates the shared errors and the noise of the localisation. It
     estimates them again whenever the number of keyframes has grown by half. 0 estimates them only at the end of the
     session."""
+    search_from: Annotated[int, Field(ge=0)] = 75
+    """Number of keyframes at which the session first searches its unexplained boxes for objects, by the offline association
+    in a process beside it. It searches again whenever the number of keyframes has grown by half, up to `reassociate` boxes.
+    0 searches only at the end of the session."""
     forget: Positive = 5.0
     """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 
 from objslam.live.mapper.maintenance import is_quiet
 from objslam.live.worker import Request, Worker, solved
-from objslam.sources.journal.records import Correction
+from objslam.sources.journal.corrections import Correction
 
 if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
@@ -36,6 +36,8 @@ class Rounds(ABC, Generic[Answer, Told]):
     quick: bool
     """Whether a round takes less time than the start of a process. Then a patient session does the work itself, and any
     other session keeps its process running."""
+    told: type[Told]
+    """The kind of its corrections."""
 
     def __init__(self, mapper: Mapper, record: Callable[[Told], bool], first: int, patient: bool) -> None:
         """Prepare for a session. record: writes a correction to the journal, and returns whether it may be made.
@@ -51,9 +53,9 @@ class Rounds(ABC, Generic[Answer, Told]):
         self._known: deque[Told] = deque()
         self._replaying = False
 
-    def expect(self, known: Iterable[Told]) -> None:
-        """Replay the corrections of a journal, each at its keyframe. No new round starts before `begin`."""
-        self._known, self._replaying = deque(known), True
+    def expect(self, known: Iterable[Correction]) -> None:
+        """Replay its own among the corrections of a journal, each at its keyframe. No new round starts before `begin`."""
+        self._known, self._replaying = deque(one for one in known if isinstance(one, self.told)), True
 
     def begin(self) -> None:
         """Continue after the journal of a resumed session. Repeat the last round if it had not yet corrected the map."""

@@ -22,13 +22,12 @@ from objslam.errors import LogError, OutputError
 from objslam.simulation import make_camera
 from objslam.sources import read
 from objslam.sources.journal.aside import restore_after_kill
+from objslam.sources.journal.corrections import BodiesMessage, CalibrationMessage, ObjectsMessage
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.log import read_journal
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.record_format import MAGICS
 from objslam.sources.journal.records import (
-    BodiesMessage,
-    CalibrationMessage,
     CameraMessage,
     FrameMessage,
     MountMessage,
@@ -83,6 +82,13 @@ def bodies(count):
     return st.builds(BodiesMessage, st.integers(0, 10**9), ids, shapes, sides, yaws, spread)
 
 
+def objects(count):
+    """Of up to 9 rays each, no ray of two objects."""
+    numbers = st.lists(st.integers(0, 10**9), min_size=count, max_size=9 * count, unique=True)
+    parts = numbers.map(lambda found: tuple(np.array(sorted(found[i::count]), dtype=np.int64) for i in range(count)))
+    return st.builds(ObjectsMessage, st.integers(0, 10**9), parts)
+
+
 SIZES, SHARES, SECONDS = st.floats(1.0, 300.0), st.floats(0.0, 1.0), st.floats(0.1, 1e3)
 NOISES = st.builds(
     NoiseFactors,
@@ -100,6 +106,7 @@ MESSAGES = st.one_of(
     st.builds(NoteMessage, FINITE, POSES),
     st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations), NOISES),
     st.integers(0, 4).flatmap(bodies),
+    st.integers(1, 4).flatmap(objects),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
     st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),
     st.just(CameraMessage(replace(make_camera("depth"), depth_noise=RangeNoise(0.01, 0.005, 0.02)))),
@@ -114,6 +121,8 @@ def same(one, other):
             same(a, b)
         elif isinstance(a, np.ndarray):
             np.testing.assert_array_equal(a, b)
+        elif isinstance(a, tuple) and a and isinstance(a[0], np.ndarray):
+            assert list(map(list, a)) == list(map(list, b))
         else:
             assert a == b
 

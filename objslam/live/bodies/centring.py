@@ -16,7 +16,7 @@ from objslam.live.counters import Counters
 from objslam.live.rounds import Rounds
 from objslam.mapping.bodies.centre_bearings import worth_turning
 from objslam.mapping.bodies.fitting import FEWEST
-from objslam.sources.journal.records import BodiesMessage
+from objslam.sources.journal.corrections import BodiesMessage
 
 if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
@@ -62,7 +62,7 @@ class CentringRequest:
 class BodyCentring(Rounds[BodiesMessage, BodiesMessage]):
     """Fits bodies in rounds, and turns the bearings of their landmarks to their centres."""
 
-    growth, delay, quick = _GROWTH, _DELAY, True
+    growth, delay, quick, told = _GROWTH, _DELAY, True, BodiesMessage
 
     def __init__(
         self,

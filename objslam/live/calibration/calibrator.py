@@ -19,7 +19,7 @@ from objslam.live.calibration.recalibration import recalibrate
 from objslam.live.calibration.request import CalibrationRequest
 from objslam.live.counters import Counters
 from objslam.live.rounds import Rounds
-from objslam.sources.journal.records import CalibrationMessage
+from objslam.sources.journal.corrections import CalibrationMessage
 
 if TYPE_CHECKING:
     from objslam.live.mapper.mapper import Mapper
@@ -81,7 +81,7 @@ def _without_late(errors: SharedErrors, theta: Floats, known: Container[str]) ->
 class Calibrator(Rounds[tuple[Calibration, NoiseFactors] | None, CalibrationMessage]):
     """Estimates the shared errors and the noise of the localisation in rounds, and corrects the map by them."""
 
-    growth, delay, quick = _GROWTH, _DELAY, False
+    growth, delay, quick, told = _GROWTH, _DELAY, False, CalibrationMessage
 
     def __init__(
         self,

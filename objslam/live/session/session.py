@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -22,15 +22,18 @@ from objslam.live.bodies.description import BodyEstimator
 from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
+from objslam.live.rounds import Rounds
+from objslam.live.search.object_search import ObjectSearch
 from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import FrameQueue
 from objslam.live.session.intake import Intake
 from objslam.live.session.map_locator import MapLocator
 from objslam.live.session.snapshots import Describer, take_snapshot
 from objslam.mapping.localization import PriorMap
+from objslam.sources.journal.corrections import Correction
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.reader import corrections, messages
-from objslam.sources.journal.records import Correction, FrameMessage, Message, NoteMessage
+from objslam.sources.journal.records import FrameMessage, Message, NoteMessage
 
 _MOST_POSES = 20_000  # The most messages, except frames, that wait: 100 s of odometry at 200 Hz. More cost memory.
 _IDLE = 0.05
@@ -65,11 +68,14 @@ class Session(Intake):
     ) -> None:
         super().__init__(settings, Counters(), self._enqueue)
         self._mapper = Mapper(settings, self.counters)
-        self._calibrator = Calibrator(settings, self.counters, self._mapper, self._record, name, patient)
-        self._centring = BodyCentring(settings, self.counters, self._mapper, self._record, patient)
+        of_session = settings, self.counters, self._mapper, self._record
+        self._rounds: tuple[Rounds[Any, Any], ...] = (
+            Calibrator(*of_session, name, patient),
+            ObjectSearch(*of_session, name, patient),
+            BodyCentring(*of_session, patient),
+        )
         self._known, self._locator = known, MapLocator(known, self._mapper, self.counters)
-        rounds = (self._calibrator, self._centring)
-        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, rounds, self._locator, patient)
+        self._frames_waiting = FrameQueue(settings, self.counters, self._mapper, self._rounds, self._locator, patient)
         self._name, self._journal_file, self._resume, self._patient = name, journal, resume, patient
         live = settings.live
         self._journal = None
@@ -163,8 +169,8 @@ class Session(Intake):
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join()
-        self._calibrator.close()
-        self._centring.close()
+        for each in self._rounds:
+            each.close()
         self._bodies.close()
         if self._journal is not None:
             try:
@@ -227,15 +233,15 @@ class Session(Intake):
     def _replay_journal(self) -> None:
         if not self._journal_file or not self._resume:
             return
-        calibrations, bodies = corrections(self._journal_file)
-        self._calibrator.expect(calibrations)
-        self._centring.expect(bodies)
+        known = corrections(self._journal_file)
+        for each in self._rounds:
+            each.expect(known)
         for message in messages(self._journal_file, self.counters.ledger):
             if not isinstance(message, Correction):
                 self.recall(message)
                 self._frames_waiting.take(message, time.perf_counter(), measured=False)
-        self._calibrator.begin()
-        self._centring.begin()
+        for each in self._rounds:
+            each.begin()
 
     def _work(self) -> None:
         self._guard(self._serve)

@@ -6,17 +6,8 @@ from pathlib import Path
 
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
-from objslam.sources.journal.records import (
-    BODIES_KIND,
-    CALIBRATION_KIND,
-    BodiesMessage,
-    CalibrationMessage,
-    Correction,
-    Message,
-    decode,
-    is_stop,
-    read_stop,
-)
+from objslam.sources.journal.corrections import CORRECTION_READERS, Correction
+from objslam.sources.journal.records import Message, decode, is_stop, read_stop
 from objslam.sources.journal.segments import contents
 
 
@@ -36,15 +27,14 @@ def messages(path: Path, ledger: Ledger) -> Iterator[Message]:
             ledger.drop(error.message, where=place)
 
 
-def corrections(file: Path) -> tuple[list[CalibrationMessage], list[BodiesMessage]]:
+def corrections(file: Path) -> list[Correction]:
     """Return only the corrections in the journal `file`. A correction may come later in the file than the keyframe at which
     it takes effect."""
     found: list[Correction] = []
     for _, content in contents(file, Ledger()):
-        if content.startswith((CALIBRATION_KIND, BODIES_KIND)):
+        if content[:1] in CORRECTION_READERS:
             with suppress(LogError):  # `messages` counts unreadable records.
                 message = decode(content)
                 assert isinstance(message, Correction)
                 found.append(message)
-    bodies = [one for one in found if isinstance(one, BodiesMessage)]
-    return [one for one in found if isinstance(one, CalibrationMessage)], bodies
+    return found

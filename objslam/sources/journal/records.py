@@ -10,21 +10,11 @@ from typing import Literal
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.bodies.body import SHAPES
-from objslam.core.calibration import Calibration
 from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
-from objslam.core.noise import MOST_POSE_NOISE, NOMINAL, NoiseFactors
-from objslam.core.validity import (
-    MAX_POSITION,
-    box_rules,
-    camera_fault,
-    covariance_fault,
-    is_name,
-    rigid_pose,
-    valid_depths,
-    valid_stamps,
-)
+from objslam.core.validity import box_rules, camera_fault, is_name, valid_depths
 from objslam.errors import LogError
+from objslam.sources.journal.corrections import CORRECTION_READERS, Correction, encode_correction
+from objslam.sources.journal.fields import as_array, as_count, as_name, as_pose, as_stamp
 
 PathKind = Literal["odometry", "localization"]
 
@@ -35,12 +25,6 @@ _PATHS: dict[bytes, PathKind] = {kind: path for path, kind in _KINDS.items()}
 _MOUNT_KIND, _CAMERA_KIND, _FRAME_KIND, _NOTE_KIND = b"M", b"C", b"F", b"N"
 _STOP_KIND = b"E"
 _LONGEST_REASON = 200  # The most letters of a reason that are shown. A larger number shows more of it.
-_OF_LOCALIZATION = ("heading", "heading_share", "heading_seconds", "place", "place_share", "place_seconds")
-"""The fields of `NoiseFactors` that a calibration message has."""
-CALIBRATION_KIND = b"S"
-"""The first byte of a calibration message."""
-BODIES_KIND = b"B"
-"""The first byte of a message about bodies."""
 
 
 @dataclass(frozen=True)
@@ -119,37 +103,6 @@ class NoteMessage:
     odometry: Floats
 
 
-@dataclass(frozen=True)
-class CalibrationMessage:
-    """The shared errors that a session corrects in its map and in all later messages, and the noise of its localisation.
-
-    keyframe: the number of keyframes in the map before the correction. noise: only the fields `_OF_LOCALIZATION` count.
-    """
-
-    keyframe: int
-    calibration: Calibration
-    noise: NoiseFactors = NOMINAL
-
-
-@dataclass(frozen=True)
-class BodiesMessage:
-    """The bodies of n landmarks, to whose centres a session turns its bearings.
-
-    keyframe: the number of keyframes in the map before the correction. ids: (n,) of the landmarks. shape: (n,) index into
-    `SHAPES`, 0 for a landmark whose bearings stay at the centres of its boxes. half: (n, 3) m, the half axes along the yaw,
-    across it and upwards. yaw: (n,) rad in the map of the session. covariance: (n, 4, 4) of the half axes and the yaw.
-    """
-
-    keyframe: int
-    ids: Ints
-    shape: Ints
-    half: Floats
-    yaw: Floats
-    covariance: Floats
-
-
-Correction = CalibrationMessage | BodiesMessage
-"""What a session found itself, and then corrected in its map."""
 Message = PoseMessage | MountMessage | CameraMessage | FrameMessage | NoteMessage | Correction
 
 
@@ -179,16 +132,10 @@ def encode(message: Message) -> bytes:
     if isinstance(message, MountMessage):
         name = message.camera.encode()
         return _MOUNT.pack(_MOUNT_KIND, message.stamp, *message.pose[:3].ravel().tolist(), len(name)) + name
+    if isinstance(message, Correction):
+        return encode_correction(message)
     if isinstance(message, NoteMessage):
         return _NOTE_KIND + json.dumps([message.clock, message.odometry.ravel().tolist()]).encode()
-    if isinstance(message, CalibrationMessage):
-        found = message.calibration
-        numbers = [array.tolist() for array in (found.values, found.covariance, found.prior)]
-        noise = [getattr(message.noise, name) for name in _OF_LOCALIZATION]
-        return CALIBRATION_KIND + json.dumps([message.keyframe, found.names, *numbers, noise]).encode()
-    if isinstance(message, BodiesMessage):
-        arrays = (message.ids, message.shape, message.half, message.yaw, message.covariance)
-        return BODIES_KIND + json.dumps([message.keyframe, *(array.tolist() for array in arrays)]).encode()
     if isinstance(message, CameraMessage):
         c = message.camera
         data = [c.name, c.width, c.height, c.matrix.ravel().tolist(), c.distortion_model, c.distortion.tolist()]
@@ -214,7 +161,7 @@ def decode(data: bytes) -> Message:
 
 def _read_pose(data: bytes) -> PoseMessage:
     kind, stamp, *rows = _POSE.unpack(data)
-    return PoseMessage(_PATHS[kind], _stamp(stamp), _pose([*rows, 0.0, 0.0, 0.0, 1.0]))
+    return PoseMessage(_PATHS[kind], as_stamp(stamp), as_pose([*rows, 0.0, 0.0, 0.0, 1.0]))
 
 
 def _read_mount(data: bytes) -> MountMessage:
@@ -222,48 +169,12 @@ def _read_mount(data: bytes) -> MountMessage:
     name = data[_MOUNT.size :]
     if len(name) != length:
         raise ValueError("the camera's name does not have the length that the record states")
-    return MountMessage(_stamp(stamp), _name(name.decode()), _pose([*rows, 0.0, 0.0, 0.0, 1.0]))
+    return MountMessage(as_stamp(stamp), as_name(name.decode()), as_pose([*rows, 0.0, 0.0, 0.0, 1.0]))
 
 
 def _read_note(data: bytes) -> NoteMessage:
     clock, odometry = json.loads(data[1:])
-    return NoteMessage(_stamp(clock), _pose(odometry))
-
-
-def _read_calibration(data: bytes) -> CalibrationMessage:
-    keyframe, names, values, covariance, prior, *noise = json.loads(data[1:])
-    n = len(names)
-    found = Calibration(tuple(map(_name, names)), _array(values, (n,)), _array(covariance, (n, n)), _array(prior, (n,)))
-    fault = covariance_fault(found.covariance)
-    if fault is not None:
-        raise ValueError(f"the covariance of the calibration {fault}")
-    return CalibrationMessage(_integer(keyframe), found, _noise(*noise))
-
-
-def _noise(values: list[float] | None = None) -> NoiseFactors:
-    """Return the noise of a localisation. Journals of older versions have none."""
-    if values is None:
-        return NOMINAL
-    noise = dict(zip(_OF_LOCALIZATION, _array(values, (len(_OF_LOCALIZATION),)).tolist(), strict=True))
-    for name in ("heading", "place"):
-        share, seconds = noise[f"{name}_share"], noise[f"{name}_seconds"]
-        if not 0 < noise[name] <= MOST_POSE_NOISE or not 0 <= share <= 1 or seconds < 0 or (share > 0 and seconds == 0):
-            raise ValueError(f"the noise of localised {name}s cannot be")
-    return NoiseFactors(**noise)
-
-
-def _read_bodies(data: bytes) -> BodiesMessage:
-    keyframe, ids, shape, half, yaw, covariance = json.loads(data[1:])
-    n = len(ids)
-    shapes, sides = np.array([_integer(one) for one in shape], dtype=np.int64).reshape(n), _array(half, (n, 3))
-    spread = _array(covariance, (n, 4, 4))
-    if (shapes >= len(SHAPES)).any() or (sides[shapes > 0] <= 0).any() or (np.abs(sides) >= MAX_POSITION).any():
-        raise ValueError("a body of an unknown shape, or of an impossible size")
-    fault = covariance_fault(spread)
-    if fault is not None:
-        raise ValueError(f"the covariance of a body {fault}")
-    numbers = np.array([_integer(one) for one in ids], dtype=np.int64)
-    return BodiesMessage(_integer(keyframe), numbers, shapes, sides, _array(yaw, (n,)), spread)
+    return NoteMessage(as_stamp(clock), as_pose(odometry))
 
 
 def _read_camera(data: bytes) -> CameraMessage:
@@ -271,12 +182,12 @@ def _read_camera(data: bytes) -> CameraMessage:
     known = next((one for one in COEFFICIENTS if one == model), None)
     if known is None:
         raise ValueError("an unknown lens model")
-    inner, outer = _array(matrix, (3, 3)), _array(distortion, (-1,))
+    inner, outer = as_array(matrix, (3, 3)), as_array(distortion, (-1,))
     # Older journals do not store `sees_size`. The noise of depths is stored only if a sensor has its own.
     sees_size = bool(more[0]) if more else True
-    noise = RangeNoise(*_array(more[1], (3,)).tolist()) if len(more) > 1 else None
-    size = _integer(width), _integer(height)
-    camera = Camera(_name(name), *size, inner, known, outer, _pose(base_T_camera), float(scale), sees_size, noise)
+    noise = RangeNoise(*as_array(more[1], (3,)).tolist()) if len(more) > 1 else None
+    size = as_count(width), as_count(height)
+    camera = Camera(as_name(name), *size, inner, known, outer, as_pose(base_T_camera), float(scale), sees_size, noise)
     fault = camera_fault(camera)
     if fault is not None:
         raise ValueError(f"camera {fault}")
@@ -288,53 +199,20 @@ def _read_frame(data: bytes) -> FrameMessage:
     if whole not in ([], [True]):
         raise ValueError("the frame has too many fields")
     count = len(labels)
-    corners, score, depth = _array(boxes, (count, 4)), _array(scores, (count,)), _array(depths, (count,))
+    corners, score, depth = as_array(boxes, (count, 4)), as_array(scores, (count,)), as_array(depths, (count,))
     for fine, reason in box_rules(corners, score, np.array([is_name(label) for label in labels], dtype=bool)):
         if not fine.all():
             raise ValueError(reason)
     depth = np.where(valid_depths(depth), depth, np.nan)
     track = np.array(tracks, dtype=np.int64).reshape(count)
-    return FrameMessage(_stamp(stamp), _name(camera), corners, tuple(labels), score, depth, track, bool(whole))
+    return FrameMessage(as_stamp(stamp), as_name(camera), corners, tuple(labels), score, depth, track, bool(whole))
 
 
 _READERS: dict[bytes, Callable[[bytes], Message]] = {
     **dict.fromkeys(_PATHS, _read_pose),
     _MOUNT_KIND: _read_mount,
     _NOTE_KIND: _read_note,
-    CALIBRATION_KIND: _read_calibration,
-    BODIES_KIND: _read_bodies,
+    **CORRECTION_READERS,
     _CAMERA_KIND: _read_camera,
     _FRAME_KIND: _read_frame,
 }
-
-
-def _stamp(value: float) -> float:
-    if not valid_stamps(np.array(value, dtype=np.float64)):
-        raise ValueError("a stamp is not finite or too large")
-    return float(value)
-
-
-def _name(value: object) -> str:
-    if not is_name(value):
-        raise ValueError("a name that is empty or not printable")
-    return str(value)
-
-
-def _integer(value: object) -> int:
-    if type(value) is not int or value < 0:
-        raise ValueError("a count is not a whole number")
-    return value
-
-
-def _pose(values: list[float]) -> Floats:
-    pose = rigid_pose(_array(values, (4, 4)))
-    if pose is None:
-        raise ValueError("a pose that is not rigid, or too far away")
-    return pose
-
-
-def _array(values: list[float], shape: tuple[int, ...]) -> Floats:
-    array = np.array(values, dtype=np.float64).reshape(shape)
-    if not np.isfinite(array).all():
-        raise ValueError("a number is not finite")
-    return array

@@ -1,0 +1,94 @@
+"""A session searches the boxes of its past for objects that it saw only for moments."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from driving import feed
+
+from objslam.config import load_settings
+from objslam.evaluation.evaluate import evaluate
+from objslam.live.adapters.replay import events
+from objslam.live.session.session import Session
+from objslam.simulation import preset, simulate
+
+GLIMPSE, APART = 4, 9.0
+"""An object is seen in this number of images, fewer than live.min_rays, and then not for this time, s, longer than
+live.forget."""
+
+
+def settings_of(*more):
+    return load_settings(None, ("mode=joint", "output.recording=false", "checks.use=false", "bodies.use=false", *more))
+
+
+@pytest.fixture(scope="module")
+def log():
+    """A drive of two minutes. The detector sees half of the objects only for moments."""
+    changes = {"frames": 400, "classes": 12, "false": 0.0, "localization": None, "laps": 3}
+    whole = simulate(preset("demo", **changes), 5)
+    found = whole.cameras[0].detections
+    keep = np.ones(len(found.frame), dtype=bool)
+    for label in range(0, len(found.label_names), 2):
+        begin = left = -np.inf
+        for i in np.flatnonzero(found.label == label).tolist():
+            stamp = found.frame_stamps[found.frame[i]]
+            if stamp - begin > APART:
+                begin, left = stamp, GLIMPSE
+            keep[i], left = left > 0, left - 1
+    labels = np.arange(len(found.label_names))  # Two of the objects that are seen for moments have one label.
+    labels = np.where(labels % 2 == 0, 2 * (labels // 4), labels)
+    names = tuple(f"thing {i}" for i in range(len(labels)))
+    columns = {name: getattr(found, name)[keep] for name in ("frame", "boxes", "scores", "depths", "track_ids")}
+    thin = replace(found, **columns, label=labels[found.label[keep]], label_names=names)
+    shared = {label: names[labels[i]] for i, label in enumerate(found.label_names)}
+    objects = tuple(replace(o, label=shared[o.label]) for o in whole.truth.objects if o.label in shared)
+    truth = replace(whole.truth, objects=objects)
+    return replace(whole, cameras=(replace(whole.cameras[0], detections=thin),), truth=truth)
+
+
+def drive(log, settings, **more):
+    return feed(Session(settings, patient=True, **more).start(), log)
+
+
+def judged(snapshot, log):
+    found = evaluate(snapshot.map, log.truth, align="se2", radius=0.8).objects
+    return found, np.array([one.squared_3d for one in found.matches])
+
+
+@pytest.fixture(scope="module")
+def searched(log, tmp_path_factory):
+    """A session that searches, after its last message."""
+    session = drive(log, settings_of(), journal=tmp_path_factory.mktemp("whole") / "journal")
+    yield session
+    session.abort()
+
+
+def test_objects_seen_for_moments_are_in_the_map_while_the_robot_drives(log, searched):
+    session = drive(log, settings_of("live.search_from=0"))
+    without, _ = judged(session.snapshot(), log)
+    session.abort()
+    found, squared = judged(searched.snapshot(), log)
+    assert len(without.missed) >= 4
+    assert len(found.missed) <= 1
+    assert not found.false
+    assert (squared < 14.2).all()  # three sigmas
+    assert searched.counters.accepted()["objects found in earlier boxes"] >= 4
+    m = searched._mapper.state
+    tracked = [ray[0] for track in m.tracks for ray in track.rays]
+    assert not np.isin(m.rays.number[m.rays.owner >= 0], tracked).any()
+
+
+def test_a_session_killed_after_a_search_goes_on_to_the_same_map(log, searched, tmp_path):
+    session = Session(settings_of(), tmp_path / "killed", patient=True).start()
+    pushes = list(events(log))
+    for number, push in enumerate(pushes):
+        feed(session, log, number, pushes=[push])
+        if "objects found in earlier boxes" in session.counters.accepted():
+            break
+    session.abort()
+    again = Session(settings_of(), tmp_path / "killed", resume=True, patient=True).start()
+    feed(again, log, number + 1, pushes=pushes[number + 1 :])
+    one, other = again.snapshot().map.objects, searched.snapshot().map.objects
+    again.abort()
+    assert [(o.id, o.label) for o in one] == [(o.id, o.label) for o in other]
+    np.testing.assert_allclose([o.position for o in one], [o.position for o in other], atol=1e-6)
