@@ -35,6 +35,7 @@ from objslam.mapping.joint.labels import (
     labels_tell,
     may_be_by_label,
     noise_explains,
+    scatters_alone,
     shows_second_object,
     warn_of_noise,
 )
@@ -76,7 +77,7 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
         return named if sure else _with_several_a_label(state, named)
     # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
     # With a localisation, such a path shows as noise of the localisation, and no label is doubted.
-    bent = not sure or state.keyframes.localized_every
+    bent = not sure or scatters_alone(named) or state.keyframes.localized_every
     return _associated_again(begin, state if bent else replace(named, association=None, estimate=None), None)
 
 
@@ -299,6 +300,12 @@ def _improved(state: JointState, step: Callable[[JointState], JointState]) -> Jo
 def _by_label(state: JointState) -> tuple[JointState, bool]:
     """Return the state with one object per label, and whether the rays agree with it. If they disagree at a few labels only,
     the shared errors and the noise of the state are still better than the nominal values."""
+    named, agree = _solved_by_label(state)
+    return named, agree and (state.settings.association.method == "by_label" or not scatters_alone(named))
+
+
+def _solved_by_label(state: JointState) -> tuple[JointState, bool]:
+    """Return the state with one object per label, and whether hardly a ray is rejected."""
     association, errors = associate_by_label(state.rays), state.errors
     solved = state.solve("labels", association)
     assert solved.estimate is not None
