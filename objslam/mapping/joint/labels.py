@@ -121,8 +121,8 @@ def labels_tell(association: Association, estimate: Estimate) -> bool:
     return bool(placed.any()) and not (placed & (rejected >= MANY) & (rejected > SECOND * number)).any()
 
 
-def scatters_alone(named: JointState | Solution) -> bool:
-    """Return whether the rays of some label agree with one object only at noise that the rays of other labels do not have.
+def scatter_alone(named: JointState | Solution) -> Bools:
+    """Return the objects (N,) with which their rays agree only at noise that the rays of other labels do not have.
 
     A person who walks has a label, but no place. A solve explains such rays by noisy boxes. Then hardly a ray is rejected,
     and only the other labels show how noisy the boxes are. A label scatters alone if at least `MANY` of its rays, and more
@@ -132,18 +132,19 @@ def scatters_alone(named: JointState | Solution) -> bool:
     association, estimate = named.association, named.estimate
     assert association is not None
     assert estimate is not None
-    off = angles_to_objects(named.rays, estimate, estimate.map_T_base @ named.keyframes.base_T_camera) / named.rays.sigma
-    known = np.flatnonzero(np.isfinite(off) & (association.object >= 0))
-    owner, off = association.object[known], off[known]
+    origins, directions = named.rays.in_map(estimate.map_T_base @ named.keyframes.base_T_camera)
+    known = np.flatnonzero(np.isfinite(estimate.positions[association.object, 0]) & (association.object >= 0))
+    owner = association.object[known]
+    off = angles_off(origins[known], directions[known], estimate.positions[owner]) / named.rays.sigma[known]
     number = np.bincount(owner, minlength=association.count)
     many = number >= MANY
     if many.sum() < _OTHERS:
-        return False
+        return np.zeros(association.count, dtype=bool)
     spread = np.sqrt(np.bincount(owner, off**2, association.count) / np.maximum(number, 1))
     nominal = 1.0 if estimate.noise is None else 1 / estimate.noise.rays
     limit = _AGREES * max(float(np.median(spread[many])), nominal)
     beyond = np.bincount(owner[off > limit], minlength=association.count)
-    return bool((many & (beyond >= MANY) & (beyond > SECOND * number)).any())
+    return np.asarray(many & (beyond >= MANY) & (beyond > SECOND * number))
 
 
 def clock_explains(association: Association, errors: SharedErrors, solve: Callable[[Floats], Estimate]) -> Floats | None:
