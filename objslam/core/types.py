@@ -345,6 +345,6 @@ class Association:
 
 def label_table(names: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
     """Return the distinct names in sorted order, and for each of the names (len(names),) its index among them."""
-    table = tuple(sorted(set(names)))
+    table = tuple(sorted({str(name) for name in names}))  # numpy has its own text, whose repr would stand in messages.
     index = {name: i for i, name in enumerate(table)}
     return table, np.array([index[name] for name in names], dtype=np.int64)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.geometry import inverse
 from objslam.errors import SolveError
 from objslam.frontend.tracks import associate_tracks
@@ -19,6 +17,7 @@ from objslam.mapping.exploration.first_exploration import explored, solved_if_su
 from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
 from objslam.mapping.fixed.camera_calibration import associate_at_poses
 from objslam.mapping.fixed.fixed_poses import FixedPoses
+from objslam.mapping.joint.by_label import at_other_labels, by_label
 from objslam.mapping.joint.doubted_labels import (
     CLEAR_ODDS,
     doubted_names,
@@ -29,15 +28,7 @@ from objslam.mapping.joint.doubted_labels import (
 )
 from objslam.mapping.joint.held_errors import Solved, with_gross_errors
 from objslam.mapping.joint.joint_alternation import JointState
-from objslam.mapping.joint.labels import (
-    angles_to_objects,
-    clock_explains,
-    labels_tell,
-    may_be_by_label,
-    noise_explains,
-    shows_second_object,
-    warn_of_noise,
-)
+from objslam.mapping.joint.labels import may_be_by_label, scatter_alone
 from objslam.mapping.moves.missed_loops import with_missed_loops
 from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
@@ -64,19 +55,22 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     state = _begun(begin)
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
         return _associated_again(begin, state, start)
-    named, agree = _by_label(state)
+    named, agree = by_label(state)
     wider, named = _with_gross_errors(begin, named)
     if wider is not None:
         other = _begun(wider.attempt())
-        again, agrees = _by_label(other)
+        again, agrees = by_label(other)
         if agrees:
             begin, state, named, agree = wider, state.replaced(other), state.replaced(again), True
     sure = state.settings.association.method == "by_label" or not doubted_names(named)
     if agree:
         return named if sure else _with_several_a_label(state, named)
+    alone = scatter_alone(named).any()
+    if alone and (found := at_other_labels(state, named)) is not None:
+        return _settled(found)
     # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
     # With a localisation, such a path shows as noise of the localisation, and no label is doubted.
-    bent = not sure or state.keyframes.localized_every
+    bent = not sure or alone or state.keyframes.localized_every
     return _associated_again(begin, state if bent else replace(named, association=None, estimate=None), None)
 
 
@@ -159,6 +153,12 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
                 break
             state = _or_from(other_start, state)
         state = _improved(state, JointState.split)
+    return _settled(state)
+
+
+def _settled(state: JointState) -> JointState:
+    """Return the state after what follows the last round: a solve with all shared errors, and no objects of things that
+    move."""
     assert state.association is not None
     if state.unsettled:
         rounds, changed = state.settings.joint.max_rounds, f"{state.unsettled} of {state.association.count} objects"
@@ -294,47 +294,3 @@ def _improved(state: JointState, step: Callable[[JointState], JointState]) -> Jo
             break
         state = found
     return state
-
-
-def _by_label(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, and whether the rays agree with it. If they disagree at a few labels only,
-    the shared errors and the noise of the state are still better than the nominal values."""
-    association, errors = associate_by_label(state.rays), state.errors
-    solved = state.solve("labels", association)
-    assert solved.estimate is not None
-    if state.settings.association.method == "by_label":
-        return solved, True
-    told = labels_tell(association, solved.estimate)
-    if (association.object < 0).any():  # A frame has two boxes of a label. No noise causes that.
-        return _with_doubles(solved) if told else (solved, False)
-    if told:
-        return solved, True
-    if solved.errors is None or errors is None:
-        return solved, False
-    noisier = noise_explains(association, solved.estimate, solved.errors, partial(solved.solve_once, association))
-    if noisier is not None:
-        again = solved.solve("labels", association, noisier.map_T_base @ solved.keyframes.base_T_camera)
-        assert again.estimate is not None
-        warn_of_noise(solved.errors, noisier, state.ledger)
-        # The last solve estimates the noise again, unless the settings fix it, and may reject the rays of an object.
-        known = solved.errors.with_unknown_noise().unknown_noise != solved.errors.unknown_noise
-        return (again, True) if known or labels_tell(association, again.estimate) else (solved, False)
-    begin = clock_explains(association, errors, lambda at: solved.solve_once(association, errors, begin=at))
-    if begin is None:
-        return solved, False
-    return replace(solved, errors=errors, theta=begin).solve("labels", association), True
-
-
-def _with_doubles(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, from the nearest box of each label in each keyframe.
-
-    Also return whether the other boxes show no second object of any label.
-    """
-    assert state.association is not None
-    assert state.estimate is not None
-    nearest = associate_by_label(state.rays, angles_to_objects(state.rays, state.estimate, state.solved_poses))
-    if not np.array_equal(nearest.object, state.association.object):
-        state = state.solve("labels", nearest, state.solved_poses)
-    assert state.estimate is not None
-    solved = state.rays, nearest, state.estimate, state.keyframes, state.solved_poses
-    return state, not shows_second_object(*solved, state.settings)

@@ -121,6 +121,12 @@ def test_wrong_frames_are_named(changes: dict[str, Any], message: str) -> None:
         objslam.Detections.from_frames(**{**right, **changes})
 
 
+def test_labels_of_numpy_become_plain_text() -> None:
+    """A message that quotes the name of a label would show np.str_('cup')."""
+    found = objslam.Detections.from_frames([0.0], [[[0, 0, 5, 5]]], [np.array(["cup"])])
+    assert [repr(name) for name in found.label_names] == ["'cup'"]
+
+
 @pytest.mark.parametrize(
     ("poses", "message"),
     [

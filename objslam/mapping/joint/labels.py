@@ -1,18 +1,27 @@
 """Judge whether each label names a single object. Then the labels alone decide which rays belong together."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats
 from objslam.core.calibration import kind
-from objslam.core.diagnostics import Ledger
-from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off
 from objslam.core.noise import NOMINAL
-from objslam.core.types import Association, Keyframes, Rays
-from objslam.frontend.shared_errors import SharedErrors
+from objslam.core.types import Association
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from objslam.config import Settings
+    from objslam.core.arrays import Bools, Floats
+    from objslam.core.diagnostics import Ledger
+    from objslam.core.estimate import Estimate
+    from objslam.core.types import Keyframes, Rays
+    from objslam.frontend.shared_errors import SharedErrors
+    from objslam.mapping.joint.joint_alternation import JointState
+    from objslam.mapping.solution import Solution
 
 MANY, SECOND = 5, 0.25
 """A label has a second object if at least `MANY` of its rays, and more than the share `SECOND`, are rejected. Larger values
@@ -24,6 +33,9 @@ takes a solve."""
 _AGREES = 3.0
 """A ray agrees with the object of its label if it is off by at most this many standard deviations. With a larger value,
 fewer boxes can show a second object."""
+_OTHERS = 3
+"""The fewest objects with `MANY` rays whose usual noise judges the label of each one. With a larger number, fewer logs are
+judged."""
 _JUDGEMENTS = 2
 """How many times `noise_explains` solves, each time with the noise that the last solve found. A solve that rejects rays
 finds too little noise, so a second solve finds more. A larger number is slower."""
@@ -107,6 +119,32 @@ def labels_tell(association: Association, estimate: Estimate) -> bool:
     number = np.bincount(association.object[held], minlength=association.count)
     rejected = np.bincount(association.object[held & (estimate.weight == 0)], minlength=association.count)
     return bool(placed.any()) and not (placed & (rejected >= MANY) & (rejected > SECOND * number)).any()
+
+
+def scatter_alone(named: JointState | Solution) -> Bools:
+    """Return the objects (N,) with which their rays agree only at noise that the rays of other labels do not have.
+
+    A person who walks has a label, but no place. A solve explains such rays by noisy boxes. Then hardly a ray is rejected,
+    and only the other labels show how noisy the boxes are. A label scatters alone if at least `MANY` of its rays, and more
+    than the share `SECOND`, are off by more than `_AGREES` times the usual noise of an object. The noise of the settings
+    counts if it is larger. named: a map with one object for each label, whose rays have sigmas by its own noise.
+    """
+    association, estimate = named.association, named.estimate
+    assert association is not None
+    assert estimate is not None
+    origins, directions = named.rays.in_map(estimate.map_T_base @ named.keyframes.base_T_camera)
+    known = np.flatnonzero(np.isfinite(estimate.positions[association.object, 0]) & (association.object >= 0))
+    owner = association.object[known]
+    off = angles_off(origins[known], directions[known], estimate.positions[owner]) / named.rays.sigma[known]
+    number = np.bincount(owner, minlength=association.count)
+    many = number >= MANY
+    if many.sum() < _OTHERS:
+        return np.zeros(association.count, dtype=bool)
+    spread = np.sqrt(np.bincount(owner, off**2, association.count) / np.maximum(number, 1))
+    nominal = 1.0 if estimate.noise is None else 1 / estimate.noise.rays
+    limit = _AGREES * max(float(np.median(spread[many])), nominal)
+    beyond = np.bincount(owner[off > limit], minlength=association.count)
+    return np.asarray(many & (beyond >= MANY) & (beyond > SECOND * number))
 
 
 def clock_explains(association: Association, errors: SharedErrors, solve: Callable[[Floats], Estimate]) -> Floats | None:
