@@ -59,7 +59,7 @@ MESSAGES = [
     replace(FRAMES, whole=True, stamp=3.0),
     CalibrationMessage(3, CALIBRATION),
     BodiesMessage(3, np.array([4]), np.array([2]), np.ones((1, 3)), np.zeros(1), np.eye(4)[None]),
-    ObjectsMessage(3, (np.array([1, 5]), np.array([2, 3, 4]))),
+    ObjectsMessage(3, (np.array([1, 5]), np.array([2, 3, 4])), np.array([7])),
 ]
 
 

@@ -86,7 +86,8 @@ def objects(count):
     """Of up to 9 rays each, no ray of two objects."""
     numbers = st.lists(st.integers(0, 10**9), min_size=count, max_size=9 * count, unique=True)
     parts = numbers.map(lambda found: tuple(np.array(sorted(found[i::count]), dtype=np.int64) for i in range(count)))
-    return st.builds(ObjectsMessage, st.integers(0, 10**9), parts)
+    gone = npst.arrays(np.int64, count, elements=st.integers(0, 99))
+    return st.builds(ObjectsMessage, st.integers(0, 10**9), parts, gone)
 
 
 SIZES, SHARES, SECONDS = st.floats(1.0, 300.0), st.floats(0.0, 1.0), st.floats(0.1, 1e3)

@@ -9,6 +9,7 @@ from driving import feed
 from objslam.config import load_settings
 from objslam.evaluation.evaluate import evaluate
 from objslam.live.adapters.replay import events
+from objslam.live.search.object_search import no_objects
 from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
 
@@ -92,3 +93,29 @@ def test_a_session_killed_after_a_search_goes_on_to_the_same_map(log, searched, 
     again.abort()
     assert [(o.id, o.label) for o in one] == [(o.id, o.label) for o in other]
     np.testing.assert_allclose([o.position for o in one], [o.position for o in other], atol=1e-6)
+
+
+def test_a_landmark_without_rays_in_the_offline_association_is_no_object():
+    owner = np.repeat([4, 7, 9, -1], [20, 20, 5, 8])
+    explained = np.concatenate([np.ones(20), np.arange(20) < 2, np.ones(5), np.zeros(8)]).astype(bool)
+    assert len(no_objects(owner, explained)) == 0  # The association explains too few rays of the landmarks.
+    owner, explained = np.append(owner, np.full(40, 4)), np.append(explained, np.ones(40, dtype=bool))
+    assert no_objects(owner, explained).tolist() == [7]
+    assert len(no_objects(np.full(3, -1), np.ones(3, dtype=bool))) == 0
+
+
+def test_landmarks_of_people_who_walk_leave_the_map_while_the_robot_drives():
+    room = {"frames": 300, "classes": 4, "false": 0.0, "localization": None, "moving": 8, "missed": 0.0}
+    log = simulate(preset("demo", **room), 6)
+    false = []
+    for start in (0, 75):
+        session = drive(log, settings_of(f"live.search_from={start}"))
+        found, _ = judged(session.snapshot(), log)
+        false.append(len(found.false))
+        if start:
+            assert len(found.matches) >= 11
+            assert session.counters.accepted()["landmarks that are no objects"] >= 1
+        m = session._mapper.state
+        assert np.isin(m.rays.owner[m.rays.owner >= 0], m.landmarks.id).all()
+        session.abort()
+    assert false[1] < false[0] / 2

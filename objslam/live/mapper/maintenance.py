@@ -279,7 +279,12 @@ def _drop_ghosts(m: MapState) -> None:
     ghost = np.flatnonzero((landmarks.expected >= live.ghost_frames) & rarely_seen)
     if len(ghost):
         m.counters.accept("ghosts dropped", len(ghost))
-        mine = np.isin(m.rays.owner, landmarks.id[ghost])
-        m.graph.drop_rays(m.rays.number[mine])
-        m.rays.owner[mine], m.rays.used[mine] = -1, False
-        remove_landmarks(m, ghost)
+        drop_landmarks(m, ghost)
+
+
+def drop_landmarks(m: MapState, rows: Ints) -> None:
+    """Remove the landmarks in rows (n,). Their rays then belong to no landmark."""
+    mine = np.isin(m.rays.owner, m.landmarks.id[rows])
+    m.graph.drop_rays(m.rays.number[mine])
+    m.rays.owner[mine], m.rays.used[mine] = -1, False
+    remove_landmarks(m, rows)

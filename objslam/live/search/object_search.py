@@ -19,6 +19,7 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.counters import Counters
+from objslam.live.mapper.maintenance import drop_landmarks
 from objslam.live.mapper.mapper import Mapper
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.track_promotion import add_landmark
@@ -34,6 +35,12 @@ slower machines, but shows the objects later."""
 _NEW = 0.5
 """An object is new if less than this share of its rays belongs to landmarks of the session. A larger share adds more objects
 beside landmarks."""
+_GONE = 0.1
+"""A landmark is no object if the offline association gives at most this share of its rays to objects. Things that move and
+false boxes end so. A larger share drops more landmarks."""
+_RIGHT = 0.7
+"""An association drops landmarks only if it gives at least this share of the rays of all landmarks to objects. With a
+smaller share, a solve that went wrong may drop right landmarks."""
 _BEND = 0.2
 """The standard deviation (m) of camera poses from several views of an object, before the object joins them. A larger one
 keeps more rays for its first position."""
@@ -41,17 +48,17 @@ keeps more rays for its first position."""
 
 @dataclass(frozen=True)
 class SearchRequest:
-    """The drive of a session so far. owned: (R,) which of its rays belong to a landmark of the session."""
+    """The drive of a session so far. owner: (R,) the session's landmark of each of its rays, -1 without one."""
 
     found: Collected
-    owned: Bools
+    owner: Ints
     cameras: tuple[Camera, ...]
     settings: Settings
 
-    def solve(self) -> tuple[Ints, ...]:
-        """Associate and solve the drive as at the end of the session. Return for each object that the session has not found
-        the numbers (n,) of its rays, in order. An object with little parallax is left out, because later views would not
-        fit its first position. Raises SolveError if the solve fails."""
+    def solve(self) -> ObjectsMessage:
+        """Associate and solve the drive as at the end of the session. Return the objects that the session has not found, and
+        its landmarks that are none. The caller puts in the keyframe, which is 0 here. An object with little parallax is left
+        out, because later views would not fit its first position. Raises SolveError if the solve fails."""
         from objslam.graph.init_unknown_correspondences import InitialEstimate
         from objslam.mapping.alternation import solve
         from objslam.mapping.corrected import corrected
@@ -67,12 +74,25 @@ class SearchRequest:
         for j, one in enumerate(objects.objects):
             mine = used & (solution.association.object == j)
             placed = one.parallax_deg >= self.settings.joint.min_parallax_deg or bool(np.isfinite(f.rays.range[mine]).any())
-            if one.status == "ok" and placed and self.owned[mine].mean() < _NEW:
-                new.append(np.sort(f.numbers[mine & ~self.owned]))
-        return tuple(new)
+            if one.status == "ok" and placed and (self.owner[mine] >= 0).mean() < _NEW:
+                new.append(np.sort(f.numbers[mine & (self.owner < 0)]))
+        return ObjectsMessage(0, tuple(new), no_objects(self.owner, used & (solution.association.object >= 0)))
 
 
-class ObjectSearch(Rounds[tuple[Ints, ...], ObjectsMessage]):
+def no_objects(owner: Ints, explained: Bools) -> Ints:
+    """Return the ids (n,) of landmarks that are no objects (`_GONE`).
+
+    owner: (R,) the landmark of each ray, -1 without one. explained: (R,) whether the offline association gives a ray to an
+    object.
+    """
+    held = owner >= 0
+    if not held.any() or explained[held].mean() < _RIGHT:
+        return np.zeros(0, dtype=np.int64)
+    ids, index = np.unique(owner[held], return_inverse=True)
+    return np.asarray(ids[np.bincount(index, explained[held]) <= _GONE * np.bincount(index)])
+
+
+class ObjectSearch(Rounds[ObjectsMessage, ObjectsMessage]):
     """Searches for objects in rounds, and adds them to the map."""
 
     growth, delay, quick, told = _GROWTH, _DELAY, False, ObjectsMessage
@@ -100,16 +120,21 @@ class ObjectSearch(Rounds[tuple[Ints, ...], ObjectsMessage]):
         if len(free) > m.settings.live.reassociate:
             return None
         found = collect(m, self._name, count_dropped=False)
-        owned = ~free[np.searchsorted(m.rays.number, found.numbers)]
-        return SearchRequest(found, owned, tuple(one.camera for one in found.log.cameras), m.given)
+        owner = m.rays.owner[np.searchsorted(m.rays.number, found.numbers)]
+        return SearchRequest(found, owner, tuple(one.camera for one in found.log.cameras), m.given)
 
-    def _correction(self, number: int, answer: tuple[Ints, ...] | None) -> ObjectsMessage | None:
+    def _correction(self, number: int, answer: ObjectsMessage | None) -> ObjectsMessage | None:
         if answer is None:
             self._counters.accept("searches for objects given up")
-        return ObjectsMessage(number, answer) if answer else None
+        return replace(answer, keyframe=number) if answer is not None and (answer.rays or len(answer.gone)) else None
 
     def _take_up(self, correction: ObjectsMessage) -> None:
-        added = add_objects(self._mapper.state, correction)
+        m = self._mapper.state
+        gone = m.rows_of(correction.gone[np.isin(correction.gone, m.landmarks.id)])
+        if len(gone):
+            drop_landmarks(m, gone)
+            self._counters.accept("landmarks that are no objects", len(gone))
+        added = add_objects(m, correction)
         if added:
             self._counters.accept("objects found in earlier boxes", added)
 

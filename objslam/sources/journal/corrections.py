@@ -49,14 +49,15 @@ class BodiesMessage:
 
 @dataclass(frozen=True)
 class ObjectsMessage:
-    """Objects that a session found in boxes of its past, which belonged to no object.
+    """Objects that a session found in boxes of its past, which belonged to no object, and landmarks that are no objects.
 
     keyframe: the number of keyframes in the map before the correction. rays: for each object, the numbers (n,) of its rays,
-    in order. No ray has two objects.
+    in order. No ray has two objects. gone: (n,) the ids of the landmarks that are no objects.
     """
 
     keyframe: int
     rays: tuple[Ints, ...]
+    gone: Ints
 
 
 Correction = CalibrationMessage | BodiesMessage | ObjectsMessage
@@ -73,7 +74,8 @@ def encode_correction(message: Correction) -> bytes:
     if isinstance(message, BodiesMessage):
         arrays = (message.ids, message.shape, message.half, message.yaw, message.covariance)
         return _BODIES_KIND + json.dumps([message.keyframe, *(array.tolist() for array in arrays)]).encode()
-    return _OBJECTS_KIND + json.dumps([message.keyframe, [rays.tolist() for rays in message.rays]]).encode()
+    objects = [rays.tolist() for rays in message.rays]
+    return _OBJECTS_KIND + json.dumps([message.keyframe, objects, message.gone.tolist()]).encode()
 
 
 def _read_calibration(data: bytes) -> CalibrationMessage:
@@ -115,12 +117,12 @@ def _read_bodies(data: bytes) -> BodiesMessage:
 
 
 def _read_objects(data: bytes) -> ObjectsMessage:
-    keyframe, objects = json.loads(data[1:])
+    keyframe, objects, gone = json.loads(data[1:])
     rays = tuple(np.array([as_count(one) for one in numbers], dtype=np.int64) for numbers in objects)
     every = np.concatenate([*rays, np.zeros(0, dtype=np.int64)])
     if len(np.unique(every)) < len(every) or any(not len(one) or (np.diff(one) < 0).any() for one in rays):
         raise ValueError("rays of objects that repeat, or are not in order")
-    return ObjectsMessage(as_count(keyframe), rays)
+    return ObjectsMessage(as_count(keyframe), rays, np.array([as_count(one) for one in gone], dtype=np.int64))
 
 
 CORRECTION_READERS: dict[bytes, Callable[[bytes], Correction]] = {
