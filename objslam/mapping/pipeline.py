@@ -156,10 +156,11 @@ def _run(
         # Wrong input looks like large shared errors. Their estimation would take many rounds, and no object counts anyway.
         spoilt = diagnosis.spoilt and settings.mode == "fixed"
         errors = None if spoilt else shared_errors(log, *seen_something(frames, rays), settings)
+        of_labels = settings
         if settings.mode == "joint" and diagnosis.refutable:
-            settings = with_known_labels(diagnosis, log, settings, of_solve)
+            of_labels = with_known_labels(diagnosis, log, rays, settings, of_solve)
         try:
-            solution = solve(frames, rays, cameras, settings, ledger, of_solve, errors=errors)
+            solution = solve(frames, rays, cameras, of_labels, ledger, of_solve, errors=errors)
         except SolveError:
             say(diagnosis, ledger)
             raise

@@ -244,15 +244,19 @@ def test_an_object_is_seen_in_both_halves_unless_by_chance():
     assert seen_in_both(late, ~fits, np.zeros(100, dtype=int)) == 0.0
 
 
+def rays_of(log):
+    return build_rays(log, build_keyframes(log, SETTINGS, Ledger()), SETTINGS, Ledger())
+
+
 def test_labels_that_a_corrected_log_shows_as_names_are_names_in_the_wrong_log(clean):
     """So the boxes of a wrong log are not associated without their labels."""
     log = MISTAKES["base_T_camera inverted"](clean)
     diagnosis = diagnose(log, SETTINGS, Ledger())
     assert [one.name for one in diagnosis.findings] == ["mount inverted"]
-    assert with_known_labels(diagnosis, log, SETTINGS, nothing).association.method == "by_label"
+    assert with_known_labels(diagnosis, log, rays_of(log), SETTINGS, nothing).association.method == "by_label"
     given = load_settings(None, ("mode=joint", "output.recording=false", "association.method=global"))
-    assert with_known_labels(diagnosis, log, given, nothing) is given
-    assert with_known_labels(Diagnosis(), log, SETTINGS, nothing) is SETTINGS
+    assert with_known_labels(diagnosis, log, rays_of(log), given, nothing) is given
+    assert with_known_labels(Diagnosis(), log, rays_of(log), SETTINGS, nothing) is SETTINGS
 
 
 def test_labels_of_several_objects_are_no_names():
@@ -268,4 +272,16 @@ def test_labels_of_several_objects_are_no_names():
     )
     diagnosis = diagnose(log, SETTINGS, Ledger())
     assert diagnosis.spoilt
-    assert with_known_labels(diagnosis, log, SETTINGS, nothing) is SETTINGS
+    assert with_known_labels(diagnosis, log, rays_of(log), SETTINGS, nothing) is SETTINGS
+
+
+def test_the_settings_of_a_result_are_those_of_the_user(clean):
+    """Although a wrong log was solved with one object for each label, because its corrected log shows that."""
+    log = MISTAKES["base_T_camera inverted"](clean)
+    for more in ((), ("noise.rays=false", "noise.ranges=false", "noise.odometry=false")):
+        settings = load_settings(
+            None, ("mode=joint", "output.recording=false", "calibration.use=false", "bodies.use=false", *more)
+        )
+        result = pipeline.run(log, settings, Ledger())
+        assert [one["name"] for one in result.summary["wrong_input"]][:1] == ["mount inverted"]
+        assert result.settings.association.method == "auto"

@@ -74,7 +74,7 @@ class SearchRequest:
         for j, one in enumerate(objects.objects):
             mine = used & (solution.association.object == j)
             placed = one.parallax_deg >= self.settings.joint.min_parallax_deg or bool(np.isfinite(f.rays.range[mine]).any())
-            if one.status == "ok" and placed and (self.owner[mine] >= 0).mean() < _NEW:
+            if one.status == "ok" and placed and mine.any() and (self.owner[mine] >= 0).mean() < _NEW:
                 new.append(np.sort(f.numbers[mine & (self.owner < 0)]))
         return ObjectsMessage(0, tuple(new), no_objects(self.owner, used & (solution.association.object >= 0)))
 
