@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -13,38 +13,86 @@ from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.mapping.joint.doubted_labels import doubted_names, unchecked_labels
 from objslam.mapping.joint.labels import (
+    MANY,
     angles_to_objects,
     clock_explains,
     labels_tell,
     noise_explains,
+    rejected,
     scatter_alone,
     shows_second_object,
     warn_of_noise,
 )
 
 if TYPE_CHECKING:
+    from objslam.core.arrays import Ints
     from objslam.mapping.joint.joint_alternation import JointState
 
-
-def by_label(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, and whether the rays agree with it. If they disagree at a few labels only,
-    the shared errors and the noise of the state are still better than the nominal values."""
-    named, agree = _solved_by_label(state)
-    return named, agree and (state.settings.association.method == "by_label" or not scatter_alone(named).any())
+_FEWEST = 3
+"""The fewest labels, each with at least `MANY` rays, that show the path without the labels that scatter. Fewer labels cannot
+tell which of them scatter. With a larger number, more logs are explored."""
 
 
-def _solved_by_label(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, and whether hardly a ray is rejected."""
-    association, errors = associate_by_label(state.rays), state.errors
+@dataclass(frozen=True)
+class Named:
+    """A map with one object for each label.
+
+    state: the solved map. agree: whether the rays agree with it. others: the map of the labels that agree, if the others
+    scatter alone. None if there is no such map, or if it is not sure.
+    """
+
+    state: JointState
+    agree: bool
+    others: JointState | None = None
+
+
+def by_label(state: JointState) -> Named:
+    """Return the map with one object per label. If the rays disagree at a few labels only, its shared errors and its noise
+    are still better than the nominal values."""
+    association = associate_by_label(state.rays)
     solved = state.solve("labels", association)
     assert solved.estimate is not None
     if state.settings.association.method == "by_label":
-        return solved, True
+        return Named(solved, True)
     told = labels_tell(association, solved.estimate)
-    if (association.object < 0).any():  # A frame has two boxes of a label. No noise causes that.
-        return _with_doubles(solved) if told else (solved, False)
-    if told:
-        return solved, True
+    if told and not scatter_alone(solved).any():
+        # Two boxes of a label in a frame: no noise causes that.
+        return Named(*_with_doubles(solved)) if (association.object < 0).any() else Named(solved, True)
+    # If the settings have too little noise, true rays are rejected. So more noise is tried before labels are left out.
+    if not told and not (association.object < 0).any() and _has_fixed_noise(solved):
+        found = Named(*_with_other_start(state, solved))
+        return found if found.agree else replace(found, others=_of_labels_that_agree(state, solved))
+    if (others := _of_labels_that_agree(state, solved)) is not None:
+        return Named(solved, False, others)
+    if told or (association.object < 0).any():
+        return Named(solved, False)
+    return Named(*_with_other_start(state, solved))
+
+
+def at_other_labels(state: JointState, others: JointState) -> JointState | None:
+    """Return the state after rounds at the path that the labels show which agree. None if no solve is possible.
+
+    At this path, the rounds find the objects of the labels that scatter, if they have any. So the log need not be explored,
+    which takes longer. The noise stays as it is: with more noise, the path would bend to things that move. state: before the
+    solve by labels. others: the map of the labels that agree.
+    """
+    assert others.association is not None
+    assert others.estimate is not None
+    known = replace(others, errors=None if others.errors is None else others.errors.with_known_noise())
+    try:
+        return state.replaced(known.alternated(others.estimate.map_T_base, (others.association, others.estimate.positions)))
+    except SolveError:
+        return None
+
+
+def _with_other_start(state: JointState, solved: JointState) -> tuple[JointState, bool]:
+    """Return the state solved with the noise or the clock with which labels are names, and whether there is one.
+
+    state: before the solve by labels. solved: after it. It rejects many rays.
+    """
+    association, errors = solved.association, state.errors
+    assert association is not None
+    assert solved.estimate is not None
     if solved.errors is None or errors is None:
         return solved, False
     noisier = noise_explains(association, solved.estimate, solved.errors, partial(solved.solve_once, association))
@@ -53,12 +101,19 @@ def _solved_by_label(state: JointState) -> tuple[JointState, bool]:
         assert again.estimate is not None
         warn_of_noise(solved.errors, noisier, state.ledger)
         # The last solve estimates the noise again, unless the settings fix it, and may reject the rays of an object.
-        known = solved.errors.with_unknown_noise().unknown_noise != solved.errors.unknown_noise
-        return (again, True) if known or labels_tell(association, again.estimate) else (solved, False)
-    begin = clock_explains(association, errors, lambda at: solved.solve_once(association, errors, begin=at))
-    if begin is None:
-        return solved, False
-    return replace(solved, errors=errors, theta=begin).solve("labels", association), True
+        if not _has_fixed_noise(solved) and not labels_tell(association, again.estimate):
+            return solved, False
+    else:
+        begin = clock_explains(association, errors, lambda at: solved.solve_once(association, errors, begin=at))
+        if begin is None:
+            return solved, False
+        again = replace(solved, errors=errors, theta=begin).solve("labels", association)
+    return again, not scatter_alone(again).any()
+
+
+def _has_fixed_noise(state: JointState) -> bool:
+    """Return whether the settings fix noise that a solve could estimate."""
+    return state.errors is not None and state.errors.with_unknown_noise().unknown_noise != state.errors.unknown_noise
 
 
 def _with_doubles(state: JointState) -> tuple[JointState, bool]:
@@ -76,26 +131,38 @@ def _with_doubles(state: JointState) -> tuple[JointState, bool]:
     return state, not shows_second_object(*solved, state.settings)
 
 
-def at_other_labels(state: JointState, named: JointState) -> JointState | None:
-    """Return the state after rounds at the path that all labels show but those that scatter alone. None if this path is not
-    sure: too few other labels check it (`unchecked_labels`), their rays do not agree either, or they are doubted.
+def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | None:
+    """Return the map of the labels that agree with each other, without the labels that scatter.
 
-    At this path, the rounds find the objects of the labels that scatter, if they have any. So the log need not be explored,
-    which takes longer. state: before the solve by labels. named: after it.
+    Rays of a thing that moves bend the path, and then rays of other labels are rejected as well. So a label may scatter only
+    at the path without the first ones. None if the remaining labels do not show the path (`_show_path`), or if this map has
+    doubted labels. state: before the solve by labels. named: after it.
     """
-    assert named.association is not None
-    scatter = scatter_alone(named)
-    of_one = named.association.label[scatter]
-    as_one = replace(named.rays, label=np.where(np.isin(named.rays.label, of_one), of_one[0], named.rays.label))
-    if not named.keyframes.localized_every and of_one[0] in unchecked_labels(as_one, named.keyframes):
-        return None
-    number = np.append(np.where(scatter, -1, np.cumsum(~scatter) - 1), -1)
-    others = Association(number[named.association.object], named.association.label[~scatter])
-    try:
-        solved = state.attempt().solve("labels", others)
+    solved, left = named, np.zeros(0, dtype=np.int64)  # The labels that scatter.
+    while True:
+        assert solved.association is not None
         assert solved.estimate is not None
-        if not labels_tell(others, solved.estimate) or scatter_alone(solved).any() or doubted_names(solved):
+        scatter = rejected(solved.association, solved.estimate) | scatter_alone(solved)
+        if not scatter.any():
+            return None if solved is named or doubted_names(solved) else solved
+        left = np.union1d(left, solved.association.label[scatter])
+        if not _show_path(named, left):
             return None
-        return state.replaced(solved.alternated(solved.estimate.map_T_base, (others, solved.estimate.positions)))
-    except SolveError:
-        return None
+        number = np.append(np.where(scatter, -1, np.cumsum(~scatter) - 1), -1)
+        others = Association(number[solved.association.object], solved.association.label[~scatter])
+        try:
+            solved = state.attempt().solve("labels", others)
+        except SolveError:
+            return None
+
+
+def _show_path(named: JointState, left: Ints) -> bool:
+    """Return whether the labels show the path without the labels in `left`: they are `_FEWEST`, and enough of them are seen
+    at each moment (`unchecked_labels`), unless there is a localisation."""
+    rays = named.rays
+    if (np.bincount(rays.label[~np.isin(rays.label, left)]) >= MANY).sum() < _FEWEST:
+        return False
+    if named.keyframes.localized_every:
+        return True
+    as_one = replace(rays, label=np.where(np.isin(rays.label, left), left[0], rays.label))
+    return bool(left[0] not in unchecked_labels(as_one, named.keyframes))

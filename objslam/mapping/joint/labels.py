@@ -109,16 +109,20 @@ def _contains(boxes: Floats, others: Floats) -> Bools:
 
 
 def labels_tell(association: Association, estimate: Estimate) -> bool:
-    """Return whether every label is one object: no label has many rejected rays (`MANY`).
+    """Return whether every label is one object: no label is `rejected`. False if no object has a position."""
+    return bool(np.isfinite(estimate.positions[:, 0]).any()) and not rejected(association, estimate).any()
 
-    An object without a position is ignored, because its rays may only have too little parallax. False if no object has a
-    position.
+
+def rejected(association: Association, estimate: Estimate) -> Bools:
+    """Return the objects (N,) with many rejected rays (`MANY`).
+
+    An object without a position is ignored, because its rays may only have too little parallax.
     """
-    placed = np.isfinite(estimate.positions[:, 0])
     held = association.object >= 0
     number = np.bincount(association.object[held], minlength=association.count)
-    rejected = np.bincount(association.object[held & (estimate.weight == 0)], minlength=association.count)
-    return bool(placed.any()) and not (placed & (rejected >= MANY) & (rejected > SECOND * number)).any()
+    beyond = np.bincount(association.object[held & (estimate.weight == 0)], minlength=association.count)
+    placed = np.isfinite(estimate.positions[:, 0])
+    return np.asarray(placed & (beyond >= MANY) & (beyond > SECOND * number))
 
 
 def scatter_alone(named: JointState | Solution) -> Bools:
