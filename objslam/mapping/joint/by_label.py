@@ -18,6 +18,7 @@ from objslam.mapping.joint.labels import (
     clock_explains,
     labels_tell,
     noise_explains,
+    rays_beyond,
     rejected,
     scatter_alone,
     shows_second_object,
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 _FEWEST = 3
 """The fewest labels, each with at least `MANY` rays, that show the path without the labels that scatter. Fewer labels cannot
 tell which of them scatter. With a larger number, more logs are explored."""
+
+_FAILURES = 2
+"""No more labels are tried after this number of labels in a row that do not agree. Each try takes a solve, and later labels
+fit worse. With a larger number, fewer labels are left out by mistake."""
 
 
 @dataclass(frozen=True)
@@ -135,34 +140,69 @@ def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | 
     """Return the map of the labels that agree with each other, without the labels that scatter.
 
     Rays of a thing that moves bend the path, and then rays of other labels are rejected as well. So a label may scatter only
-    at the path without the first ones. None if the remaining labels do not show the path (`_show_path`), or if this map has
-    doubted labels. state: before the solve by labels. named: after it.
+    at the path without the first ones, and a label that scattered may agree there. These labels are tried once more, one
+    after another, and first the one that fits best, because each label that agrees improves the path. None if the remaining
+    labels do not show the path (`_show_path`), or if this map has doubted labels. state: before the solve by labels. named:
+    after it.
     """
-    solved, left = named, np.zeros(0, dtype=np.int64)  # The labels that scatter.
+    solved, best = named, None
+    tried, failed = np.zeros(0, dtype=np.int64), 0
     while True:
         assert solved.association is not None
         assert solved.estimate is not None
         scatter = rejected(solved.association, solved.estimate) | scatter_alone(solved)
-        if not scatter.any():
-            return None if solved is named or doubted_names(solved) else solved
-        left = np.union1d(left, solved.association.label[scatter])
-        if not _show_path(named, left):
+        labels = solved.association.label[~scatter]
+        if scatter.any():
+            failed += 1
+        elif solved is named:
             return None
-        number = np.append(np.where(scatter, -1, np.cumsum(~scatter) - 1), -1)
-        others = Association(number[solved.association.object], solved.association.label[~scatter])
+        else:
+            best, failed = solved, 0
+        if best is not None:
+            assert best.association is not None
+            more = np.setdiff1d(_by_fit(best), np.union1d(tried, best.association.label), assume_unique=True)
+            if not len(more) or failed >= _FAILURES:
+                return None if doubted_names(best) else best
+            tried = np.append(tried, more[0])
+            labels = np.append(best.association.label, more[0])
+        if not _show_path(named, labels):
+            return None
+        begin, start = (state, None) if best is None else (best, best.solved_poses)
         try:
-            solved = state.attempt().solve("labels", others)
+            solved = begin.attempt().solve("labels", _of_labels(named, labels), start)
         except SolveError:
             return None
 
 
-def _show_path(named: JointState, left: Ints) -> bool:
-    """Return whether the labels show the path without the labels in `left`: they are `_FEWEST`, and enough of them are seen
-    at each moment (`unchecked_labels`), unless there is a localisation."""
+def _by_fit(solved: JointState) -> Ints:
+    """Return the labels of rays that meet at the path of a map of some labels, and first those whose rays fit best."""
+    from objslam.graph.fixed_pose_triangulation import triangulate_at
+
+    association = associate_by_label(solved.rays)
+    found = triangulate_at(solved.solved_poses, solved.keyframes, solved.rays, association, solved.settings)
+    beyond, number = rays_beyond(solved, association, np.where(found.ok[:, None], found.positions, np.nan))
+    order = np.argsort(beyond / np.maximum(number, 1), kind="stable")
+    return association.label[order[number[order] > 0]]
+
+
+def _of_labels(named: JointState, labels: Ints) -> Association:
+    """Return the association of a map with one object for each label, for some labels only."""
+    before = named.association
+    assert before is not None
+    stays = np.isin(before.label, labels)
+    number = np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)
+    return Association(number[before.object], before.label[stays])
+
+
+def _show_path(named: JointState, labels: Ints) -> bool:
+    """Return whether some labels show the path: they are `_FEWEST`, and enough of them are seen at each moment
+    (`unchecked_labels`), unless there is a localisation."""
     rays = named.rays
-    if (np.bincount(rays.label[~np.isin(rays.label, left)]) >= MANY).sum() < _FEWEST:
+    of_them = np.isin(rays.label, labels)
+    if (np.bincount(rays.label[of_them]) >= MANY).sum() < _FEWEST:
         return False
-    if named.keyframes.localized_every:
+    if named.keyframes.localized_every or of_them.all():
         return True
-    as_one = replace(rays, label=np.where(np.isin(rays.label, left), left[0], rays.label))
-    return bool(left[0] not in unchecked_labels(as_one, named.keyframes))
+    first = rays.label[~of_them][0]
+    as_one = replace(rays, label=np.where(of_them, rays.label, first))
+    return bool(first not in unchecked_labels(as_one, named.keyframes))
