@@ -55,7 +55,10 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     state = _begun(begin)
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
         return _associated_again(begin, state, start)
+    before = state.ledger.copy()
     named = by_label(state)
+    if not named.agree:  # What a solve warned of does not matter if its map is not used.
+        state.ledger.restore(before)
     wider, solved = _with_gross_errors(begin, named.state if named.others is None else named.others)
     named = replace(named, state=solved) if named.others is None else replace(named, others=solved)
     if wider is not None:
