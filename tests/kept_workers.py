@@ -24,8 +24,8 @@ def kept_workers() -> Iterator[None]:
     """Keep the process of a `Worker` that is closed while it has nothing to do, and give it to the next one that starts.
 
     A start takes half a second for imports, and a session of some seconds makes several. A process may serve any number of
-    requests one after another, so it answers as a new one would. A process that still works when its worker is closed, or that
-    failed, is ended, as ever."""
+    requests one after another, so it answers as a new one would. A process that failed is ended, as ever. So is one that
+    still works when its worker is closed."""
     start, close, idle = worker._start, Worker.close, list[subprocess.Popen[bytes]]()
 
     def taken() -> subprocess.Popen[bytes] | None:
