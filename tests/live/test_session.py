@@ -580,7 +580,7 @@ def test_fiducials_are_used_up_to_the_edge_as_offline(log, tmp_path):
     front = log.cameras[0]
     corner = front.detections.boxes.copy()
     corner[::3] += [-1, 0, -1, 0] * corner[::3, :1]  # every third box begins at the left edge
-    settings, used = load_settings(None, ("mode=joint", "live.keyframe_distance=0")), {}
+    settings, used = load_settings(None, ("mode=joint", "live.keyframe_distance=0", *HELD)), {}  # It counts rays only.
     for whole in (False, True):
         (tmp_path / str(whole)).mkdir()
         cut = replace(log, cameras=(replace(front, detections=replace(front.detections, boxes=corner, whole=whole)),))
