@@ -178,7 +178,7 @@ def test_a_loop_that_does_not_hold_leaves_all_as_it_was(hall, monkeypatch):
     monkeypatch.setattr(loop_closure, "_close", watched)
     monkeypatch.setattr(loop_closure, "_NEAR", 0.0)  # none so small that it is closed without being asked
     monkeypatch.setattr(loop_closure, "_holds", lambda m, mine: False)
-    drive(hall, until=lambda: len(same) >= 3).abort()
+    drive(hall, load_settings(None, (*DEFAULT, *HELD, "live.search_from=0")), until=lambda: len(same) >= 3).abort()
     assert same
     assert all(same)
 
