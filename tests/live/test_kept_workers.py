@@ -1,13 +1,13 @@
 """The processes that the tests keep for later sessions: only idle ones, and none where a test asks for its own."""
 
 import os
-import time
+import signal
 from functools import partial
 from types import SimpleNamespace
 
 import pytest
 from kept_workers import kept_workers
-from waiting import LIMIT, wait_for
+from waiting import wait_for
 
 from objslam.live.worker import Worker
 
@@ -35,17 +35,17 @@ def test_an_idle_process_goes_to_the_next_worker(own_processes):
             os.kill(one, 0)
 
 
-def test_a_process_that_works_or_failed_is_not_kept(own_processes):
+@pytest.mark.parametrize(("ends", "solve"), [(False, signal.pause), (True, partial(int, "no"))])
+def test_a_process_that_works_or_failed_is_not_kept(own_processes, ends, solve):
     with kept_workers():
-        for request in (SimpleNamespace(solve=partial(time.sleep, LIMIT)), SimpleNamespace(solve=partial(int, "no"))):
-            worker = asked(Worker())
-            number = worker.result()
-            asked(worker, request)
-            if request.solve.func is int:
-                wait_for(lambda worker=worker: worker.done)
-            worker.close()
-            with pytest.raises(ProcessLookupError):
-                os.kill(number, 0)
+        worker = Worker()
+        number = asked(worker).result()
+        asked(worker, SimpleNamespace(solve=solve))
+        if ends:
+            wait_for(lambda: worker.done)
+        worker.close()
+        with pytest.raises(ProcessLookupError):
+            os.kill(number, 0)
 
 
 def test_a_test_may_have_processes_of_its_own(own_processes):
