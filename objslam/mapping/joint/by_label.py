@@ -11,7 +11,7 @@ import numpy as np
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.types import Association
 from objslam.errors import SolveError
-from objslam.mapping.joint.doubted_labels import doubted_names, unchecked_labels
+from objslam.mapping.joint.doubted_labels import doubted_labels, unchecked_labels
 from objslam.mapping.joint.labels import (
     MANY,
     angles_to_objects,
@@ -141,9 +141,9 @@ def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | 
 
     Rays of a thing that moves bend the path, and then rays of other labels are rejected as well. So a label may scatter only
     at the path without the first ones, and a label that scattered may agree there. These labels are tried once more, one
-    after another, and first the one that fits best, because each label that agrees improves the path. None if the remaining
-    labels do not show the path (`_show_path`), or if this map has doubted labels. state: before the solve by labels. named:
-    after it.
+    after another, and first the one that fits best, because each label that agrees improves the path. Labels that are
+    doubted at last are left out as well. None if the remaining labels do not show the path (`_show_path`). state: before the
+    solve by labels. named: after it.
     """
     solved, best = named, None
     tried, failed = np.zeros(0, dtype=np.int64), 0
@@ -161,10 +161,15 @@ def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | 
         if best is not None:
             assert best.association is not None
             more = np.setdiff1d(_by_fit(best), np.union1d(tried, best.association.label), assume_unique=True)
-            if not len(more) or failed >= _FAILURES:
-                return None if doubted_names(best) else best
-            tried = np.append(tried, more[0])
-            labels = np.append(best.association.label, more[0])
+            if len(more) and failed < _FAILURES:
+                tried = np.append(tried, more[0])
+                labels = np.append(best.association.label, more[0])
+            else:
+                assert best.estimate is not None
+                doubted = doubted_labels(best.rays, best.association, best.keyframes, best.estimate)
+                if not len(doubted):
+                    return best
+                tried, labels, best = np.union1d(tried, doubted), np.setdiff1d(best.association.label, doubted), None
         if not _show_path(named, labels):
             return None
         begin, start = (state, None) if best is None else (best, best.solved_poses)
