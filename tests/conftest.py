@@ -62,6 +62,24 @@ def no_waiting_for_the_disk() -> None:
     os.fsync = os.fdatasync = sync  # type: ignore[assignment]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def processes_beside_sessions() -> Iterator[None]:
+    """They are kept for later tests. Tests of how they start and end take the fixture `own_processes`."""
+    from kept_workers import kept_workers
+
+    with kept_workers():
+        yield
+
+
+@pytest.fixture
+def own_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each session starts and ends the processes beside it, as it does for a user."""
+    from kept_workers import AS_EVER
+
+    for of, name, value in AS_EVER:
+        monkeypatch.setattr(of, name, value)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector: pytest.Collector) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
     """Every second process collects from the last file to the first. Without compiled files, it takes as long to rewrite the

@@ -36,10 +36,12 @@ def chosen_backend(device: str, large: bool) -> Backend:
     Raises:
         ConfigError: the setting is "cuda", and torch is not installed or sees no CUDA device.
     """
+    if device == "cpu" or (device == "auto" and not large):
+        return "numpy"  # Most batches. To look for torch takes as long as some of them.
     installed = find_spec("torch") is not None
     if device == "cuda" and not installed:
         raise ConfigError("triangulation.device=cuda needs torch", hint='pip install "objslam[torch]"')
-    if not installed or device == "cpu" or (device == "auto" and not (large and _has_driver())):
+    if not installed or (device == "auto" and not _has_driver()):
         return "numpy"
     import torch
 

@@ -38,11 +38,19 @@ def corrected_rays(
     places = np.einsum("mkij,mkj->mki", map_T_base[..., :3, :3], base_T_camera[..., :3, 3] + move) + map_T_base[..., :3, 3]
     origins = places[:, rays.keyframe]
     if rays.offset is not None:
-        origins = origins + np.einsum("mrij,rj->mri", turned, rays.offset)
+        origins = origins + _rotated(turned, rays.offset)
     if not lens.any():
-        return origins, np.einsum("mrij,rj->mri", turned, rays.direction), np.broadcast_to(rays.sigma, lens.shape[:2])
+        return origins, _rotated(turned, rays.direction), np.broadcast_to(rays.sigma, lens.shape[:2])
     directions, factors = refocused(rays.direction, lens)
-    return origins, np.einsum("mrij,mrj->mri", turned, directions), rays.sigma * factors
+    return origins, _rotated(turned, directions), rays.sigma * factors
+
+
+def _rotated(rotations: Floats, vectors: Floats) -> Floats:
+    """Return the products (M, R, 3) of matrices (M, R, 3, 3) and vectors (R, 3) or (M, R, 3).
+
+    `np.einsum` takes three to ten times as long, because the matrices of a ray lie side by side in memory."""
+    x, y, z = (vectors[..., k, None] for k in range(3))
+    return np.asarray(rotations[..., 0] * x + rotations[..., 1] * y + rotations[..., 2] * z)
 
 
 def _of_cameras(errors: Sequence[Mapping[str, float]], cameras: Sequence[str], kinds: Sequence[str]) -> Floats:

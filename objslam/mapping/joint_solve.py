@@ -55,23 +55,26 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     state = _begun(begin)
     if start is not None or not may_be_by_label(state.settings, state.all_rays):
         return _associated_again(begin, state, start)
-    named, agree = by_label(state)
-    wider, named = _with_gross_errors(begin, named)
+    before = state.ledger.copy()
+    named = by_label(state)
+    if not named.agree:  # What a solve warned of does not matter if its map is not used.
+        state.ledger.restore(before)
+    wider, solved = _with_gross_errors(begin, named.state if named.others is None else named.others)
+    named = replace(named, state=solved) if named.others is None else replace(named, others=solved)
     if wider is not None:
         other = _begun(wider.attempt())
-        again, agrees = by_label(other)
-        if agrees:
-            begin, state, named, agree = wider, state.replaced(other), state.replaced(again), True
-    sure = state.settings.association.method == "by_label" or not doubted_names(named)
-    if agree:
-        return named if sure else _with_several_a_label(state, named)
-    alone = scatter_alone(named).any()
-    if alone and (found := at_other_labels(state, named)) is not None:
+        again = by_label(other)
+        if again.agree or again.others is not None:
+            begin, state, named = wider, state.replaced(other), replace(again, state=state.replaced(again.state))
+    doubted = state.settings.association.method != "by_label" and bool(doubted_names(named.state))
+    if named.agree:
+        return _with_several_a_label(state, named.state) if doubted else named.state
+    if named.others is not None and (found := at_other_labels(state, named.others)) is not None:
         return _settled(found)
     # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
     # With a localisation, such a path shows as noise of the localisation, and no label is doubted.
-    bent = not sure or alone or state.keyframes.localized_every
-    return _associated_again(begin, state if bent else replace(named, association=None, estimate=None), None)
+    bent = doubted or scatter_alone(named.state).any() or state.keyframes.localized_every
+    return _associated_again(begin, state if bent else replace(named.state, association=None, estimate=None), None)
 
 
 def _associated_again(begin: JointState, state: JointState, start: InitialEstimate | None) -> JointState:

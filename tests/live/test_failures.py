@@ -209,7 +209,7 @@ def test_the_command_tells_a_cause_that_a_user_can_mend(folder, breaks, command,
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOMEM, "Cannot allocate memory"), RuntimeError("can't start new thread")])
-def test_work_beside_a_session_fails_alone_where_no_thread_starts(monkeypatch, error):
+def test_work_beside_a_session_fails_alone_where_no_thread_starts(monkeypatch, error, own_processes):
     def no_thread(thread):
         raise error
 

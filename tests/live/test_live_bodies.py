@@ -85,7 +85,7 @@ def test_no_process_without_need(log, monkeypatch, off):
     session.stop()
 
 
-def test_one_process_answers_all_requests_until_one_fails(log, monkeypatch):
+def test_one_process_answers_all_requests_until_one_fails(log, monkeypatch, own_processes):
     asked = []
     with monkeypatch.context() as patch:
         patch.setattr(Worker, "ask", lambda self, request: asked.append(request))

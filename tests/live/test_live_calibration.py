@@ -84,7 +84,7 @@ def test_odometry_is_corrected_pose_by_pose_as_a_whole(turn, tilt):
         np.testing.assert_allclose(second.correct(float(said.stamps[i]), said.poses[i]), whole.odometry.poses[i], atol=1e-9)
 
 
-def test_errors_are_found_while_the_robot_drives_and_the_map_is_better_for_it(log):
+def test_errors_are_found_while_the_robot_drives_and_the_map_is_better_for_it(log, own_processes):
     session = drive(log, settings_of("live.calibrate_from=80"))
     snapshot = session.snapshot()
     session.abort()
@@ -241,7 +241,7 @@ def test_a_clock_that_may_be_right_delays_no_frame():
     assert observed(of(0.03), np.array([0.05, 0.0])).values[0] == 0
 
 
-def test_a_worker_that_fails_costs_no_frame(log, monkeypatch):
+def test_a_worker_that_fails_costs_no_frame(log, monkeypatch, own_processes):
     monkeypatch.setattr("objslam.live.worker.Worker._run", lambda self: self._process.kill())
     session = drive(log, settings_of("live.calibrate_from=80"))
     snapshot = session.snapshot()

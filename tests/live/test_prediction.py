@@ -30,8 +30,9 @@ def test_the_localisation_gives_the_pose_after_a_way_without_boxes(rate, monkeyp
         return found
 
     monkeypatch.setattr(PosePredictor, "predict", recorded)
-    feed(Session(load_settings(None, ("mode=joint",)), patient=True).start(), log).abort()
     begin = float(seen.frame_stamps[BLIND[1]]) - 1e-6
+    session = Session(load_settings(None, ("mode=joint",)), patient=True).start()
+    feed(session, log, until=lambda: bool(predicted) and predicted[-1][0] >= begin).abort()
     stamp, first = next((stamp, found) for stamp, found in predicted if stamp >= begin)
     truth, _ = interpolate(log.truth.trajectory.stamps, log.truth.trajectory.poses, np.array([stamp]), np.inf)
     there = truth[0] @ camera.camera.base_T_camera

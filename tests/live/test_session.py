@@ -178,7 +178,7 @@ def test_a_loop_that_does_not_hold_leaves_all_as_it_was(hall, monkeypatch):
     monkeypatch.setattr(loop_closure, "_close", watched)
     monkeypatch.setattr(loop_closure, "_NEAR", 0.0)  # none so small that it is closed without being asked
     monkeypatch.setattr(loop_closure, "_holds", lambda m, mine: False)
-    drive(hall, until=lambda: len(same) >= 3).abort()
+    drive(hall, load_settings(None, (*DEFAULT, *HELD, "live.search_from=0")), until=lambda: len(same) >= 3).abort()
     assert same
     assert all(same)
 
@@ -580,7 +580,7 @@ def test_fiducials_are_used_up_to_the_edge_as_offline(log, tmp_path):
     front = log.cameras[0]
     corner = front.detections.boxes.copy()
     corner[::3] += [-1, 0, -1, 0] * corner[::3, :1]  # every third box begins at the left edge
-    settings, used = load_settings(None, ("mode=joint", "live.keyframe_distance=0")), {}
+    settings, used = load_settings(None, ("mode=joint", "live.keyframe_distance=0", *HELD)), {}  # It counts rays only.
     for whole in (False, True):
         (tmp_path / str(whole)).mkdir()
         cut = replace(log, cameras=(replace(front, detections=replace(front.detections, boxes=corner, whole=whole)),))

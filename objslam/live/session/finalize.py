@@ -34,7 +34,7 @@ from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.joint.doubted_labels import doubted_names
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
-from objslam.mapping.joint.labels import labels_tell
+from objslam.mapping.joint.labels import labels_tell, may_be_by_label
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.solution import Solution, without_errors
@@ -131,7 +131,9 @@ def _solved(found: Collected, by_label: bool, cameras: tuple[Camera, ...], setti
             ledger.add(own)
             sure = few or not by_label or settings.association.method == "by_label"
             return solution if sure else replace(solution, doubted=doubted_names(solution))
-    start = None if by_label else InitialEstimate(found.map_T_camera, found.association, found.positions)
+    # A session doubts all names if one label is of a thing that moves. The whole drive shows which labels are names.
+    names = by_label or (few and may_be_by_label(settings, found.rays))
+    start = None if names else InitialEstimate(found.map_T_camera, found.association, found.positions)
     return solve(found.keyframes, found.rays, cameras, settings, ledger, lambda *_: None, start, found.errors)
 
 

@@ -221,19 +221,29 @@ def _tried_points(rows: _Rows, size: Ints, dice: Floats) -> tuple[Floats, Bools]
     one = (dice[0, :tried] * size[:, None]).astype(np.int64)
     other = (one + 1 + (dice[1, :tried] * (size - 1)[:, None]).astype(np.int64)) % size[:, None]
     real = order < _tried(size)[:, None]
-    row = np.arange(len(size))[:, None]
-    a, b = ((row, np.where(real, np.where(every, x, y), 0)) for x, y in ((first, one), (second, other)))
-    o_a, d_a, o_b, d_b = rows.origins[a], rows.directions[a], rows.origins[b], rows.directions[b]
-    cos, between = np.einsum("lpi,lpi->lp", d_a, d_b), o_b - o_a
+    labels, width = rows.real.shape
+    row = width * np.arange(labels)[:, None]
+    # The axis of x, y and z comes first, because NumPy is slow if the last axis is short.
+    origins, directions = (np.ascontiguousarray(each.reshape(-1, 3).T) for each in (rows.origins, rows.directions))
+    a, b = (row + np.where(real, np.where(every, x, y), 0) for x, y in ((first, one), (second, other)))
+    o_a, d_a, o_b, d_b = (each.take(at, axis=1) for at in (a, b) for each in (origins, directions))
+    cos, between = _dots(d_a, d_b), o_b - o_a
     sin2 = 1 - cos**2
     wide = real & (sin2 > np.sin(_LEAST_ANGLE / 2) ** 2)
-    along_a, along_b = (np.einsum("lpi,lpi->lp", between, d) for d in (d_a, d_b))
+    along_a, along_b = (_dots(between, d) for d in (d_a, d_b))
     sin2 = np.where(wide, sin2, 1.0)
     s, t = (along_a - cos * along_b) / sin2, (cos * along_a - along_b) / sin2
-    points = (o_a + s[:, :, None] * d_a + o_b + t[:, :, None] * d_b) / 2
+    points = (o_a + s * d_a + o_b + t * d_b) / 2
     ahead = wide & (s > _NEAREST) & (t > _NEAREST)
     some = np.argsort(~ahead, axis=1, kind="stable")[:, : max(1, int(ahead.sum(axis=1).max()))]
-    return np.take_along_axis(points, some[:, :, None], axis=1), np.take_along_axis(ahead, some, axis=1)
+    return np.stack([np.take_along_axis(each, some, axis=1) for each in points], axis=2), np.take_along_axis(
+        ahead, some, axis=1
+    )
+
+
+def _dots(a: Floats, b: Floats) -> Floats:
+    """Return the products (L, P) of vectors (3, L, P)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def _seen_from_around(rows: _Rows, points: Floats, inside: Bools) -> Bools:

@@ -109,7 +109,8 @@ class FixedPoses:
             association, estimate = found, self.solve(found, trace, parameters)
         if self.settings.association.method == "by_label":
             return association, estimate
-        left = things_at_rest(self.seen, self.rays_seen, association, estimate, self.seen.map_T_camera)
+        given = self.seen, self.rays_seen, association, estimate, self.seen.map_T_camera
+        left = things_at_rest(*given, self.settings)
         return (association, estimate) if left is association else (left, self.solve(left, trace, parameters))
 
     def _posed(self, more: Floats | float) -> PosedRays:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -11,40 +11,93 @@ import numpy as np
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.types import Association
 from objslam.errors import SolveError
-from objslam.mapping.joint.doubted_labels import doubted_names, unchecked_labels
+from objslam.mapping.joint.doubted_labels import doubted_labels, unchecked_labels
 from objslam.mapping.joint.labels import (
+    MANY,
     angles_to_objects,
     clock_explains,
     labels_tell,
     noise_explains,
+    rays_beyond,
+    rejected,
     scatter_alone,
     shows_second_object,
     warn_of_noise,
 )
 
 if TYPE_CHECKING:
+    from objslam.core.arrays import Ints
     from objslam.mapping.joint.joint_alternation import JointState
 
+_FEWEST = 3
+"""The fewest labels, each with at least `MANY` rays, that show the path without the labels that scatter. Fewer labels cannot
+tell which of them scatter. With a larger number, more logs are explored."""
 
-def by_label(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, and whether the rays agree with it. If they disagree at a few labels only,
-    the shared errors and the noise of the state are still better than the nominal values."""
-    named, agree = _solved_by_label(state)
-    return named, agree and (state.settings.association.method == "by_label" or not scatter_alone(named).any())
+_FAILURES = 2
+"""No more labels are tried after this number of labels in a row that do not agree. Each try takes a solve, and later labels
+fit worse. With a larger number, fewer labels are left out by mistake."""
 
 
-def _solved_by_label(state: JointState) -> tuple[JointState, bool]:
-    """Return the state with one object per label, and whether hardly a ray is rejected."""
-    association, errors = associate_by_label(state.rays), state.errors
+@dataclass(frozen=True)
+class Named:
+    """A map with one object for each label.
+
+    state: the solved map. agree: whether the rays agree with it. others: the map of the labels that agree, if the others
+    scatter alone. None if there is no such map, or if it is not sure.
+    """
+
+    state: JointState
+    agree: bool
+    others: JointState | None = None
+
+
+def by_label(state: JointState) -> Named:
+    """Return the map with one object per label. If the rays disagree at a few labels only, its shared errors and its noise
+    are still better than the nominal values."""
+    association = associate_by_label(state.rays)
     solved = state.solve("labels", association)
     assert solved.estimate is not None
     if state.settings.association.method == "by_label":
-        return solved, True
+        return Named(solved, True)
     told = labels_tell(association, solved.estimate)
-    if (association.object < 0).any():  # A frame has two boxes of a label. No noise causes that.
-        return _with_doubles(solved) if told else (solved, False)
-    if told:
-        return solved, True
+    if told and not scatter_alone(solved).any():
+        # Two boxes of a label in a frame: no noise causes that.
+        return Named(*_with_doubles(solved)) if (association.object < 0).any() else Named(solved, True)
+    # If the settings have too little noise, true rays are rejected. So more noise is tried before labels are left out.
+    if not told and not (association.object < 0).any() and _has_fixed_noise(solved):
+        found = Named(*_with_other_start(state, solved))
+        return found if found.agree else replace(found, others=_of_labels_that_agree(state, solved))
+    if (others := _of_labels_that_agree(state, solved)) is not None:
+        return Named(solved, False, others)
+    if told or (association.object < 0).any():
+        return Named(solved, False)
+    return Named(*_with_other_start(state, solved))
+
+
+def at_other_labels(state: JointState, others: JointState) -> JointState | None:
+    """Return the state after rounds at the path that the labels show which agree. None if no solve is possible.
+
+    At this path, the rounds find the objects of the labels that scatter, if they have any. So the log need not be explored,
+    which takes longer. The noise stays as it is: with more noise, the path would bend to things that move. state: before the
+    solve by labels. others: the map of the labels that agree.
+    """
+    assert others.association is not None
+    assert others.estimate is not None
+    known = replace(others, errors=None if others.errors is None else others.errors.with_known_noise())
+    try:
+        return state.replaced(known.alternated(others.estimate.map_T_base, (others.association, others.estimate.positions)))
+    except SolveError:
+        return None
+
+
+def _with_other_start(state: JointState, solved: JointState) -> tuple[JointState, bool]:
+    """Return the state solved with the noise or the clock with which labels are names, and whether there is one.
+
+    state: before the solve by labels. solved: after it. It rejects many rays.
+    """
+    association, errors = solved.association, state.errors
+    assert association is not None
+    assert solved.estimate is not None
     if solved.errors is None or errors is None:
         return solved, False
     noisier = noise_explains(association, solved.estimate, solved.errors, partial(solved.solve_once, association))
@@ -53,12 +106,19 @@ def _solved_by_label(state: JointState) -> tuple[JointState, bool]:
         assert again.estimate is not None
         warn_of_noise(solved.errors, noisier, state.ledger)
         # The last solve estimates the noise again, unless the settings fix it, and may reject the rays of an object.
-        known = solved.errors.with_unknown_noise().unknown_noise != solved.errors.unknown_noise
-        return (again, True) if known or labels_tell(association, again.estimate) else (solved, False)
-    begin = clock_explains(association, errors, lambda at: solved.solve_once(association, errors, begin=at))
-    if begin is None:
-        return solved, False
-    return replace(solved, errors=errors, theta=begin).solve("labels", association), True
+        if not _has_fixed_noise(solved) and not labels_tell(association, again.estimate):
+            return solved, False
+    else:
+        begin = clock_explains(association, errors, lambda at: solved.solve_once(association, errors, begin=at))
+        if begin is None:
+            return solved, False
+        again = replace(solved, errors=errors, theta=begin).solve("labels", association)
+    return again, not scatter_alone(again).any()
+
+
+def _has_fixed_noise(state: JointState) -> bool:
+    """Return whether the settings fix noise that a solve could estimate."""
+    return state.errors is not None and state.errors.with_unknown_noise().unknown_noise != state.errors.unknown_noise
 
 
 def _with_doubles(state: JointState) -> tuple[JointState, bool]:
@@ -76,26 +136,78 @@ def _with_doubles(state: JointState) -> tuple[JointState, bool]:
     return state, not shows_second_object(*solved, state.settings)
 
 
-def at_other_labels(state: JointState, named: JointState) -> JointState | None:
-    """Return the state after rounds at the path that all labels show but those that scatter alone. None if this path is not
-    sure: too few other labels check it (`unchecked_labels`), their rays do not agree either, or they are doubted.
+def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | None:
+    """Return the map of the labels that agree with each other, without the labels that scatter.
 
-    At this path, the rounds find the objects of the labels that scatter, if they have any. So the log need not be explored,
-    which takes longer. state: before the solve by labels. named: after it.
+    Rays of a thing that moves bend the path, and then rays of other labels are rejected as well. So a label may scatter only
+    at the path without the first ones, and a label that scattered may agree there. These labels are tried once more, one
+    after another, and first the one that fits best, because each label that agrees improves the path. Labels that are
+    doubted at last are left out as well. None if the remaining labels do not show the path (`_show_path`). state: before the
+    solve by labels. named: after it.
     """
-    assert named.association is not None
-    scatter = scatter_alone(named)
-    of_one = named.association.label[scatter]
-    as_one = replace(named.rays, label=np.where(np.isin(named.rays.label, of_one), of_one[0], named.rays.label))
-    if not named.keyframes.localized_every and of_one[0] in unchecked_labels(as_one, named.keyframes):
-        return None
-    number = np.append(np.where(scatter, -1, np.cumsum(~scatter) - 1), -1)
-    others = Association(number[named.association.object], named.association.label[~scatter])
-    try:
-        solved = state.attempt().solve("labels", others)
+    solved, best = named, None
+    tried, failed = np.zeros(0, dtype=np.int64), 0
+    while True:
+        assert solved.association is not None
         assert solved.estimate is not None
-        if not labels_tell(others, solved.estimate) or scatter_alone(solved).any() or doubted_names(solved):
+        scatter = rejected(solved.association, solved.estimate) | scatter_alone(solved)
+        labels = solved.association.label[~scatter]
+        if scatter.any():
+            failed += 1
+        elif solved is named:
             return None
-        return state.replaced(solved.alternated(solved.estimate.map_T_base, (others, solved.estimate.positions)))
-    except SolveError:
-        return None
+        else:
+            best, failed = solved, 0
+        if best is not None:
+            assert best.association is not None
+            more = np.setdiff1d(_by_fit(best), np.union1d(tried, best.association.label), assume_unique=True)
+            if len(more) and failed < _FAILURES:
+                tried = np.append(tried, more[0])
+                labels = np.append(best.association.label, more[0])
+            else:
+                assert best.estimate is not None
+                doubted = doubted_labels(best.rays, best.association, best.keyframes, best.estimate)
+                if not len(doubted):
+                    return best
+                tried, labels, best = np.union1d(tried, doubted), np.setdiff1d(best.association.label, doubted), None
+        if not _show_path(named, labels):
+            return None
+        begin, start = (state, None) if best is None else (best, best.solved_poses)
+        try:
+            solved = begin.attempt().solve("labels", _of_labels(named, labels), start)
+        except SolveError:
+            return None
+
+
+def _by_fit(solved: JointState) -> Ints:
+    """Return the labels of rays that meet at the path of a map of some labels, and first those whose rays fit best."""
+    from objslam.graph.fixed_pose_triangulation import triangulate_at
+
+    association = associate_by_label(solved.rays)
+    found = triangulate_at(solved.solved_poses, solved.keyframes, solved.rays, association, solved.settings)
+    beyond, number = rays_beyond(solved, association, np.where(found.ok[:, None], found.positions, np.nan))
+    order = np.argsort(beyond / np.maximum(number, 1), kind="stable")
+    return association.label[order[number[order] > 0]]
+
+
+def _of_labels(named: JointState, labels: Ints) -> Association:
+    """Return the association of a map with one object for each label, for some labels only."""
+    before = named.association
+    assert before is not None
+    stays = np.isin(before.label, labels)
+    number = np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)
+    return Association(number[before.object], before.label[stays])
+
+
+def _show_path(named: JointState, labels: Ints) -> bool:
+    """Return whether some labels show the path: they are `_FEWEST`, and enough of them are seen at each moment
+    (`unchecked_labels`), unless there is a localisation."""
+    rays = named.rays
+    of_them = np.isin(rays.label, labels)
+    if (np.bincount(rays.label[of_them]) >= MANY).sum() < _FEWEST:
+        return False
+    if named.keyframes.localized_every or of_them.all():
+        return True
+    first = rays.label[~of_them][0]
+    as_one = replace(rays, label=np.where(of_them, rays.label, first))
+    return bool(first not in unchecked_labels(as_one, named.keyframes))

@@ -89,16 +89,18 @@ def doubted_labels(rays: Rays, association: Association, keyframes: Keyframes, e
 
     Args:
         rays: the rays, with their labels.
-        association: the object of each ray. A second box of a label in one frame may have no object.
+        association: the object of each ray. A second box of a label in one frame may have no object. Labels without an
+            object are not judged, and check no other label.
         keyframes: the keyframes of the rays.
         estimate: the solved map of one object for each label.
     """
     noise = estimate.noise
     if keyframes.localized_every or noise is None:
         return np.zeros(0, dtype=np.int64)
-    unchecked = unchecked_labels(rays, keyframes)
+    of_map = np.isin(rays.label, association.label)
+    unchecked = unchecked_labels(rays.take(of_map), keyframes)
     if max(noise.along, noise.across, noise.turning) > _GREW:
-        enough = np.flatnonzero(np.bincount(rays.label) >= 2 * MANY)
+        enough = np.flatnonzero(np.bincount(rays.label[of_map]) >= 2 * MANY)
         return enough if noise.rays > _NOISY_BOXES else unchecked
     count, held = len(rays.label_names), association.object >= 0
     rejected, number = (np.bincount(rays.label[which], minlength=count) for which in (held & (estimate.weight == 0), held))

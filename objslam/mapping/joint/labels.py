@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from objslam.config import Settings
-    from objslam.core.arrays import Bools, Floats
+    from objslam.core.arrays import Bools, Floats, Ints
     from objslam.core.diagnostics import Ledger
     from objslam.core.estimate import Estimate
     from objslam.core.types import Keyframes, Rays
@@ -109,16 +109,20 @@ def _contains(boxes: Floats, others: Floats) -> Bools:
 
 
 def labels_tell(association: Association, estimate: Estimate) -> bool:
-    """Return whether every label is one object: no label has many rejected rays (`MANY`).
+    """Return whether every label is one object: no label is `rejected`. False if no object has a position."""
+    return bool(np.isfinite(estimate.positions[:, 0]).any()) and not rejected(association, estimate).any()
 
-    An object without a position is ignored, because its rays may only have too little parallax. False if no object has a
-    position.
+
+def rejected(association: Association, estimate: Estimate) -> Bools:
+    """Return the objects (N,) with many rejected rays (`MANY`).
+
+    An object without a position is ignored, because its rays may only have too little parallax.
     """
-    placed = np.isfinite(estimate.positions[:, 0])
     held = association.object >= 0
     number = np.bincount(association.object[held], minlength=association.count)
-    rejected = np.bincount(association.object[held & (estimate.weight == 0)], minlength=association.count)
-    return bool(placed.any()) and not (placed & (rejected >= MANY) & (rejected > SECOND * number)).any()
+    beyond = np.bincount(association.object[held & (estimate.weight == 0)], minlength=association.count)
+    placed = np.isfinite(estimate.positions[:, 0])
+    return np.asarray(placed & (beyond >= MANY) & (beyond > SECOND * number))
 
 
 def scatter_alone(named: JointState | Solution) -> Bools:
@@ -132,19 +136,32 @@ def scatter_alone(named: JointState | Solution) -> Bools:
     association, estimate = named.association, named.estimate
     assert association is not None
     assert estimate is not None
-    origins, directions = named.rays.in_map(estimate.map_T_base @ named.keyframes.base_T_camera)
-    known = np.flatnonzero(np.isfinite(estimate.positions[association.object, 0]) & (association.object >= 0))
+    beyond, number = rays_beyond(named, association, estimate.positions)
+    return np.asarray((beyond >= MANY) & (beyond > SECOND * number))
+
+
+def rays_beyond(named: JointState | Solution, association: Association, positions: Floats) -> tuple[Ints, Ints]:
+    """Return how many rays of each object (N,) are off by more than `_AGREES` times the usual noise, and of how many rays.
+
+    The usual noise is the one of the objects whose labels are in the map `named`. Both numbers are zero for objects with
+    fewer than `MANY` rays, and for all objects if fewer than `_OTHERS` show the usual noise. association: of the rays of the
+    map, with its labels or more. positions: (N, 3) m of the objects at the path of the map, NaN if unknown.
+    """
+    assert named.association is not None
+    assert named.estimate is not None
+    origins, directions = named.rays.in_map(named.estimate.map_T_base @ named.keyframes.base_T_camera)
+    known = np.flatnonzero(np.isfinite(positions[association.object, 0]) & (association.object >= 0))
     owner = association.object[known]
-    off = angles_off(origins[known], directions[known], estimate.positions[owner]) / named.rays.sigma[known]
+    off = angles_off(origins[known], directions[known], positions[owner]) / named.rays.sigma[known]
     number = np.bincount(owner, minlength=association.count)
     many = number >= MANY
-    if many.sum() < _OTHERS:
-        return np.zeros(association.count, dtype=bool)
+    usual = many & np.isin(association.label, named.association.label)
+    if usual.sum() < _OTHERS:
+        return np.zeros_like(number), np.zeros_like(number)
     spread = np.sqrt(np.bincount(owner, off**2, association.count) / np.maximum(number, 1))
-    nominal = 1.0 if estimate.noise is None else 1 / estimate.noise.rays
-    limit = _AGREES * max(float(np.median(spread[many])), nominal)
-    beyond = np.bincount(owner[off > limit], minlength=association.count)
-    return np.asarray(many & (beyond >= MANY) & (beyond > SECOND * number))
+    nominal = 1.0 if named.estimate.noise is None else 1 / named.estimate.noise.rays
+    limit = _AGREES * max(float(np.median(spread[usual])), nominal)
+    return np.bincount(owner[off > limit], minlength=association.count) * many, number * many
 
 
 def clock_explains(association: Association, errors: SharedErrors, solve: Callable[[Floats], Estimate]) -> Floats | None:

@@ -11,8 +11,10 @@ from objslam.core.geometry import angles_off
 from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
+from objslam.mapping.joint.labels import SECOND
 
 if TYPE_CHECKING:
+    from objslam.config import Settings
     from objslam.core.arrays import Bools, Floats, Ints
     from objslam.core.estimate import Estimate
     from objslam.core.types import Keyframes, Rays
@@ -34,6 +36,18 @@ _LONG = 6
 """The fewest rays of a track that shows that a thing of a moving label is at rest. The rays of shorter tracks meet in a
 point even if the thing moves: a cart with four rays in tracks of three passed for a thing at rest. A larger number drops
 more objects of such labels."""
+_VISITS = 2
+"""The fewest visits to a thing of a moving label that is at rest. In one visit, the rays to a robot that drives on a line
+often meet in a point, and nothing but a second visit shows that it was chance. A larger number drops more objects."""
+_AWAY = 5.0
+"""The shortest time (s) between two visits. In a longer time, a thing that moves gets farther. With a longer time, objects
+have fewer visits, and more of moving labels are dropped."""
+_APART = 3.0
+"""The rays of a track meet in no point if the root mean square of their residuals is more than this multiple of the usual
+one. Recorded robots that other robots saw had 0.4 to 60. A larger multiple finds fewer moving labels."""
+_EXPLAINED = 0.8
+"""The least share of the rays of a track that are of objects, if the track is of things at rest. Recorded landmarks had 0.98
+and more, and recorded robots 0.5 on average. A larger share finds more moving labels."""
 _USUAL = 3
 """The fewest objects from which the usual scatter is measured: those whose tracks have hardly any other rays, and whose
 label does not seem to move. With a larger number, fewer maps are judged."""
@@ -77,7 +91,8 @@ def _dropped(state: JointState, known: Ints) -> tuple[JointState, Ints]:
     assert state.association is not None
     assert state.estimate is not None
     before = state.association
-    left = things_at_rest(state.keyframes, state.rays, before, state.estimate, state.solved_poses, known)
+    given = state.keyframes, state.rays, before, state.estimate, state.solved_poses, state.settings
+    left = things_at_rest(*given, known)
     if left is before:
         return state, known
     gone = (before.object >= 0) & (left.object < 0)
@@ -90,6 +105,7 @@ def things_at_rest(
     association: Association,
     estimate: Estimate,
     map_T_camera: Floats,
+    settings: Settings,
     known: Ints | None = None,
 ) -> Association:
     """Return the association without objects of things that move, else the association itself.
@@ -101,7 +117,7 @@ def things_at_rest(
     if long tracks show that they are at rest. If all things have one label, the usual scatter is unknown, and all objects
     stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses. known: labels that are known to move.
     """
-    moving = _moving(keyframes, rays, association, estimate, map_T_camera, known)
+    moving = _moving(keyframes, rays, association, estimate, map_T_camera, settings, known)
     if not moving.any():
         return association
     number = np.append(np.where(moving, -1, np.cumsum(~moving) - 1), -1)
@@ -122,6 +138,7 @@ def _moving(
     association: Association,
     estimate: Estimate,
     map_T_camera: Floats,
+    settings: Settings,
     known: Ints | None,
 ) -> Bools:
     """Return which objects (N,) are of things that move. The parameters are as in `things_at_rest`."""
@@ -140,16 +157,64 @@ def _moving(
     number = np.bincount(owner[held], minlength=association.count).astype(np.float64)
     squares = np.bincount(owner[held], np.nan_to_num(off) ** 2, association.count).astype(np.float64)
     label = association.label
-    sums = np.zeros((4, label.max() + 1))
+    sums = np.zeros((4, len(rays.label_names)))
     np.add.at(sums.T, label, np.stack([many, many * pure, squares, number], axis=1))
     all_told, all_pure, all_squares, all_rays = sums
     passed = all_pure < _PASSED * all_told
     rest = (many > 0) & (pure >= _PURE) & ~passed[label]
     moves = np.isin(np.arange(len(passed)), [] if known is None else known)
+    long = length[track] >= _LONG
+    fits = np.ones(association.count, dtype=bool)
     if rest.sum() >= _USUAL:
-        usual = np.median(squares[rest] / number[rest])
+        usual = float(np.median(squares[rest] / number[rest]))
         moves |= passed & (all_squares > _SCATTER**2 * usual * all_rays)
+        moves |= _wander(keyframes, rays, np.where(long, track, -1), owner, map_T_camera, settings, usual)
+        fits = squares <= _SCATTER**2 * usual * number
     # An object without long tracks, such as one whose rays are all rejected, would take up rays of the dropped objects.
-    long = length[track[told]] >= _LONG
-    rests = np.bincount(owner[told[long]], minlength=association.count) > 0
-    return np.asarray(((pure < _PURE) | ~rests) & moves[label])
+    shown = np.flatnonzero(long & (owner >= 0))
+    rests = _visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], association.count) >= _VISITS
+    return np.asarray(((pure < _PURE) | ~rests | ~fits) & moves[label])
+
+
+def _wander(
+    keyframes: Keyframes,
+    rays: Rays,
+    track: Ints,
+    owner: Ints,
+    map_T_camera: Floats,
+    settings: Settings,
+    usual: float,
+) -> Bools:
+    """Return the labels (L,) whose boxes follow things that move.
+
+    A track follows such a thing if its rays meet in no point, and if they are not of objects. Tracks also pass on to equal
+    things nearby, but then their rays are of objects. A label wanders if more than the share `SECOND` of its rays in long
+    tracks is in such tracks. track: (R,) -1 for a ray without a long track. owner: (R,) the object of each ray that agrees,
+    else -1. usual: the mean square of the residuals of a thing at rest, in variances of a ray.
+    """
+    from objslam.graph.fixed_pose_triangulation import triangulate_at
+
+    held = np.flatnonzero(track >= 0)
+    number, first, inverse = np.unique(track[held], return_index=True, return_inverse=True)
+    count, label = len(number), rays.label[held[first]]
+    mine = np.full(len(rays), -1)
+    mine[held] = inverse.ravel()
+    found = triangulate_at(map_T_camera, keyframes, rays, Association(mine, label), settings)
+    origins, directions = rays.in_map(map_T_camera)
+    off = angles_off(origins[held], directions[held], found.positions[mine[held]]) / rays.sigma[held]
+    length = np.bincount(mine[held], minlength=count)
+    meets = np.bincount(mine[held], np.nan_to_num(off) ** 2, count) <= _APART**2 * usual * length
+    explained = np.bincount(mine[held], owner[held] >= 0, count) >= _EXPLAINED * length
+    labels = len(rays.label_names)
+    follow = np.bincount(label, np.where(meets | explained, 0, length), labels)
+    return np.asarray(follow > SECOND * np.bincount(label, length, labels))
+
+
+def _visits(stamps: Floats, owner: Ints, count: int) -> Ints:
+    """Return how many visits (N,) each object has: groups of rays without a gap of `_AWAY` between them.
+
+    stamps: (R,) s. owner: (R,) the object of each ray."""
+    order = np.lexsort((stamps, owner))
+    of, at = owner[order], stamps[order]
+    begins = np.append(True, (np.diff(of) != 0) | (np.diff(at) > _AWAY))[: len(of)]
+    return np.bincount(of[begins], minlength=count)
