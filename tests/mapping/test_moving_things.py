@@ -14,9 +14,10 @@ from objslam.core.types import Association, Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
+from objslam.frontend.tracks import tracks_of_rays
 from objslam.mapping import pipeline
 from objslam.mapping.joint.joint_alternation import JointState
-from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
+from objslam.mapping.moves.moving_things import associated_at_rest, things_at_rest, without_moving_things
 from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
 
@@ -128,6 +129,65 @@ def test_a_map_of_things_at_rest_stays_the_same() -> None:
     state = solved(simulate(preset("rooms", placed=row, objects=6, classes=3, missed=0.3, false=0.1), 3))
     assert without_moving_things(state) is state
     assert associated_at_rest(state) is state
+
+
+def with_carts_at_rest(log: Log, places: np.ndarray) -> Log:
+    """The log with the boxes of carts at places (N, 2) m. Far away, they are as large as boxes need to show them."""
+    camera, found = log.cameras[0].camera, log.cameras[0].detections
+    assert found is not None
+    assert log.truth is not None
+    assert log.truth.trajectory is not None
+    path = log.truth.trajectory
+    poses = interpolate(path.stamps, path.poses, found.frame_stamps, 0.2)[0]
+    rng, boxes, frames = np.random.default_rng(0), [], []
+    for place in places:
+        size = max(float(np.hypot(*place)) / 40, 1.0)
+        for frame, pose in enumerate(poses):
+            camera_T_map = inverse(pose @ camera.base_T_camera)
+            seen = (_CART * size + np.append(place, 0.0)) @ camera_T_map[:3, :3].T + camera_T_map[:3, 3]
+            if seen[:, 2].min() < 0.5:
+                continue
+            pixels = project(camera, seen)
+            low, high = pixels.min(axis=0), pixels.max(axis=0)
+            if (low > 1).all() and (high < [camera.width - 2, camera.height - 2]).all():
+                boxes.append(np.concatenate([low, high]) + rng.normal(0, 1.5, 4))
+                frames.append(frame)
+    return with_boxes(log, np.array(frames), np.array(boxes), "cart")
+
+
+def test_boxes_of_far_things_are_of_no_label_that_moves() -> None:
+    """The rays to a far thing are parallel, and so they are of no object. A cart nearby, seen in one visit, stays."""
+    log = simulate(preset("rooms", missed=0.0, false=0.0), 1)
+    far = 3000 * np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (0.7, 0.7), (-0.7, 0.7), (-0.7, -0.7), (0.7, -0.7)])
+    state = solved(with_carts_at_rest(log, np.vstack([[(1.0, 0.5)], far])))
+    before, estimate = state.association, state.estimate
+    assert before is not None
+    assert estimate is not None
+    cart = before.label == state.rays.label_names.index("cart")
+    near = cart & (np.linalg.norm(estimate.positions[:, :2] - [1.0, 0.5], axis=1) < 1.0)
+    assert near.sum() == 1
+    number = np.append(np.where(cart & ~near, -1, np.cumsum(~cart | near) - 1), -1)
+    of_near = number[before.object] == number[np.flatnonzero(near)[0]]
+    stamps = state.keyframes.stamps[state.rays.keyframe]
+    later = of_near & (stamps > stamps[of_near][0] + 4.0)
+    left = Association(np.where(later, -1, number[before.object]), before.label[~cart | near])
+    again = state.attempt().solve("association", left, state.solved_poses)
+    assert again.estimate is not None
+    alone = (left.object < 0) & (state.rays.label == state.rays.label_names.index("cart"))
+    assert alone.sum() > 100
+    given = again.keyframes, again.rays, left, again.estimate, again.solved_poses, again.settings
+    assert things_at_rest(*given) is left
+
+
+def test_boxes_without_tracks_say_nothing_of_motion() -> None:
+    """A detector that looks at four of 25 images."""
+    log = with_carts(simulate(preset("rooms", missed=0.1, false=0.0), 1), 4, 1)
+    (camera,) = log.cameras
+    assert camera.detections is not None
+    seldom = camera.detections.take(camera.detections.frame % 25 < 4)
+    state = solved(replace(log, cameras=(replace(camera, detections=seldom),)))
+    assert tracks_of_rays(state.keyframes, state.rays, state.solved_poses)[1].max() < 6
+    assert without_moving_things(state) is state
 
 
 def solved(log: Log) -> JointState:

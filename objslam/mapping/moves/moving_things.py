@@ -187,27 +187,38 @@ def _wander(
 ) -> Bools:
     """Return the labels (L,) whose boxes follow things that move.
 
-    A track follows such a thing if its rays meet in no point, and if they are not of objects. Tracks also pass on to equal
-    things nearby, but then their rays are of objects. A label wanders if more than the share `SECOND` of its rays in long
-    tracks is in such tracks. track: (R,) -1 for a ray without a long track. owner: (R,) the object of each ray that agrees,
-    else -1. usual: the mean square of the residuals of a thing at rest, in variances of a ray.
+    A track follows such a thing if its rays meet in no point, are not parallel as those to a far thing are, and are not of
+    objects. Tracks also pass on to equal things nearby, but then their rays are of objects. A label wanders if more than the
+    share `SECOND` of its rays in long tracks is in such tracks.
+
+    Args:
+        keyframes, rays: of the map.
+        track: (R,) -1 for a ray without a long track.
+        owner: (R,) the object of each ray that agrees, else -1.
+        map_T_camera: (K, 4, 4).
+        settings: of the run.
+        usual: the mean square of the residuals of a thing at rest, in variances of a ray.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
-    held = np.flatnonzero(track >= 0)
+    labels, held = len(rays.label_names), np.flatnonzero(track >= 0)
+    if not len(held):
+        return np.zeros(labels, dtype=bool)
     number, first, inverse = np.unique(track[held], return_index=True, return_inverse=True)
     count, label = len(number), rays.label[held[first]]
     mine = np.full(len(rays), -1)
     mine[held] = inverse.ravel()
     found = triangulate_at(map_T_camera, keyframes, rays, Association(mine, label), settings)
     origins, directions = rays.in_map(map_T_camera)
-    off = angles_off(origins[held], directions[held], found.positions[mine[held]]) / rays.sigma[held]
-    length = np.bincount(mine[held], minlength=count)
-    meets = np.bincount(mine[held], np.nan_to_num(off) ** 2, count) <= _APART**2 * usual * length
-    explained = np.bincount(mine[held], owner[held] >= 0, count) >= _EXPLAINED * length
-    labels = len(rays.label_names)
-    follow = np.bincount(label, np.where(meets | explained, 0, length), labels)
-    return np.asarray(follow > SECOND * np.bincount(label, length, labels))
+    track, origins, directions, sigma = mine[held], origins[held], directions[held], rays.sigma[held]
+    length = np.bincount(track, minlength=count)
+    middle = np.stack([np.bincount(track, way, count) for way in directions.T], axis=1).astype(np.float64)
+    point = angles_off(origins, directions, found.positions[track])
+    parallel = angles_off(np.zeros_like(origins), directions, middle[track])
+    squares = np.minimum(*(np.bincount(track, np.nan_to_num(off / sigma) ** 2, count) for off in (point, parallel)))
+    explained = np.bincount(track, owner[held] >= 0, count) >= _EXPLAINED * length
+    follow = (squares > _APART**2 * usual * length) & ~explained
+    return np.asarray(np.bincount(label, follow * length, labels) > SECOND * np.bincount(label, length, labels))
 
 
 def _visits(stamps: Floats, owner: Ints, count: int) -> Ints:
