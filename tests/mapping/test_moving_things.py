@@ -14,7 +14,6 @@ from objslam.core.types import Association, Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.tracks import tracks_of_rays
 from objslam.mapping import pipeline
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.moves.moving_things import associated_at_rest, things_at_rest, without_moving_things
@@ -177,17 +176,6 @@ def test_boxes_of_far_things_are_of_no_label_that_moves() -> None:
     assert alone.sum() > 100
     given = again.keyframes, again.rays, left, again.estimate, again.solved_poses, again.settings
     assert things_at_rest(*given) is left
-
-
-def test_boxes_without_tracks_say_nothing_of_motion() -> None:
-    """A detector that looks at four of 25 images."""
-    log = with_carts(simulate(preset("rooms", missed=0.1, false=0.0), 1), 4, 1)
-    (camera,) = log.cameras
-    assert camera.detections is not None
-    seldom = camera.detections.take(camera.detections.frame % 25 < 4)
-    state = solved(replace(log, cameras=(replace(camera, detections=seldom),)))
-    assert tracks_of_rays(state.keyframes, state.rays, state.solved_poses)[1].max() < 6
-    assert without_moving_things(state) is state
 
 
 def solved(log: Log) -> JointState:

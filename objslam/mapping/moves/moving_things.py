@@ -202,8 +202,6 @@ def _wander(
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
     labels, held = len(rays.label_names), np.flatnonzero(track >= 0)
-    if not len(held):
-        return np.zeros(labels, dtype=bool)
     number, first, inverse = np.unique(track[held], return_index=True, return_inverse=True)
     count, label = len(number), rays.label[held[first]]
     mine = np.full(len(rays), -1)
