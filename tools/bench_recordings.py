@@ -1,13 +1,14 @@
 """Map recorded drives with default settings, and compare each map with its truth and with its own sigmas.
 
-    python tools/bench_recordings.py [--parts named short poses late cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
+    python tools/bench_recordings.py [--parts named robots short poses late cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
 
 named: UTIAS MRCLAM 6 and 7 (15 landmarks, the odometry of wheels) and Lost in the Woods (17 posts, one observation a
-second), each landmark with a label of its own, from bearings and with ranges. short: parts of the MRCLAM drives of two to
-five minutes. poses: whole drives at the poses of the motion capture. late: drives whose motion capture begins after two
-fifths of the time, beside the odometry, with mode fixed and auto. cube: a cabinet of TUM fr3 at the poses of the motion
-capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with ranges, and one
-label for all landmarks.
+second), each landmark with a label of its own, from bearings and with ranges. robots: the MRCLAM drives, with the boxes of
+the other robots, which drive around, each with a label of its own. Their objects are false. short: parts of the MRCLAM
+drives of two to five minutes. poses: whole drives at the poses of the motion capture. late: drives whose motion capture
+begins after two fifths of the time, beside the odometry, with mode fixed and auto. cube: a cabinet of TUM fr3 at the poses
+of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with
+ranges, and one label for all landmarks.
 
 Maps from odometry are compared after SE(2) alignment. The truth is inside a 95 % ellipsoid in 95 % of the cases, if the
 covariances are right. Times are of the processor, for the map alone.
@@ -28,6 +29,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "real"))
 from log_parts import part, without_names
 from lost_in_the_woods import read_lost_in_the_woods
+from other_robots import read_with_other_robots
 from ycbv import RUNS, read_ycbv
 
 from objslam.config import load_settings
@@ -54,14 +56,17 @@ CABINET_SIZE = np.array([0.826, 0.498, 0.563])
 """The length, width and height, m, of the cabinet in the same surface."""
 
 
-def drives(data: Path, only: str, with_range: bool) -> Iterator[tuple[str, Log]]:
-    """Read the drives whose name contains `only`: 6-1, ..., 7-3, woods."""
+def drives(data: Path, only: str, with_range: bool, other_robots: bool = False) -> Iterator[tuple[str, Log]]:
+    """Read the drives whose name contains `only`: 6-1, ..., 7-3, woods. other_robots: without woods, and with the boxes
+    of the other robots."""
     for folder, robots in DRIVES:
         for robot in robots:
             name = f"{folder[-1]}-{robot}"
-            if only in name:
+            if only in name and other_robots:
+                yield name, read_with_other_robots(data / folder, robot, with_range=with_range)
+            elif only in name:
                 yield name, read(data / folder, Ledger(), SourceOptions(robot=robot, with_range=with_range))
-    if only in "woods":
+    if only in "woods" and not other_robots:
         yield "woods", read_lost_in_the_woods(data / "lost_in_the_woods", with_range=with_range)
 
 
@@ -79,19 +84,16 @@ def judged(log: Log, result: RunResult, radius: float = RADIUS, align: str = "se
     return evaluate(result.map, log.truth, path, align=align, radius=radius).to_dict()
 
 
-def compare(data: Path, only: str, overrides: list[str], names: bool) -> None:
+def compare(data: Path, only: str, overrides: list[str], names: bool, other_robots: bool = False) -> None:
     """Print a line for each drive."""
-    print(
-        "whole drives, each landmark with its own label"
-        if names
-        else "whole drives with ranges, one label for all landmarks"
-    )
+    labels = "each landmark with its own label" if names else "one label for all landmarks"
+    print(f"whole drives{'' if names else ' with ranges'}, {labels}{', and boxes of other robots' if other_robots else ''}")
     print(
         f"{'drive':<7}{'range':>6}{'right':>7}{'false':>7}{'missed':>8}{'RMSE m':>8}{'without scale':>15}{'inside 95 %':>13}"
         f"{'median Mahalanobis^2':>22}{'ATE m':>8}{'s':>7}"
     )
     for with_range in (False, True) if names else (True,):
-        for name, log in drives(data, only, with_range):
+        for name, log in drives(data, only, with_range, other_robots):
             log = log if names else without_names(log)
             result, seconds = solve(log, overrides)
             found = judged(log, result, RADIUS if names else UNNAMED_RADIUS)
@@ -217,7 +219,7 @@ def ycbv(data: Path, overrides: list[str]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("named", "short", "poses", "late", "cube", "ycbv", "unnamed")
+    parts = ("named", "robots", "short", "poses", "late", "cube", "ycbv", "unnamed")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--only", default="", help="only the drives whose name contains this, such as 6-1 or woods")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs")
@@ -233,6 +235,7 @@ def main() -> None:
         "late": lambda: late(data, only, overrides),
         "cube": lambda: cube(data, overrides),
         "ycbv": lambda: ycbv(data, overrides),
+        "robots": lambda: compare(data, only, overrides, names=True, other_robots=True),
         "unnamed": lambda: compare(data, only, overrides, names=False),
     }
     for name in arguments.parts:

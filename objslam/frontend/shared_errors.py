@@ -127,12 +127,6 @@ class SharedErrors:
         noise = self.settings.noise.model_copy(update={"rays": True, "ranges": True, "odometry": True})
         return replace(self, settings=self.settings.model_copy(update={"noise": noise}))
 
-    def with_known_noise(self) -> Self:
-        """Return the same measurements with no kind of noise unknown: the factors `noise` are taken as they are."""
-        noise = dict.fromkeys(("rays", "ranges", "odometry", "localization"), False)
-        known = self.settings.noise.model_copy(update=noise)
-        return replace(self, settings=self.settings.model_copy(update={"noise": known}))
-
     @cached_property
     def _half(self) -> Floats:
         half = half_widths_of_rays(self.rays, self.keyframes, [one.camera for one in self.log.cameras])

@@ -7,7 +7,8 @@ import pytest
 from more_boxes import with_boxes
 
 from objslam.config import load_settings
-from objslam.core.camera import project
+from objslam.core.arrays import Floats
+from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.types import Association, Log
@@ -16,7 +17,7 @@ from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping import pipeline
 from objslam.mapping.joint.joint_alternation import JointState
-from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
+from objslam.mapping.moves.moving_things import associated_at_rest, things_at_rest, without_moving_things
 from objslam.mapping.solution import seen_something
 from objslam.simulation import preset, simulate
 
@@ -25,16 +26,33 @@ _CART = np.array([[0.2 * np.cos(a), 0.2 * np.sin(a), z] for a in _RING for z in 
 """Points on the surface of a cart, 0.4 m wide and 0.7 m high, around its place on the floor."""
 
 
-def with_carts(log: Log, number: int, seed: int) -> Log:
-    """The log with the boxes of carts, which drive straight from one random place to the next at 0.5 to 1.2 m/s."""
-    rng = np.random.default_rng(seed)
+def camera_poses(log: Log) -> tuple[Camera, Floats, Floats]:
+    """The camera, the stamps of its frames (F,), and the true poses map_T_base (F, 4, 4) of the robot in them."""
     camera, found = log.cameras[0].camera, log.cameras[0].detections
     assert found is not None
     assert log.truth is not None
     assert log.truth.trajectory is not None
     path = log.truth.trajectory
-    poses = interpolate(path.stamps, path.poses, found.frame_stamps, 0.2)[0]
-    seconds = np.diff(found.frame_stamps, prepend=found.frame_stamps[0])
+    return camera, found.frame_stamps, interpolate(path.stamps, path.poses, found.frame_stamps, 0.2)[0]
+
+
+def box_of_cart(camera: Camera, pose: Floats, at: Floats, size: float = 1.0) -> Floats | None:
+    """The box (4,) px of a cart at a place (2,) m, None if it is not whole in the image. pose: map_T_base."""
+    camera_T_map = inverse(pose @ camera.base_T_camera)
+    seen = (_CART * size + np.append(at, 0.0)) @ camera_T_map[:3, :3].T + camera_T_map[:3, 3]
+    if seen[:, 2].min() < 0.5:
+        return None
+    pixels = project(camera, seen)
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    whole = (low > 1).all() and (high < [camera.width - 2, camera.height - 2]).all()
+    return np.concatenate([low, high]) if whole else None
+
+
+def with_carts(log: Log, number: int, seed: int) -> Log:
+    """The log with the boxes of carts, which drive straight from one random place to the next at 0.5 to 1.2 m/s."""
+    rng = np.random.default_rng(seed)
+    camera, stamps, poses = camera_poses(log)
+    seconds = np.diff(stamps, prepend=stamps[0])
     middle, reach = poses[:, :2, 3].mean(axis=0), 0.7 * np.ptp(poses[:, :2, 3], axis=0)
     boxes, frames = [], []
     for _ in range(number):
@@ -46,14 +64,9 @@ def with_carts(log: Log, number: int, seed: int) -> Log:
                 goals.pop()
             else:
                 at = at + away / way * step
-            camera_T_map = inverse(pose @ camera.base_T_camera)
-            seen = (_CART + np.append(at, 0.0)) @ camera_T_map[:3, :3].T + camera_T_map[:3, 3]
-            if seen[:, 2].min() < 0.5:
-                continue
-            pixels = project(camera, seen)
-            low, high = pixels.min(axis=0), pixels.max(axis=0)
-            if (low > 1).all() and (high < [camera.width - 2, camera.height - 2]).all() and rng.random() > 0.1:
-                boxes.append(np.concatenate([low, high]) + rng.normal(0, 1.5, 4))
+            box = box_of_cart(camera, pose, at)
+            if box is not None and rng.random() > 0.1:
+                boxes.append(box + rng.normal(0, 1.5, 4))
                 frames.append(frame)
     return with_boxes(log, np.array(frames), np.array(boxes), "cart")
 
@@ -128,6 +141,42 @@ def test_a_map_of_things_at_rest_stays_the_same() -> None:
     state = solved(simulate(preset("rooms", placed=row, objects=6, classes=3, missed=0.3, false=0.1), 3))
     assert without_moving_things(state) is state
     assert associated_at_rest(state) is state
+
+
+def with_carts_at_rest(log: Log, places: Floats) -> Log:
+    """The log with the boxes of carts at places (N, 2) m. Far away, they are as large as boxes need to show them."""
+    camera, _, poses = camera_poses(log)
+    rng, boxes, frames = np.random.default_rng(0), [], []
+    for place in places:
+        size = max(float(np.hypot(*place)) / 40, 1.0)
+        seen = [box_of_cart(camera, pose, place, size) for pose in poses]
+        boxes += [box + rng.normal(0, 1.5, 4) for box in seen if box is not None]
+        frames += [frame for frame, box in enumerate(seen) if box is not None]
+    return with_boxes(log, np.array(frames), np.array(boxes), "cart")
+
+
+def test_boxes_of_far_things_are_of_no_label_that_moves() -> None:
+    """The rays to a far thing are parallel, and so they are of no object. A cart nearby, seen in one visit, stays."""
+    log = simulate(preset("rooms", missed=0.0, false=0.0), 1)
+    far = 3000 * np.array([(1, 0), (0, 1), (-1, 0), (0, -1), (0.7, 0.7), (-0.7, 0.7), (-0.7, -0.7), (0.7, -0.7)])
+    state = solved(with_carts_at_rest(log, np.vstack([[(1.0, 0.5)], far])))
+    before, estimate = state.association, state.estimate
+    assert before is not None
+    assert estimate is not None
+    cart = before.label == state.rays.label_names.index("cart")
+    near = cart & (np.linalg.norm(estimate.positions[:, :2] - [1.0, 0.5], axis=1) < 1.0)
+    assert near.sum() == 1
+    number = np.append(np.where(cart & ~near, -1, np.cumsum(~cart | near) - 1), -1)
+    of_near = number[before.object] == number[np.flatnonzero(near)[0]]
+    stamps = state.keyframes.stamps[state.rays.keyframe]
+    later = of_near & (stamps > stamps[of_near][0] + 4.0)
+    left = Association(np.where(later, -1, number[before.object]), before.label[~cart | near])
+    again = state.attempt().solve("association", left, state.solved_poses)
+    assert again.estimate is not None
+    alone = (left.object < 0) & (state.rays.label == state.rays.label_names.index("cart"))
+    assert alone.sum() > 100
+    given = again.keyframes, again.rays, left, again.estimate, again.solved_poses, again.settings
+    assert things_at_rest(*given) is left
 
 
 def solved(log: Log) -> JointState:

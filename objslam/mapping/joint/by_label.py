@@ -27,6 +27,7 @@ from objslam.mapping.joint.labels import (
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Ints
+    from objslam.frontend.shared_errors import SharedErrors
     from objslam.mapping.joint.joint_alternation import JointState
 
 _FEWEST = 3
@@ -83,11 +84,18 @@ def at_other_labels(state: JointState, others: JointState) -> JointState | None:
     """
     assert others.association is not None
     assert others.estimate is not None
-    known = replace(others, errors=None if others.errors is None else others.errors.with_known_noise())
+    known = replace(others, errors=None if others.errors is None else _with_known_noise(others.errors))
     try:
         return state.replaced(known.alternated(others.estimate.map_T_base, (others.association, others.estimate.positions)))
     except SolveError:
         return None
+
+
+def _with_known_noise(errors: SharedErrors) -> SharedErrors:
+    """Return the same measurements with no kind of noise unknown."""
+    known = dict.fromkeys(("rays", "ranges", "odometry", "localization"), False)
+    noise = errors.settings.noise.model_copy(update=known)
+    return replace(errors, settings=errors.settings.model_copy(update={"noise": noise}))
 
 
 def _with_other_start(state: JointState, solved: JointState) -> tuple[JointState, bool]:

@@ -11,7 +11,6 @@ from objslam.core.geometry import angles_off
 from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
-from objslam.mapping.joint.labels import SECOND
 
 if TYPE_CHECKING:
     from objslam.config import Settings
@@ -36,8 +35,11 @@ _LONG = 6
 """The fewest rays of a track that shows that a thing of a moving label is at rest. The rays of shorter tracks meet in a
 point even if the thing moves: a cart with four rays in tracks of three passed for a thing at rest. A larger number drops
 more objects of such labels."""
+_MOSTLY = 0.5
+"""A label wanders if more than this share of its rays in long tracks follows things that move. Recorded robots had 0.5 and
+more. Labels of two moving things and three at rest had less. A larger share finds fewer moving labels."""
 _VISITS = 2
-"""The fewest visits to a thing of a moving label that is at rest. In one visit, the rays to a robot that drives on a line
+"""The fewest visits to a thing at rest whose label wanders. In one visit, the rays to a robot that drives on a line
 often meet in a point, and nothing but a second visit shows that it was chance. A larger number drops more objects."""
 _AWAY = 5.0
 """The shortest time (s) between two visits. In a longer time, a thing that moves gets farther. With a longer time, objects
@@ -164,16 +166,17 @@ def _moving(
     rest = (many > 0) & (pure >= _PURE) & ~passed[label]
     moves = np.isin(np.arange(len(passed)), [] if known is None else known)
     long = length[track] >= _LONG
-    fits = np.ones(association.count, dtype=bool)
+    wander, fits = np.zeros_like(moves), np.ones(association.count, dtype=bool)
     if rest.sum() >= _USUAL:
         usual = float(np.median(squares[rest] / number[rest]))
         moves |= passed & (all_squares > _SCATTER**2 * usual * all_rays)
-        moves |= _wander(keyframes, rays, np.where(long, track, -1), owner, map_T_camera, settings, usual)
+        wander = _wander(keyframes, rays, np.where(long, track, -1), owner, map_T_camera, settings, usual)
         fits = squares <= _SCATTER**2 * usual * number
     # An object without long tracks, such as one whose rays are all rejected, would take up rays of the dropped objects.
     shown = np.flatnonzero(long & (owner >= 0))
-    rests = _visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], association.count) >= _VISITS
-    return np.asarray(((pure < _PURE) | ~rests | ~fits) & moves[label])
+    visits = _visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], association.count)
+    of_moving = (moves | wander)[label] & ((pure < _PURE) | (visits == 0))
+    return np.asarray(of_moving | (wander[label] & ((visits < _VISITS) | ~fits)))
 
 
 def _wander(
@@ -187,27 +190,36 @@ def _wander(
 ) -> Bools:
     """Return the labels (L,) whose boxes follow things that move.
 
-    A track follows such a thing if its rays meet in no point, and if they are not of objects. Tracks also pass on to equal
-    things nearby, but then their rays are of objects. A label wanders if more than the share `SECOND` of its rays in long
-    tracks is in such tracks. track: (R,) -1 for a ray without a long track. owner: (R,) the object of each ray that agrees,
-    else -1. usual: the mean square of the residuals of a thing at rest, in variances of a ray.
+    A track follows such a thing if its rays meet in no point, are not parallel as those to a far thing are, and are not of
+    objects. Tracks also pass on to equal things nearby, but then their rays are of objects. A label wanders if more than the
+    share `_MOSTLY` of its rays in long tracks is in such tracks.
+
+    Args:
+        keyframes, rays: of the map.
+        track: (R,) -1 for a ray without a long track.
+        owner: (R,) the object of each ray that agrees, else -1.
+        map_T_camera: (K, 4, 4).
+        settings: of the run.
+        usual: the mean square of the residuals of a thing at rest, in variances of a ray.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
-    held = np.flatnonzero(track >= 0)
+    labels, held = len(rays.label_names), np.flatnonzero(track >= 0)
     number, first, inverse = np.unique(track[held], return_index=True, return_inverse=True)
     count, label = len(number), rays.label[held[first]]
     mine = np.full(len(rays), -1)
     mine[held] = inverse.ravel()
     found = triangulate_at(map_T_camera, keyframes, rays, Association(mine, label), settings)
     origins, directions = rays.in_map(map_T_camera)
-    off = angles_off(origins[held], directions[held], found.positions[mine[held]]) / rays.sigma[held]
-    length = np.bincount(mine[held], minlength=count)
-    meets = np.bincount(mine[held], np.nan_to_num(off) ** 2, count) <= _APART**2 * usual * length
-    explained = np.bincount(mine[held], owner[held] >= 0, count) >= _EXPLAINED * length
-    labels = len(rays.label_names)
-    follow = np.bincount(label, np.where(meets | explained, 0, length), labels)
-    return np.asarray(follow > SECOND * np.bincount(label, length, labels))
+    track, origins, directions, sigma = mine[held], origins[held], directions[held], rays.sigma[held]
+    length = np.bincount(track, minlength=count)
+    middle = np.stack([np.bincount(track, way, count) for way in directions.T], axis=1).astype(np.float64)
+    point = angles_off(origins, directions, found.positions[track])
+    parallel = angles_off(np.zeros_like(origins), directions, middle[track])
+    squares = np.minimum(*(np.bincount(track, np.nan_to_num(off / sigma) ** 2, count) for off in (point, parallel)))
+    explained = np.bincount(track, owner[held] >= 0, count) >= _EXPLAINED * length
+    follow = (squares > _APART**2 * usual * length) & ~explained
+    return np.asarray(np.bincount(label, follow * length, labels) > _MOSTLY * np.bincount(label, length, labels))
 
 
 def _visits(stamps: Floats, owner: Ints, count: int) -> Ints:
