@@ -35,9 +35,10 @@ _LONG = 6
 """The fewest rays of a track that shows that a thing of a moving label is at rest. The rays of shorter tracks meet in a
 point even if the thing moves: a cart with four rays in tracks of three passed for a thing at rest. A larger number drops
 more objects of such labels."""
-_MOSTLY = 0.5
-"""A label wanders if more than this share of its rays in long tracks follows things that move. Recorded robots had 0.5 and
-more. Labels of two moving things and three at rest had less. A larger share finds fewer moving labels."""
+_FOLLOWS = 0.3
+"""A label wanders if more than this share of its rays in long tracks follows things that move. Recorded robots had 0.3 to 1.
+With 0.25, a thing at rest was lost whose label two moving things have too. With 0.4, recorded robots became two more objects
+in five minutes. A larger share finds fewer moving labels."""
 _VISITS = 2
 """The fewest visits to a thing at rest whose label wanders. In one visit, the rays to a robot that drives on a line
 often meet in a point, and nothing but a second visit shows that it was chance. A larger number drops more objects."""
@@ -192,7 +193,7 @@ def _wander(
 
     A track follows such a thing if its rays meet in no point, are not parallel as those to a far thing are, and are not of
     objects. Tracks also pass on to equal things nearby, but then their rays are of objects. A label wanders if more than the
-    share `_MOSTLY` of its rays in long tracks is in such tracks.
+    share `_FOLLOWS` of its rays in long tracks is in such tracks.
 
     Args:
         keyframes, rays: of the map.
@@ -219,7 +220,7 @@ def _wander(
     squares = np.minimum(*(np.bincount(track, np.nan_to_num(off / sigma) ** 2, count) for off in (point, parallel)))
     explained = np.bincount(track, owner[held] >= 0, count) >= _EXPLAINED * length
     follow = (squares > _APART**2 * usual * length) & ~explained
-    return np.asarray(np.bincount(label, follow * length, labels) > _MOSTLY * np.bincount(label, length, labels))
+    return np.asarray(np.bincount(label, follow * length, labels) > _FOLLOWS * np.bincount(label, length, labels))
 
 
 def _visits(stamps: Floats, owner: Ints, count: int) -> Ints:
