@@ -14,6 +14,7 @@ from objslam.errors import SolveError
 from objslam.mapping.joint.doubted_labels import doubted_labels, unchecked_labels
 from objslam.mapping.joint.labels import (
     MANY,
+    OTHERS,
     angles_to_objects,
     clock_explains,
     labels_tell,
@@ -29,10 +30,6 @@ if TYPE_CHECKING:
     from objslam.core.arrays import Ints
     from objslam.frontend.shared_errors import SharedErrors
     from objslam.mapping.joint.joint_alternation import JointState
-
-_FEWEST = 3
-"""The fewest labels, each with at least `MANY` rays, that show the path without the labels that scatter. Fewer labels cannot
-tell which of them scatter. With a larger number, more logs are explored."""
 
 _FAILURES = 2
 """No more labels are tried after this number of labels in a row that do not agree. Each try takes a solve, and later labels
@@ -208,11 +205,11 @@ def _of_labels(named: JointState, labels: Ints) -> Association:
 
 
 def _show_path(named: JointState, labels: Ints) -> bool:
-    """Return whether some labels show the path: they are `_FEWEST`, and enough of them are seen at each moment
+    """Return whether some labels show the path: they are `OTHERS`, and enough of them are seen at each moment
     (`unchecked_labels`), unless there is a localisation."""
     rays = named.rays
     of_them = np.isin(rays.label, labels)
-    if (np.bincount(rays.label[of_them]) >= MANY).sum() < _FEWEST:
+    if (np.bincount(rays.label[of_them]) >= MANY).sum() < OTHERS:
         return False
     if named.keyframes.localized_every or of_them.all():
         return True

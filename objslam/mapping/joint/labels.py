@@ -33,7 +33,7 @@ takes a solve."""
 _AGREES = 3.0
 """A ray agrees with the object of its label if it is off by at most this many standard deviations. With a larger value,
 fewer boxes can show a second object."""
-_OTHERS = 3
+OTHERS = 3
 """The fewest objects with `MANY` rays whose usual noise judges the label of each one. With a larger number, fewer logs are
 judged."""
 _JUDGEMENTS = 2
@@ -144,7 +144,7 @@ def rays_beyond(named: JointState | Solution, association: Association, position
     """Return how many rays of each object (N,) are off by more than `_AGREES` times the usual noise, and of how many rays.
 
     The usual noise is the one of the objects whose labels are in the map `named`. Both numbers are zero for objects with
-    fewer than `MANY` rays, and for all objects if fewer than `_OTHERS` show the usual noise. association: of the rays of the
+    fewer than `MANY` rays, and for all objects if fewer than `OTHERS` show the usual noise. association: of the rays of the
     map, with its labels or more. positions: (N, 3) m of the objects at the path of the map, NaN if unknown.
     """
     assert named.association is not None
@@ -156,7 +156,7 @@ def rays_beyond(named: JointState | Solution, association: Association, position
     number = np.bincount(owner, minlength=association.count)
     many = number >= MANY
     usual = many & np.isin(association.label, named.association.label)
-    if usual.sum() < _OTHERS:
+    if usual.sum() < OTHERS:
         return np.zeros_like(number), np.zeros_like(number)
     spread = np.sqrt(np.bincount(owner, off**2, association.count) / np.maximum(number, 1))
     nominal = 1.0 if named.estimate.noise is None else 1 / named.estimate.noise.rays
