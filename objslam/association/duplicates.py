@@ -32,4 +32,10 @@ def may_be_one(box: Floats, label: Ints) -> Bools:
     """Return which pairs (n, n) of different boxes (n, 4), px, of a frame may show one thing. label: (n,)."""
     same = label[:, None] == label
     np.fill_diagonal(same, False)
-    return same & (overlap(box[:, None], box) >= _ONE_THING) if same.any() else same
+    return same & show_one_thing(box[:, None], box) if same.any() else same
+
+
+def show_one_thing(boxes: Floats, others: Floats) -> Bools:
+    """Return whether boxes (..., 4) and others (..., 4) of one frame, px, lie so much on each other that they may show one
+    thing."""
+    return np.asarray(overlap(boxes, others) >= _ONE_THING)

@@ -46,10 +46,13 @@ _COUNTED_RAYS = 10  # The most rays that count as independent in the motion test
 class Rates:
     """Beta distributions of the detection rates in each class. mean: (L,) of each class. concentration: the sum of the two
     parameters of a distribution, the same for all classes. With several concentrations (C, 1), results get a first axis
-    (C,)."""
+    (C,). overall: the mean of all classes. untold: (L,) the probability that the rate of a class does not tell the rate of
+    one of its objects, so that the object has a rate like the objects of all classes."""
 
     mean: Floats
     concentration: float | Floats
+    overall: float
+    untold: Floats | float
 
     def cost(self, seen: Ints, expected: Ints, label: Ints) -> Floats:
         """Return -2 ln(p) (N,). p is the probability that an object of a label is detected in `seen` of `expected`
@@ -63,17 +66,22 @@ class Rates:
     def log_odds(self, history: DetectionHistory, label: Ints, rarer: Bools | bool = True) -> Floats:
         """Return the log likelihood ratio (N,) of an object of the class over a phantom, from the detections and misses.
 
-        An object has a rate of its class or, with the probability `_UNUSUAL_SHARE`, a lower one. rarer: (N,) whether it may
-        have a lower one.
+        An object has a rate of its class or, with the probability `untold`, a rate of all classes. With the probability
+        `_UNUSUAL_SHARE`, it has a lower one. rarer: (N,) whether it may have a lower one.
         """
         phantom, (lower, rarer_concentration) = self.mean * _PHANTOM_SHARE, _UNUSUAL_RATE
         # With the concentration 1 / phantom the density of phantom rates decreases from 0 on.
-        rates = np.stack([phantom, self.mean, lower * self.mean])
-        concentrations = np.stack(np.broadcast_arrays(1 / phantom, self.concentration, rarer_concentration))
+        rates = np.stack([phantom, self.mean, np.full_like(self.mean, self.overall), lower * self.mean])
+        concentrations = np.stack(
+            np.broadcast_arrays(1 / phantom, self.concentration, self.concentration, rarer_concentration)
+        )
         if concentrations.ndim > rates.ndim:
             rates = rates[:, None]
         of = history.seen, history.expected, label
-        as_phantom, usual, unusual = _beta_binomial(*of, rates, concentrations)
+        as_phantom, of_class, of_all, unusual = _beta_binomial(*of, rates, concentrations)
+        untold = np.broadcast_to(self.untold, self.mean.shape)[label]
+        with np.errstate(divide="ignore"):  # ln(0): the rate of the class tells nothing, or everything.
+            usual = np.logaddexp(np.log1p(-untold) + of_class, np.log(untold) + of_all)
         usual = np.log1p(-_UNUSUAL_SHARE) + usual
         unusual = np.where(rarer, np.log(_UNUSUAL_SHARE), -np.inf) + unusual
         return np.asarray(np.logaddexp(usual, unusual) - as_phantom)
@@ -82,13 +90,19 @@ class Rates:
 def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
     """Estimate the rate of each class (L,) as the median over its boxes. If a class has few boxes, its rate is near the rate
     of all classes. The concentration is the lowest one whose likelihood is not clearly below the highest likelihood. In this
-    likelihood, any object may be a phantom. label: (N,) of the objects. labels: the number L of all labels."""
+    likelihood, any object may be a phantom.
+
+    The boxes of one object tell nothing about the differences between objects of its class. So the more objects a class
+    has, the less likely is it that its rate does not tell the rate of an object (`untold`). label: (N,) of the objects.
+    labels: the number L of all labels."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
     boxes = np.bincount(label, seen, labels)
     mean = (boxes * _weighted_median(own, seen, label, labels) + _POOLED_BOXES * overall) / (boxes + _POOLED_BOXES)
-    rates = Rates(np.clip(mean, *_RATE_LIMITS), np.array(_CONCENTRATIONS)[:, None])
+    untold = 1 / np.maximum(np.bincount(label, minlength=labels), 1)
+    of_all = float(np.clip(overall[0], *_RATE_LIMITS))
+    rates = Rates(np.clip(mean, *_RATE_LIMITS), np.array(_CONCENTRATIONS)[:, None], of_all, untold)
     likelihood = np.logaddexp(0.0, rates.log_odds(history, label)).sum(axis=1)
     return replace(rates, concentration=_CONCENTRATIONS[int(np.argmax(likelihood >= likelihood.max() - _CLEAR_LEAD))])
 

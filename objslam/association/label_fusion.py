@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from objslam.association.duplicates import show_one_thing
 from objslam.association.existence import stray_share
 from objslam.association.gating import gated_edges
 from objslam.association.landmarks import State
@@ -23,23 +24,33 @@ def fused_labels(state: State, gate: float) -> Bools:
     An explained box lies on the landmark, in a frame in which no box belongs to the landmark. The explained boxes of a label
     must have the landmark's size. There must be more explained boxes than by chance, and fewer than the landmark's own
     boxes.
+
+    A thing right beside the landmark has such boxes too, if the detector misses the landmark. But it also has boxes where
+    the landmark has one. So boxes of the label that the landmark explains, and that lie beside its own box, tell what to
+    expect by chance. Boxes on its own box do not count, because a detector may draw one thing twice.
     """
     obs, accepts = state.obs, state.landmarks.accepts
-    if accepts.all():  # There is no other label.
+    if accepts.all() or not len(state.owner):  # There is no other label, or no landmark.
         return accepts
     count, labels = accepts.shape
     free = obs.take(state.matched < 0)
     edges = gated_edges(free, replace(state.landmarks, accepts=np.ones_like(accepts)), gate)
     frames = int(obs.frame.max(initial=0)) + 1
-    taken = state.owner * frames + obs.frame[state.assigned]
-    missed = ~np.isin(edges.landmark * frames + free.frame[edges.ray], taken)
-    ray, landmark = edges.ray[missed], edges.landmark[missed]
-    pair = landmark * labels + free.label[ray]
-    number = np.bincount(pair, minlength=count * labels).reshape(count, labels)
+    taken, sought = state.owner * frames + obs.frame[state.assigned], edges.landmark * frames + free.frame[edges.ray]
+    order = np.argsort(taken)
+    at = np.minimum(np.searchsorted(taken[order], sought), len(order) - 1)
+    missed = taken[order][at] != sought
+    pair = edges.landmark * labels + free.label[edges.ray]
+    own, box = obs.box[state.assigned][order][at], free.box[edges.ray]
+    beside = ~missed & ~show_one_thing(own, box)
+    number, neighbours = (
+        np.bincount(pair[some], minlength=count * labels).reshape(count, labels) for some in (missed, beside)
+    )
+    ray, landmark, pair = edges.ray[missed], edges.landmark[missed], pair[missed]
     away = np.linalg.norm(state.landmarks.position[landmark] - free.origin[ray], axis=1)
     size = grouped_median(np.sqrt(free.size[ray].prod(axis=1)) * away, pair, count * labels).reshape(count, labels)
     ratio = size / np.maximum(state.size, 1e-9)[:, None]
-    expected = stray_share(state, gate)[:, None] * state.unassigned
+    expected = np.maximum(stray_share(state, gate)[:, None] * state.unassigned, neighbours)
     surprising = poisson_tail(number, expected) * max(count * labels, 1) < _MOST_BY_CHANCE
     few = (number >= _MIN_BOXES) & (number < state.ray_count[:, None])
     return np.asarray(accepts | (surprising & few & (ratio < SIZE_RATIO) & (ratio > 1 / SIZE_RATIO)))

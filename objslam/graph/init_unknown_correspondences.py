@@ -165,7 +165,7 @@ class _Exploration:
         graph."""
         number = np.bincount(self.owner[self.owner >= 0], minlength=len(self.known))
         due = (number >= _AGAIN * self.counted) | whole
-        which = np.flatnonzero(due[self.owner] & (self.owner >= 0))
+        which = np.flatnonzero(np.append(due, False)[self.owner])
         index = np.cumsum(due) - 1
         self.known.covariance[due] = covariances_at(
             self.rays.take(which), index[self.owner[which]], self.known.position[due], self.window.map_T_camera

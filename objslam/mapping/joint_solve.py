@@ -29,7 +29,7 @@ from objslam.mapping.joint.doubted_labels import (
 from objslam.mapping.joint.held_errors import Solved, with_gross_errors
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.joint.labels import may_be_by_label, scatter_alone
-from objslam.mapping.moves.missed_loops import with_missed_loops
+from objslam.mapping.moves.missed_loops import shows_copies, with_missed_loops
 from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
 from objslam.mapping.solution import seen_something
@@ -148,9 +148,12 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
         def along_tracks() -> JointState:
             return _from_start(begin.attempt(), explored(along(begin, path))[0])
 
+        def by_windows() -> JointState:
+            return _from_start(begin.attempt(), explored(begin, filtered=False)[0])
+
         starts = [lambda: _from_tracks(begin), lambda: _from_start(begin.attempt(), None), along_tracks]
         if np.isfinite(state.rays.range).any():
-            starts = [] if sure else [along_tracks]
+            starts = [by_windows if sure else along_tracks]
         for other_start in starts:  # The first ones take less time.
             if not _unclear(state):
                 break
@@ -199,12 +202,18 @@ def _unclear(state: JointState) -> bool:
     """Return whether a map may be wrong, so that other starts are worth their time.
 
     An exploration goes wrong by chance, so another start may be right. The false boxes of a detector agree with no object in
-    the best of maps, but they are single boxes. So only the rays of tracks are judged, if there are any.
+    the best of maps, but they are single boxes. So only the rays of tracks are judged, if there are any. All rays may agree
+    with a map that shows the same things at several places. Copies of their relative positions then tell.
     """
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
     agree = state.agree[tracked] if tracked.any() else state.agree
-    return bool(agree.mean() < _CLEAR or noise > _NOISIER)
+    if agree.mean() < _CLEAR or noise > _NOISIER:
+        return True
+    assert state.association is not None
+    assert state.estimate is not None
+    positions = np.where(state.estimate.solved[:, None], state.estimate.positions, np.nan)
+    return shows_copies(state.rays, state.association, positions, state.solved_poses, state.settings.association)
 
 
 def _with_few_rays(state: JointState) -> JointState:

@@ -206,6 +206,21 @@ def test_where_rates_differ_a_low_one_is_no_proof():
     assert rates.concentration <= 5
 
 
+def test_one_thing_does_not_tell_how_often_others_of_its_class_are_seen():
+    """One of the two things of class 0 stands free, and the other one is seen as often as the things of other classes. Ten
+    things that are seen equally often do tell."""
+    expected, others = 600, [0.25, 0.2, 0.3, 0.22, 0.27, 0.24, 0.33, 0.21]
+    label = np.concatenate([[0, 0], np.arange(1, 9)])
+    history = counted((expected * np.array([0.65, 0.21, *others])).astype(int), np.full(len(label), expected))
+    odds = detection_rates(history, label, 9).log_odds(history, label, False)
+    assert (odds > 0).all()
+    label = np.concatenate([np.zeros(11, dtype=np.int64), np.arange(1, 9)])
+    share = np.array([0.21, *np.full(10, 0.65), *others])
+    history = counted((expected * share).astype(int), np.full(len(label), expected))
+    many = detection_rates(history, label, 9).log_odds(history, label, False)
+    assert many[0] < odds[1] - 1
+
+
 def test_a_thing_that_one_visit_of_two_shows_is_no_phantom():
     """All other things are seen in 19 of 20 frames, one in half of them, and phantoms in a tenth."""
     seen, expected = np.array([57, 58, 56, 57, 59, 30, 6, 5]), np.full(8, 60)
@@ -228,7 +243,7 @@ def test_from_odometry_alone_half_of_the_boxes_are_too_few():
     whole = state_of(scene)
     often = np.where((whole.matched == 0) & (whole.obs.frame % 3 > 0), -1, whole.matched)
     state = replace(whole, matched=often)
-    rates = Rates(np.full(2, 0.95), 50.0)
+    rates = Rates(np.full(2, 0.95), 50.0, 0.95, 0.0)
     at_odometry = replace(state, view=replace(state.view, localized=False))
     assert rarer_objects(state, rates, 9.0).tolist() == [True, True]
     assert not rarer_objects(at_odometry, rates, 9.0).any()

@@ -55,6 +55,26 @@ def test_a_large_search_for_loops_waits_for_keyframes(monkeypatch):
     assert 40 * len(keyframes) - 1000 <= sum(searches) <= 40 * len(keyframes) + 1000
 
 
+def test_an_exploration_goes_on_without_a_landmark(monkeypatch):
+    """A solve may move all landmarks to a camera, so that none is left. The next steps make new ones."""
+    log = simulate(preset("drift", frames=120), 0)
+    settings = Settings.model_validate({"mode": "joint", "odometry": STEP})
+    frames = build_keyframes(log, settings, Ledger())
+    keyframes, rays = seen_something(frames, build_rays(log, frames, settings, Ledger()))
+    solve, lost = SlidingWindow.solve, []
+
+    def losing(window, *given):
+        solve(window, *given)
+        if len(window.positions) and not lost:
+            lost.append(len(window.positions))
+            window.positions[:] = np.nan
+
+    monkeypatch.setattr(SlidingWindow, "solve", losing)
+    start = initialize_unknown(keyframes, rays, (log.cameras[0].camera,), settings, lambda done, total: None)
+    assert lost
+    assert start.association.count > 5
+
+
 def test_an_exploration_solves_the_whole_graph_only_at_doublings_and_loops(monkeypatch):
     """With a whole solve in each step, the time would grow with the square of the drive."""
     log = simulate(preset("drift"), 0)

@@ -11,7 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, inverse
 from objslam.core.types import Association
 from objslam.mapping.joint.joint_alternation import JointState
-from objslam.mapping.moves.missed_loops import with_missed_loops
+from objslam.mapping.moves.missed_loops import shows_copies, with_missed_loops
 from objslam.simulation import preset, simulate
 
 SLIP = np.array([0.0, 0.0, np.radians(25), 0.3, -0.2, 0.0])
@@ -54,6 +54,15 @@ def test_the_laps_come_together(laps):
     same = solved(laps, apart=False).association.object
     pairs = np.unique(np.stack([same, found.association.object])[:, found.agree], axis=1)
     assert pairs.shape[1] == things  # Each thing is one object.
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_copies_of_the_first_lap_are_noticed(laps, apart):
+    """All rays agree with the map that has the things of each lap at other places."""
+    state = solved(laps, apart=apart)
+    assert state.agree.mean() > 0.95
+    found = state.association, state.estimate.positions, state.solved_poses
+    assert shows_copies(state.rays, *found, state.settings.association) is apart
 
 
 def test_a_map_without_missed_loops_stays(laps):

@@ -9,23 +9,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.mapping.exploration.second_exploration import surface_of
+from objslam.mapping.moves.missed_loops import shows_copies
 
 if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
     from objslam.mapping.joint.joint_alternation import JointState
 
 
-def explored(state: JointState) -> tuple[InitialEstimate, bool]:
+def explored(state: JointState, filtered: bool = True) -> tuple[InitialEstimate, bool]:
     """Explore a log without a localisation. Return a first association, and whether the filter for logs with ranges is sure
-    of it."""
+    of it. A filter that lost its way maps the same things at several places. filtered: whether to try this filter."""
     from objslam.graph import ekf_exploration
     from objslam.graph.init_unknown_correspondences import initialize_unknown
 
     exploring = partial(state.progress, "explore")
-    if np.isfinite(state.rays.range).any():
+    if filtered and np.isfinite(state.rays.range).any():
         surface = 0.0 if state.errors is None else surface_of(state.errors, state.theta)
         start = ekf_exploration.explore(state.keyframes, state.rays, state.settings, exploring, state.errors, surface)
-        if ekf_exploration.is_sure(start):
+        found = start.association, start.positions, start.map_T_camera
+        if ekf_exploration.is_sure(start) and not shows_copies(state.rays, *found, state.settings.association):
             return start, True
     return initialize_unknown(state.keyframes, state.rays, state.cameras, state.settings, exploring), False
 

@@ -12,10 +12,16 @@ from objslam.errors import SolveError
 from objslam.mapping.joint.merge_and_split import joined
 
 if TYPE_CHECKING:
+    from objslam.config import AssociationSettings
     from objslam.core.arrays import Floats
+    from objslam.core.types import Association, Rays
     from objslam.graph.loop_closure import Closure, Landmarks
     from objslam.mapping.joint.joint_alternation import JointState
 
+_BY_CHANCE = 5
+"""A part of a map is a copy if more than this number of its landmarks has the relative positions of others. With a larger
+number, smaller copies are not noticed. With a smaller one, rows of equal things look like copies, and other starts take
+time."""
 _TRIED = 4
 """The most loops that are tried before the search ends. Loops with more evidence are tried first. Each takes a solve. A
 larger number closes more loops, and takes longer on maps that have missed none."""
@@ -45,6 +51,20 @@ def with_missed_loops(state: JointState) -> JointState:
     return state if best is state else _with_rounds(best)
 
 
+def shows_copies(
+    rays: Rays, association: Association, positions: Floats, map_T_camera: Floats, of: AssociationSettings
+) -> bool:
+    """Return whether a part of a map is a copy of another part, at another place, so that a loop was missed.
+
+    All rays can agree with such a map. A copy is sure if more than `_BY_CHANCE` landmarks have the relative positions of
+    others, with the evidence of a loop (`association.loop_evidence`). positions: (N, 3) m, NaN if unknown. map_T_camera: (K,
+    4, 4)."""
+    from objslam.graph.loop_closure import find_missed_closures
+
+    found = find_missed_closures(*_landmarks(rays, association, positions, map_T_camera, of.min_rays), map_T_camera)
+    return any(len(closure.now) > _BY_CHANCE and closure.evidence >= of.loop_evidence for closure in found)
+
+
 def _with_rounds(state: JointState) -> JointState:
     """Return the state after rounds of association, if they explain the log better."""
     assert state.association is not None
@@ -60,7 +80,11 @@ def _with_a_loop(state: JointState) -> JointState | None:
     """Return the state after the closure of one loop that explains the log better. None without one."""
     from objslam.graph.loop_closure import find_missed_closures
 
-    landmarks, middle = _landmarks(state)
+    assert state.association is not None
+    assert state.estimate is not None
+    agreed = replace(state.association, object=np.where(state.agree, state.association.object, -1))
+    positions = np.where(state.estimate.solved[:, None], state.estimate.positions, np.nan)
+    landmarks, middle = _landmarks(state.rays, agreed, positions, state.solved_poses, state.settings.association.min_rays)
     for closure in find_missed_closures(landmarks, middle, state.solved_poses)[:_TRIED]:
         closed = _closed(state, closure, landmarks)
         if closed is not None and closed.explained > state.explained:
@@ -68,19 +92,18 @@ def _with_a_loop(state: JointState) -> JointState | None:
     return None
 
 
-def _landmarks(state: JointState) -> tuple[Landmarks, Floats]:
-    """Return the landmarks of the state, and the median keyframe of the rays of each (N,), NaN without enough rays."""
+def _landmarks(
+    rays: Rays, association: Association, positions: Floats, map_T_camera: Floats, min_rays: int
+) -> tuple[Landmarks, Floats]:
+    """Return the landmarks of a map, and the median keyframe of the rays of each (N,), NaN without enough rays."""
     from objslam.graph.loop_closure import Landmarks, covariances_at
 
-    assert state.association is not None
-    assert state.estimate is not None
-    rays, label, position = state.rays, state.association.label, np.nan_to_num(state.estimate.positions)
-    owner = np.where(state.agree, state.association.object, -1)
+    label, position, owner = association.label, np.nan_to_num(positions), association.object
     held = np.flatnonzero(owner >= 0)
-    landmarks = Landmarks.none().and_also(position, covariances_at(rays, owner, position, state.solved_poses), label)
-    landmarks.see(rays.keyframe, owner, held, np.searchsorted(rays.keyframe, np.arange(len(state.keyframes) + 1)))
+    landmarks = Landmarks.none().and_also(position, covariances_at(rays, owner, position, map_T_camera), label)
+    landmarks.see(rays.keyframe, owner, held, np.searchsorted(rays.keyframe, np.arange(len(map_T_camera) + 1)))
     middle = grouped_median(rays.keyframe[held].astype(float), owner[held], len(label))
-    enough = (landmarks.rays >= state.settings.association.min_rays) & state.estimate.solved
+    enough = (landmarks.rays >= min_rays) & np.isfinite(positions[:, 0])
     return landmarks, np.where(enough, middle, np.nan)
 
 
