@@ -36,7 +36,7 @@ def test_a_thing_beside_a_cup_is_not_the_cup(apart):
     the detector calls the cup a bottle in some frames, and then it has no box of a cup."""
     names, size = ("cup", "bottle"), 0.03
     if apart:
-        points = np.stack([CUP, CUP + [0.0, 0.0, apart]])
+        points = np.stack([CUP, CUP + np.array([0.0, 0.0, apart])])
         scene = watch(points, around(), names=names, label=np.array([0, 1]), missed=0.4, size=size)
         at = np.arange(len(scene.rays)) % 4 > 0  # There are fewer boxes of the bottle.
         few = (scene.rays.label == 0) | at
