@@ -13,6 +13,7 @@ from objslam.live.adapters.replay import events
 from objslam.live.session.session import Session
 from objslam.simulation import PoseNoise, preset, simulate
 
+pytestmark = pytest.mark.long  # All tests, because two of them share a session.
 ALONE = ("mode=joint", "output.recording=false", "checks.use=false", "bodies.use=false", "live.calibrate_from=60")
 FACTOR, SECONDS = 4.0, 3.0
 
