@@ -28,10 +28,11 @@ _VIEW_CAP = 1 - math.cos(math.radians(45))
 larger angle, agreement counts as chance more rarely."""
 _NOISE_SIGMAS = 3.0  # Deviations of a ray below this many standard deviations of noise all score the same.
 _MOST_NOISE = 0.25  # Noise covers at most this share of the view. With a larger share, noisy rays agree with any point.
-_PAIRS_AT_ONCE = {"numpy": 1 << 19, "cpu": 1 << 19, "cuda": 1 << 25}
+_PAIRS_AT_ONCE = {"numpy": 1 << 17, "cpu": 1 << 19, "cuda": 1 << 25}
 """The most pairs of a ray and a hypothesis computed together, for each backend. More need more memory, 50 bytes a pair.
-Fewer need more calls. On an H100, 256,000,000 pairs took 1067 ms with 2^19, 77 ms with 2^23, 64 ms with 2^25, and 62 ms
-with 2^29."""
+Fewer need more calls. In numpy, the arrays of 2^19 pairs are so large that the system gives new pages for each, and a
+consensus took 1.6 times as long as with 2^16 or 2^17. On an H100, 256,000,000 pairs took 1067 ms with 2^19, 77 ms with 2^23,
+64 ms with 2^25, and 62 ms with 2^29."""
 _MAX_ROUNDS = 20  # The most rounds of Eq. 1 and selection. They end if the agreement stops growing. More are slower.
 
 

@@ -28,6 +28,17 @@ def test_maps_of_one_place_are_registered(count, labels, overlap):
     np.testing.assert_array_equal(a.label[found.matches[:, 0]], b.label[found.matches[:, 1]])
 
 
+def test_proposals_that_are_compared_in_parts_give_the_same_transform(monkeypatch):
+    a, b, *_ = twins(np.random.default_rng(0), 25, 4, 0.9)
+    found = []
+    for at_once in (1 << 30, 1000):
+        monkeypatch.setattr("objslam.association.registration.proposals._AT_ONCE", at_once)
+        found.append(register_maps(a, b))
+    np.testing.assert_array_equal(found[0].b_T_a, found[1].b_T_a)
+    np.testing.assert_array_equal(found[0].matches, found[1].matches)
+    assert found[0].log_odds == found[1].log_odds
+
+
 def test_maps_of_different_places_are_refused():
     rng = np.random.default_rng(1)
     for _ in range(20):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from lasting_localization import with_lasting
 from scipy.optimize import linear_sum_assignment
 
@@ -40,6 +41,7 @@ def tables(seed: int, factor: float, seconds: float) -> Log:
     return with_lasting(simulate(drive, seed), factor, seconds, seed)
 
 
+@pytest.mark.long
 def test_no_object_has_the_rays_of_two_things() -> None:
     """Such an object is between its things, or beside them, by some tenths of a metre."""
     log = tables(seed=0, factor=4.0, seconds=3.0)

@@ -60,28 +60,24 @@ def mapped(log: Log, *overrides: str) -> tuple[str, tuple[int, int, int]]:
 
 
 @pytest.mark.parametrize("jumps", [False, True])
-def test_poses_that_err_for_seconds_are_solved_without_odometry(jumps):
-    """A log whose localisation steps often has the finding that it jumps. The steps are errors that last for seconds."""
+def test_poses_that_err_for_seconds_are_solved_without_odometry(jumps, monkeypatch):
+    """A log whose localisation steps often has the finding that it jumps. The steps are errors that last for seconds.
+
+    The first association was at poses that err, so it begins anew at the solved poses. The search for phantoms needs the
+    motions that odometry measures."""
+    calls, anew = [], joint_solve._anew
+    monkeypatch.setattr(joint_solve, "_anew", lambda state: calls.append(state) or anew(state))
+    monkeypatch.setattr(joint_solve, "without_phantoms", lambda state: pytest.fail("phantoms were searched"))
     mode, numbers = mapped(drive(jumps))
     assert mode == "joint"
     assert numbers == (12, 0, 0)  # In fixed mode (6, 6, 6) and (7, 5, 5).
+    (state,) = calls
+    assert max(state.errors.noise.lasting_factors) > 1
 
 
 def test_given_poses_stay_if_no_solve_may_find_their_noise():
     """The findings are the same, but the sizes of the errors are not estimated."""
     assert mapped(drive(jumps=False), "noise.localization=false")[0] == "fixed"
-
-
-def test_the_association_begins_anew_at_the_solved_poses(monkeypatch):
-    """The first association was at poses that err. The search for phantoms needs the motions that odometry measures."""
-    calls, anew = [], joint_solve._anew
-    monkeypatch.setattr(joint_solve, "_anew", lambda state: calls.append(state) or anew(state))
-    monkeypatch.setattr(joint_solve, "without_phantoms", lambda state: pytest.fail("phantoms were searched"))
-    mode, numbers = mapped(drive(jumps=False), "mode=joint", "checks.use=false")
-    assert mode == "joint"
-    assert numbers == (12, 0, 0)
-    (state,) = calls
-    assert max(state.errors.noise.lasting_factors) > 1
 
 
 @pytest.mark.parametrize(("heading", "labels", "told"), [(1.0, [0, 0], True), (3.0, [0, 0], False), (1.0, [0, 1], False)])

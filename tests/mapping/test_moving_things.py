@@ -1,6 +1,7 @@
 """Carts that drive around in a room: they become no objects, and things at rest stay."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -71,10 +72,15 @@ def with_carts(log: Log, number: int, seed: int) -> Log:
     return with_boxes(log, np.array(frames), np.array(boxes), "cart")
 
 
+@cache
+def with_ten_carts(seed: int) -> JointState:
+    """A solved drive among ten carts."""
+    return solved(with_carts(simulate(preset("rooms", missed=0.1, false=0.0), seed), 10, seed))
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_objects_of_things_that_move_are_dropped(seed: int) -> None:
-    log = simulate(preset("rooms", missed=0.1, false=0.0), seed)
-    before = solved(with_carts(log, 10, seed))
+    before = with_ten_carts(seed)
     after = without_moving_things(before)
     assert len(carts(before)) > 4
     assert len(carts(after)) == 0
@@ -92,8 +98,7 @@ def test_objects_of_things_that_move_are_dropped(seed: int) -> None:
 
 def test_copies_of_things_at_rest_are_merged_when_moving_things_no_longer_bend_the_path() -> None:
     """Each thing has one object in the first half of the drive and another one in the second half."""
-    log = simulate(preset("rooms", missed=0.1, false=0.0), 1)
-    state = solved(with_carts(log, 10, 1))
+    state = with_ten_carts(1)
     assert state.association is not None
     late = state.rays.keyframe > len(state.keyframes) // 2
     owner, count = state.association.object, state.association.count
@@ -107,8 +112,7 @@ def test_copies_of_things_at_rest_are_merged_when_moving_things_no_longer_bend_t
 
 
 def test_rays_that_a_bent_path_rejected_are_taken_back_when_nothing_bends_it() -> None:
-    log = simulate(preset("rooms", missed=0.1, false=0.0), 2)
-    state = solved(with_carts(log, 10, 2))
+    state = with_ten_carts(2)
     assert state.association is not None
     at_rest = state.rays.label != state.rays.label_names.index("cart")
     lost = at_rest & (state.rays.keyframe > len(state.keyframes) // 2)

@@ -78,6 +78,7 @@ def two_objects(labels: list[int], noise: NoiseFactors, *, odometry: bool) -> Si
     )
 
 
+@pytest.mark.long
 def test_no_objects_are_left_where_rays_of_several_things_meet(monkeypatch):
     """Without the search for phantoms, the map of this drive has them, although each ray fits its object. Things that are
     nearer than the poses err are named."""

@@ -210,3 +210,19 @@ def test_the_benchmark_runs(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["bench", "--objects", "4", "--rays", "6", "--repeat", "1"])
     load_tool("bench_triangulation").main()
     assert "times as fast as the loop" in capsys.readouterr().out
+
+
+def test_pairs_that_are_tried_in_parts_give_the_same_consensus(monkeypatch):
+    rng, found = np.random.default_rng(3), []
+    number = rng.integers(5, 80, 20)
+    index = np.repeat(np.arange(20), number)
+    origins = rng.uniform(-3, 3, (len(index), 3))
+    directions = rng.uniform(-3, 3, (20, 3))[index] + [0, 0, 8] - origins + rng.normal(0, 0.05, (len(index), 3))
+    wrong = rng.random(len(index)) < 0.3
+    directions[wrong] += rng.normal(0, 2, (wrong.sum(), 3))
+    for at_once in (1 << 24, 3000):
+        monkeypatch.setattr("objslam.triangulation.ac_ransac._PAIRS_AT_ONCE", {"numpy": at_once})
+        found.append(triangulate(origins, directions, index, 20, 0.006, SETTINGS))
+    np.testing.assert_array_equal(found[0].weight, found[1].weight)
+    np.testing.assert_array_equal(found[0].positions, found[1].positions)
+    assert 0 < (found[0].weight == 0).sum() < len(index)

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -285,9 +286,11 @@ def test_the_histogram_counts_every_ray() -> None:
     assert [axis_end(np.full(9, x)) for x in (0.013, 0.1, 0.3, 2.0, 7.0)] == pytest.approx([0.02, 0.1, 0.5, 2.0, 10.0])
 
 
-@pytest.fixture
-def mapped(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def mapped_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log with images in which each thing is a patch of a colour of its own, and the folder of its result."""
+    tmp_path = tmp_path_factory.mktemp("mapped") / "here"
+    tmp_path.mkdir()
     from small_log import small_log
 
     from objslam.core.types import Images
@@ -313,6 +316,17 @@ def mapped(tmp_path: Path) -> Path:
     result = pipeline.run(read(tmp_path / "log", Ledger(), SourceOptions()), Settings(output=QUICK.output), Ledger())
     write_result(result, tmp_path / "out")
     return tmp_path
+
+
+@pytest.fixture
+def mapped(mapped_once: Path) -> Iterator[Path]:
+    """What a test may change of `mapped_once`. It stays in its place, because the result names the folder of its log."""
+    kept = mapped_once.with_name("kept")
+    mapped_once.rename(kept)
+    shutil.copytree(kept, mapped_once, symlinks=True)
+    yield mapped_once
+    shutil.rmtree(mapped_once)
+    kept.rename(mapped_once)
 
 
 COLOURS = {"cup": (220, 30, 30), "tall chair": (30, 200, 30), "Bücherregal": (20, 20, 210), "plant": (200, 30, 200)}
