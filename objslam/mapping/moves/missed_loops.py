@@ -22,6 +22,9 @@ _BY_CHANCE = 5
 """A part of a map is a copy if more than this number of its landmarks has the relative positions of others. With a larger
 number, smaller copies are not noticed. With a smaller one, rows of equal things look like copies, and other starts take
 time."""
+_COMPARED = 2
+"""The number of loops with the most evidence that are compared before one of them is closed. Each takes a solve. A larger
+number is slower, and closes fewer wrong loops."""
 _TRIED = 4
 """The most loops that are tried before the search ends. Loops with more evidence are tried first. Each takes a solve. A
 larger number closes more loops, and takes longer on maps that have missed none."""
@@ -35,20 +38,48 @@ def with_missed_loops(state: JointState) -> JointState:
     together. The copies of the landmarks still have the relative positions of the first ones, which reveal the loop.
 
     A closure joins landmarks and is solved at once, at held shared errors. The rounds of association follow after the last
-    closure. Earlier rounds would give the rays of visits that are not closed yet to wrong landmarks. state: without a
+    closure. Earlier rounds would give the rays of visits that are not closed yet to wrong landmarks. First, each closure
+    must explain the log better. Then all loops are closed that copies of relative positions show. state: without a
     localisation.
     """
     held = replace(state, hold=state.errors is not None)
     best = held
     while (closed := _with_a_loop(best)) is not None:
         best = closed
-    if best is held:
+    if best is not held:
+        try:
+            best = state.better(best.released(state.hold))
+        except SolveError:  # The map without the closures is there.
+            best = state
+        if best is not state:
+            state = _with_rounds(best)
+    return _with_all_loops(state)
+
+
+def _with_all_loops(state: JointState) -> JointState:
+    """Return the state after closures of all loops that copies show, and rounds, if the log is then better explained.
+
+    A single closure may explain the log worse. Some rays of a later visit belong to wrong landmarks of an earlier one, and
+    fit only the bent path. The rounds free these rays, but only if all parts of the path are where they should be. A solved
+    closure is not merged, because landmarks of parts that are not closed yet stand between the others.
+    """
+    best = replace(state.attempt(), hold=state.errors is not None)
+    for _ in range(_TRIED):
+        landmarks, middle = _of_state(best)
+        copies = _copies(landmarks, middle, best.solved_poses, state.settings.association)
+        closed = [one for closure in copies[:_COMPARED] if (one := _closed(best, closure, landmarks)) is not None]
+        if not closed:
+            break
+        best = max(closed, key=lambda one: one.explained)
+    if best.association is state.association:
         return state
+    assert best.association is not None
+    assert best.estimate is not None
     try:
-        best = state.better(best.released(state.hold))
-    except SolveError:  # The map without the closures is there.
+        best = best.alternated(best.estimate.map_T_base, (best.association, best.estimate.positions)).released(state.hold)
+    except SolveError:  # The map with the copies is there.
         return state
-    return state if best is state else _with_rounds(best)
+    return state.better(best)
 
 
 def shows_copies(
@@ -59,10 +90,15 @@ def shows_copies(
     All rays can agree with such a map. A copy is sure if more than `_BY_CHANCE` landmarks have the relative positions of
     others, with the evidence of a loop (`association.loop_evidence`). positions: (N, 3) m, NaN if unknown. map_T_camera: (K,
     4, 4)."""
+    return len(_copies(*_landmarks(rays, association, positions, map_T_camera, of.min_rays), map_T_camera, of)) > 0
+
+
+def _copies(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, of: AssociationSettings) -> list[Closure]:
+    """Return the loops that copies show, with the most evidence first. middle: (N,), map_T_camera: (K, 4, 4)."""
     from objslam.graph.loop_closure import find_missed_closures
 
-    found = find_missed_closures(*_landmarks(rays, association, positions, map_T_camera, of.min_rays), map_T_camera)
-    return any(len(closure.now) > _BY_CHANCE and closure.evidence >= of.loop_evidence for closure in found)
+    found = find_missed_closures(landmarks, middle, map_T_camera)
+    return [loop for loop in found if len(loop.now) > _BY_CHANCE and loop.evidence >= of.loop_evidence]
 
 
 def _with_rounds(state: JointState) -> JointState:
@@ -80,16 +116,21 @@ def _with_a_loop(state: JointState) -> JointState | None:
     """Return the state after the closure of one loop that explains the log better. None without one."""
     from objslam.graph.loop_closure import find_missed_closures
 
-    assert state.association is not None
-    assert state.estimate is not None
-    agreed = replace(state.association, object=np.where(state.agree, state.association.object, -1))
-    positions = np.where(state.estimate.solved[:, None], state.estimate.positions, np.nan)
-    landmarks, middle = _landmarks(state.rays, agreed, positions, state.solved_poses, state.settings.association.min_rays)
+    landmarks, middle = _of_state(state)
     for closure in find_missed_closures(landmarks, middle, state.solved_poses)[:_TRIED]:
         closed = _closed(state, closure, landmarks)
         if closed is not None and closed.explained > state.explained:
             return closed
     return None
+
+
+def _of_state(state: JointState) -> tuple[Landmarks, Floats]:
+    """Return what `_landmarks` returns, for the rays that agree with the map of a state."""
+    assert state.association is not None
+    assert state.estimate is not None
+    agreed = replace(state.association, object=np.where(state.agree, state.association.object, -1))
+    positions = np.where(state.estimate.solved[:, None], state.estimate.positions, np.nan)
+    return _landmarks(state.rays, agreed, positions, state.solved_poses, state.settings.association.min_rays)
 
 
 def _landmarks(
