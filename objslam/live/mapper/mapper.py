@@ -31,6 +31,7 @@ from objslam.live.mapper.prediction import PosePrediction, PosePredictor
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.track_promotion import promote_tracks, prune_tracks
 from objslam.live.mapper.tracks import update_positions
+from objslam.live.names.kinds import LabelKinds
 from objslam.sources.journal.records import CameraMessage, FrameMessage, Message, MountMessage, PoseMessage
 
 
@@ -38,14 +39,14 @@ class Mapper:
     """Builds the map in one thread, from messages whose stamps are in session time (see `clock`)."""
 
     def __init__(self, settings: Settings, counters: Counters) -> None:
-        by_label, rng = settings.association.method != "global", np.random.default_rng(settings.seed)
+        kinds, rng = LabelKinds(settings.association.method != "global"), np.random.default_rng(settings.seed)
         given = settings.model_copy(update={"mode": "joint"})
         known = known_errors(given)
         errors = {} if known is None else dict(zip(known.names, known.values.tolist(), strict=True))
         scaled = scaled_noise(given, errors)
         course = Course(scaled, OdometryCorrection(errors))
         self.state = MapState(
-            scaled, counters, IncrementalGraph(scaled), course, by_label, rng, given, errors=errors, calibration=known
+            scaled, counters, IncrementalGraph(scaled), course, kinds, rng, given, errors=errors, calibration=known
         )
         self._extractor = BearingExtractor(self.state)
         self._selector = KeyframeSelector(settings.live)
