@@ -33,6 +33,7 @@ def associate(
     m.kinds.seen.update(rays.label.tolist())
     for label in _shown_twice(rays.label, one) if settings.method == "auto" else ():
         if m.kinds.name(np.array([label]))[0]:
+            m.kinds.shown.add(label)
             m.note_class(label)
             predicted = None
     beside, spread = _box_centres(m, rays, map_T_camera)

@@ -145,7 +145,10 @@ def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
     named = m.kinds.name(landmarks.label)
     if named.any():
         number, fits = np.bincount(row, minlength=len(landmarks)), np.bincount(row[support], minlength=len(landmarks))
-        second = _second_objects(m, obs, held, row, support, named) if m.settings.association.method == "auto" else []
+        if m.settings.association.method == "auto":
+            # The path of a session bends more than a solve of the whole drive, which can still judge the label again.
+            judged = m.kinds.is_confirmed(landmarks.label) & (len(rays.owner) <= m.settings.live.reassociate)
+            second = _second_objects(m, obs, held, row, support, named & ~judged)
         for one in second:
             m.note_class(int(landmarks.label[one.row]))
         single = named & np.isin(np.arange(len(landmarks)), [one.row for one in second], invert=True)

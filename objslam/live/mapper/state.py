@@ -272,8 +272,8 @@ class MapState:
         self._drop_old_tracks()
 
     def note_name(self, label: int) -> None:
-        """Allow one object for a label. The caller leaves it at most one landmark."""
-        self.kinds.add_name(label)
+        """Allow one object for a label, as a solve did. The caller leaves it at most one landmark."""
+        self.kinds.add_name(label, self.next_id.ray)
         self._drop_old_tracks()
 
     def note_moving(self, label: int) -> None:

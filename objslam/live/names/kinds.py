@@ -18,6 +18,8 @@ class LabelKinds:
 
     A label that nothing is known about is a name if `are_names`. several: the numbers of the classes. moving: of the labels
     of things that move. seen: of all labels with a ray. judged: of the classes that a solve has told from the names.
+    confirmed: the first ray that no solve has judged, for each label that a solve took for a name. shown: the classes of
+    which a frame showed two things. No solve makes a name of them.
     """
 
     are_names: bool
@@ -25,6 +27,8 @@ class LabelKinds:
     moving: set[int] = field(default_factory=set)
     seen: set[int] = field(default_factory=set)
     judged: set[int] = field(default_factory=set)
+    confirmed: dict[int, int] = field(default_factory=dict)
+    shown: set[int] = field(default_factory=set)
 
     @property
     def all_names(self) -> bool:
@@ -37,6 +41,10 @@ class LabelKinds:
             return np.zeros(len(label), dtype=bool)
         none = self.several | self.moving
         return np.isin(label, list(none), invert=True) if none else np.ones(len(label), dtype=bool)
+
+    def is_confirmed(self, label: Ints) -> Bools:
+        """Return which of these labels (n,) are names that a solve has confirmed."""
+        return self.name(label) & np.isin(label, list(self.confirmed))
 
     def moves(self, label: Ints) -> Bools:
         """Return which of these labels (n,) are of things that move."""
@@ -53,8 +61,9 @@ class LabelKinds:
             self.judged.add(label)
         self.are_names &= len(self.several - self.judged) <= max(1.0, _CLASSES * len(self.seen))
 
-    def add_name(self, label: int) -> None:
-        """Note that a label is a name after all. A log of classes has no names."""
+    def add_name(self, label: int, ray: int) -> None:
+        """Note that a solve took a label for a name. ray: the number of the next ray. A log of classes has no names."""
+        self.confirmed[label] = ray
         self.several.discard(label)
         self.moving.discard(label)
 

@@ -99,11 +99,13 @@ class NameJudge(Rounds[NamesMessage | None, NamesMessage]):
         return NamesRequest(found, tuple(one.camera for one in found.log.cameras), m.given) if len(found.rays) else None
 
     def _correction(self, number: int, answer: NamesMessage | None) -> NamesMessage | None:
-        kinds = self._mapper.state.kinds
+        m = self._mapper.state
+        kinds = m.kinds
         if answer is None or not kinds.are_names:
             return None
+        doubted = (kinds.several - kinds.shown) | kinds.moving | set(m.landmarks.label[contradicted(m)].tolist())
         changes = (
-            not (kinds.several | kinds.moving).isdisjoint(answer.names.tolist())
+            not doubted.isdisjoint(answer.names.tolist())
             or not (kinds.several | kinds.moving).issuperset(answer.several.tolist())
             or not kinds.moving.issuperset(answer.moving.tolist())
         )
@@ -115,7 +117,8 @@ class NameJudge(Rounds[NamesMessage | None, NamesMessage]):
         m.read_positions()
         kinds, labels = m.kinds, m.landmarks.label
         moving = [label for label in correction.moving.tolist() if label not in kinds.moving]
-        again = sorted((kinds.several | kinds.moving).intersection(correction.names.tolist()))
+        names = [label for label in correction.names.tolist() if label not in kinds.shown]
+        again = [label for label in names if label in kinds.several | kinds.moving]
         gone = np.isin(labels, moving) | (np.isin(labels, again) & ~_firsts(m))
         for label in moving:
             m.note_moving(label)
@@ -123,7 +126,7 @@ class NameJudge(Rounds[NamesMessage | None, NamesMessage]):
             # Of a label that moved before, only the end has objects: the tracks of a session would follow the rest.
             if label not in kinds.several | kinds.moving:
                 m.note_class(label, judged=True)
-        for label in again:
+        for label in names:
             m.note_name(label)
         if gone.any():
             drop_landmarks(m, np.flatnonzero(gone))
