@@ -10,7 +10,7 @@ from driving_cart import with_cart_that_drives
 
 from objslam.config import Odometry, load_settings
 from objslam.live.adapters.replay import events
-from objslam.live.names.kinds import LabelKinds
+from objslam.live.label_kinds import LabelKinds
 from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
 

@@ -19,6 +19,7 @@ from objslam.frontend.known_errors import known_errors
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
+from objslam.live.label_kinds import LabelKinds
 from objslam.live.mapper.bearing_extraction import BearingExtractor, FrameView
 from objslam.live.mapper.course import Course, Placed
 from objslam.live.mapper.data_association import associate
@@ -31,7 +32,6 @@ from objslam.live.mapper.prediction import PosePrediction, PosePredictor
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.track_promotion import promote_tracks, prune_tracks
 from objslam.live.mapper.tracks import update_positions
-from objslam.live.names.kinds import LabelKinds
 from objslam.sources.journal.records import CameraMessage, FrameMessage, Message, MountMessage, PoseMessage
 
 

@@ -17,11 +17,11 @@ from objslam.frontend.boxes.part_finder import RobotPartFinder
 from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
+from objslam.live.label_kinds import LabelKinds
 from objslam.live.mapper.course import Course
 from objslam.live.mapper.landmark_table import LandmarkTable, box_centres, to_centres
 from objslam.live.mapper.tables import KeyframeTable, RayTable
 from objslam.live.mapper.tracks import Track
-from objslam.live.names.kinds import LabelKinds
 
 _AT_ONCE = 400
 """The most keyframes of a graph that is solved at once after a correction of its measurements. A larger graph is rebuilt in

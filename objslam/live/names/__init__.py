@@ -1,1 +1,2 @@
-"""What each label of a session is: the name of one object, a class of several, or of things that move."""
+"""Judges which labels of a session are names of one object, classes of several, or of things that move. A process beside the
+session solves the names of the whole drive."""
