@@ -210,7 +210,9 @@ def two(s, support, at, drift=1.0):
         settings=load_settings(None, ()),
         rng=np.random.default_rng(0),
     )
-    found = _second_objects(session, s, number, np.zeros(count, dtype=np.int64), np.array(support))
+    row, named = np.zeros(count, dtype=np.int64), np.ones(1, dtype=bool)
+    assert not _second_objects(session, s, number, row, np.array(support), ~named)
+    found = _second_objects(session, s, number, row, np.array(support), named)
     for second in found:
         assert second.row == 0
         np.testing.assert_array_equal(second.rays, np.flatnonzero(~np.array(support)))

@@ -22,7 +22,7 @@ from objslam.errors import LogError, OutputError
 from objslam.simulation import make_camera
 from objslam.sources import read
 from objslam.sources.journal.aside import restore_after_kill
-from objslam.sources.journal.corrections import BodiesMessage, CalibrationMessage, ObjectsMessage
+from objslam.sources.journal.corrections import BodiesMessage, CalibrationMessage, NamesMessage, ObjectsMessage
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.log import read_journal
 from objslam.sources.journal.reader import messages
@@ -90,6 +90,13 @@ def objects(count):
     return st.builds(ObjectsMessage, st.integers(0, 10**9), parts, gone)
 
 
+def label_kinds(count):
+    """Of labels that are of one kind each."""
+    labels = st.lists(st.integers(0, 99), min_size=count, max_size=3 * count, unique=True)
+    kinds = labels.map(lambda found: [np.array(found[i::3], dtype=np.int64) for i in range(3)])
+    return st.builds(lambda number, parts: NamesMessage(number, *parts), st.integers(0, 10**9), kinds)
+
+
 SIZES, SHARES, SECONDS = st.floats(1.0, 300.0), st.floats(0.0, 1.0), st.floats(0.1, 1e3)
 NOISES = st.builds(
     NoiseFactors,
@@ -108,6 +115,7 @@ MESSAGES = st.one_of(
     st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations), NOISES),
     st.integers(0, 4).flatmap(bodies),
     st.integers(1, 4).flatmap(objects),
+    st.integers(0, 4).flatmap(label_kinds),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
     st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),
     st.just(CameraMessage(replace(make_camera("depth"), depth_noise=RangeNoise(0.01, 0.005, 0.02)))),

@@ -26,38 +26,45 @@ def associate(
 
     rays: of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of
     `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks. Second boxes of
-    a thing (`_first_boxes`) are only kept for the end of the session.
+    a thing (`_first_boxes`) and boxes of things that move are only kept for the end of the session.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
     one = may_be_one(rays.box, rays.label)
-    if m.by_label and settings.method == "auto" and _shows_two(rays.label, one):
-        m.tell_apart_within_labels()
+    m.kinds.seen.update(rays.label.tolist())
+    for label in _shown_twice(rays.label, one) if settings.method == "auto" else ():
+        if m.kinds.name(np.array([label]))[0]:
+            m.kinds.shown.add(label)
+            m.note_class(label)
+            predicted = None
     beside, spread = _box_centres(m, rays, map_T_camera)
     numbers = m.next_id.ray + np.arange(count)
     m.next_id.ray += count
     row, owner, used = np.full(count, -1), np.full(count, -1), np.zeros(count, dtype=bool)
-    waiting: dict[int, Track] = {}  # The present tracks, by label, if every label is one object.
+    waiting: dict[int, Track] = {}  # The present tracks of names, by label.
     tracks: dict[int, Track] = {}  # The tracks of the frame's rays, by the index of the ray.
-    if m.by_label:
+    free: list[int] = []
+    if predicted is None:
+        predicted = predict_landmarks(landmarks, [] if m.by_label else m.tracks)
+    predicted = at_box_centres(predicted, beside, spread)
+    named, classed = m.kinds.name(rays.label), m.kinds.classes(rays.label)
+    if named.any():
         best = best_of_label(rays)
-        predicted = at_box_centres(predict_landmarks(landmarks, []), beside, spread)
+        best = best[named[best]]
         row[best], missed = match_by_label(rays.take(best), map_T_camera, predicted, uncertainty, settings.gate)
         lost = missed >= 0
         landmarks.rejected[missed[lost]] += 1
         owner[best[lost]] = landmarks.id[missed[lost]]
-        free = best[(row[best] < 0) & ~lost]
-        waiting = {track.label: track for track in m.tracks}
-    else:
-        if predicted is None:
-            predicted = predict_landmarks(landmarks, m.tracks)
-        predicted = at_box_centres(predicted, beside, spread)
+        free += best[(row[best] < 0) & ~lost].tolist()
+        waiting = {track.label: track for track in m.tracks if track.by_label}
+    if classed.any():
         first = _first_boxes(rays.score, one)
+        first = first[classed[first]]
         known = settings.gate, m.landmark_of_track, m.novelty
         row[first] = match(rays.take(first), map_T_camera, predicted, uncertainty, len(m.labels), *known)
         of_track = row >= predicted.landmarks
         m.novelty += _NOVELTY_WEIGHT * (float((of_track | (row < 0))[first].mean()) - m.novelty)
         tracks = {i: m.tracks[row[i] - predicted.landmarks] for i in np.flatnonzero(of_track).tolist()}
-        free = first[row[first] < 0]
+        free += first[row[first] < 0].tolist()
         row[of_track] = -1
     matched = np.flatnonzero(row >= 0)
     owner[matched], used[matched] = landmarks.id[row[matched]], True
@@ -72,10 +79,10 @@ def associate(
         number=numbers, keyframe=np.full(count, k), owner=owner, used=used, to_centre=added, centre_sigma=noise, **vars(rays)
     )
     stamp = float(m.keyframes.stamp[-1])
-    for i in free.tolist():
+    for i in sorted(free):
         label = int(rays.label[i])
         if label not in waiting:
-            tracks[i] = Track(m.next_id.track, label, m.by_label, stamp, stamp, uncertainty.drift)
+            tracks[i] = Track(m.next_id.track, label, bool(named[i]), stamp, stamp, uncertainty.drift)
             m.next_id.track += 1
             m.tracks.append(tracks[i])
         else:
@@ -89,9 +96,10 @@ def associate(
     return LandmarkUpdate(turned, matched, row[matched], list(tracks.values()))
 
 
-def _shows_two(label: Ints, one: Bools) -> bool:
-    """Return whether a frame shows two things of a label. label: (n,) of its boxes. one: (n, n) as in `may_be_one`."""
-    return bool((np.triu(label[:, None] == label, 1) & ~one).any())
+def _shown_twice(label: Ints, one: Bools) -> list[int]:
+    """Return the labels of which a frame shows two things. label: (n,) of its boxes. one: (n, n) as in `may_be_one`."""
+    first, _ = np.nonzero(np.triu(label[:, None] == label, 1) & ~one)
+    return sorted(set(label[first].tolist()))
 
 
 def _first_boxes(score: Floats, one: Bools) -> Ints:

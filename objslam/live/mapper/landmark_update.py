@@ -71,7 +71,7 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
             m.landmark_of_track[track] = j
             if len(m.landmark_of_track) > _TRACKS:
                 del m.landmark_of_track[next(iter(m.landmark_of_track))]
-    if not m.by_label:
+    if not m.by_label:  # Only classes have several landmarks of a label.
         shown = sorted(zip(ids.tolist(), landmarks.label[rows].tolist(), strict=True))
         for (first, label), (second, other) in combinations(shown, 2):
             if label == other:
@@ -123,3 +123,11 @@ def remove_landmarks(m: MapState, rows: Ints, rebuild: bool = True) -> None:
     m.landmarks.keep(kept)
     if rebuild:
         m.rebuild_in_slices()
+
+
+def drop_landmarks(m: MapState, rows: Ints) -> None:
+    """Remove the landmarks in rows (n,). Their rays then belong to no landmark."""
+    mine = np.isin(m.rays.owner, m.landmarks.id[rows])
+    m.graph.drop_rays(m.rays.number[mine])
+    m.rays.owner[mine], m.rays.used[mine] = -1, False
+    remove_landmarks(m, rows)

@@ -15,7 +15,7 @@ from objslam.core.statistics import MOST_NOISE_FACTOR, OUTLIER_RAY, SAME_POINT, 
 from objslam.errors import SolveError
 from objslam.live.mapper.keyframe_culling import cull_keyframes
 from objslam.live.mapper.landmark_table import covariances, in_view, noise
-from objslam.live.mapper.landmark_update import merge_landmarks, remove_landmarks
+from objslam.live.mapper.landmark_update import drop_landmarks, merge_landmarks, remove_landmarks
 from objslam.live.mapper.loop_closure import close_loop
 from objslam.live.mapper.pose_uncertainty import PoseUncertainty
 from objslam.live.mapper.state import MapState
@@ -126,8 +126,8 @@ def _polish_if_grown(m: MapState) -> None:
 def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
     """Reject rays that are outliers now, and restore rejected rays that are inliers now.
 
-    While every label is one object (`by_label`), a landmark with few inliers is triangulated again. If the rays of a label
-    show two objects, `by_label` becomes False. Return whether any ray changed, and these second objects.
+    The landmark of a name is triangulated again if few of its rays are inliers. If the rays of a name show two objects, it
+    becomes a class. Return whether any ray changed, and these second objects.
     """
     second: list[_SecondObject] = []
     rays, landmarks = m.rays, m.landmarks
@@ -142,12 +142,16 @@ def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
     before = rays.used[held] & np.isfinite(off)
     noise_factor = np.minimum(noise_factors(off[before], row[before], len(landmarks)), MOST_NOISE_FACTOR)
     support: Bools = off <= OUTLIER_RAY * noise_factor[row]
-    if m.by_label:
+    named = m.kinds.name(landmarks.label)
+    if named.any():
         number, fits = np.bincount(row, minlength=len(landmarks)), np.bincount(row[support], minlength=len(landmarks))
-        second = _second_objects(m, obs, held, row, support) if m.settings.association.method == "auto" else []
-        if second:
-            m.tell_apart_within_labels()
-        single = np.isin(np.arange(len(landmarks)), [one.row for one in second], invert=True)
+        if m.settings.association.method == "auto":
+            # The path of a session bends more than a solve of the whole drive, which can still judge the label again.
+            judged = m.kinds.is_confirmed(landmarks.label) & (len(rays.owner) <= m.settings.live.reassociate)
+            second = _second_objects(m, obs, held, row, support, named & ~judged)
+        for one in second:
+            m.note_class(int(landmarks.label[one.row]))
+        single = named & np.isin(np.arange(len(landmarks)), [one.row for one in second], invert=True)
         for j in np.flatnonzero(single & (fits < _HALF * number) & (number >= MANY)).tolist():
             mine = np.flatnonzero(row == j)
             fit = fit_point(obs.take(mine), m.rng, SLACK)
@@ -163,17 +167,19 @@ def _reconsider(m: MapState) -> tuple[bool, list[_SecondObject]]:
     return bool(len(out) or len(back)), second
 
 
-def _second_objects(m: MapState, obs: Observations, held: Ints, row: Ints, support: Bools) -> list[_SecondObject]:
+def _second_objects(
+    m: MapState, obs: Observations, held: Ints, row: Ints, support: Bools, named: Bools
+) -> list[_SecondObject]:
     """Return the landmarks whose rays show two objects, each with its outliers (rows of `m.rays`) and their point.
 
     If there are two objects, the outliers fit one point. In addition, inliers and outliers alternate (_VISITS), or the point
     is farther away than the path drifts. obs: the rays, in time order. held: (R,) their rows in `m.rays`. row: (R,) the row
-    of each ray's landmark. support: (R,) which rays are inliers.
+    of each ray's landmark. support: (R,) which rays are inliers. named: (N,) which landmarks have a name.
     """
     found: list[_SecondObject] = []
     against = np.bincount(row[~support], minlength=len(m.landmarks))
     number = np.bincount(row, minlength=len(m.landmarks))
-    for j in np.flatnonzero((against >= MANY) & (against > SECOND * number)).tolist():
+    for j in np.flatnonzero(named & (against >= MANY) & (against > SECOND * number)).tolist():
         mine = np.flatnonzero(row == j)
         outliers = mine[~support[mine]]
         fit = fit_if_observable(obs.take(outliers), MANY, AGREE, m.settings, m.rng)
@@ -276,15 +282,8 @@ def _drop_ghosts(m: MapState) -> None:
     """Remove the landmarks that were seen in too small a share of the frames that should show them (live.ghost_share)."""
     landmarks, live = m.landmarks, m.settings.live
     rarely_seen = landmarks.seen < live.ghost_share * landmarks.expected
-    ghost = np.flatnonzero((landmarks.expected >= live.ghost_frames) & rarely_seen)
+    named = m.kinds.name(landmarks.label)
+    ghost = np.flatnonzero(~named & (landmarks.expected >= live.ghost_frames) & rarely_seen)
     if len(ghost):
         m.counters.accept("ghosts dropped", len(ghost))
         drop_landmarks(m, ghost)
-
-
-def drop_landmarks(m: MapState, rows: Ints) -> None:
-    """Remove the landmarks in rows (n,). Their rays then belong to no landmark."""
-    mine = np.isin(m.rays.owner, m.landmarks.id[rows])
-    m.graph.drop_rays(m.rays.number[mine])
-    m.rays.owner[mine], m.rays.used[mine] = -1, False
-    remove_landmarks(m, rows)

@@ -19,6 +19,7 @@ from objslam.frontend.known_errors import known_errors
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
+from objslam.live.label_kinds import LabelKinds
 from objslam.live.mapper.bearing_extraction import BearingExtractor, FrameView
 from objslam.live.mapper.course import Course, Placed
 from objslam.live.mapper.data_association import associate
@@ -38,14 +39,14 @@ class Mapper:
     """Builds the map in one thread, from messages whose stamps are in session time (see `clock`)."""
 
     def __init__(self, settings: Settings, counters: Counters) -> None:
-        by_label, rng = settings.association.method != "global", np.random.default_rng(settings.seed)
+        kinds, rng = LabelKinds(settings.association.method != "global"), np.random.default_rng(settings.seed)
         given = settings.model_copy(update={"mode": "joint"})
         known = known_errors(given)
         errors = {} if known is None else dict(zip(known.names, known.values.tolist(), strict=True))
         scaled = scaled_noise(given, errors)
         course = Course(scaled, OdometryCorrection(errors))
         self.state = MapState(
-            scaled, counters, IncrementalGraph(scaled), course, by_label, rng, given, errors=errors, calibration=known
+            scaled, counters, IncrementalGraph(scaled), course, kinds, rng, given, errors=errors, calibration=known
         )
         self._extractor = BearingExtractor(self.state)
         self._selector = KeyframeSelector(settings.live)

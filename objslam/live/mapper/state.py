@@ -17,6 +17,7 @@ from objslam.frontend.boxes.part_finder import RobotPartFinder
 from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
+from objslam.live.label_kinds import LabelKinds
 from objslam.live.mapper.course import Course
 from objslam.live.mapper.landmark_table import LandmarkTable, box_centres, to_centres
 from objslam.live.mapper.tables import KeyframeTable, RayTable
@@ -96,7 +97,7 @@ class MapState:
     """The whole state of a session's map.
 
     graph: the factors and the estimate. cameras, labels: indexed by their numbers. rays: `owner` gives each ray's landmark.
-    tracks: in the order of their first observation. by_label: whether every label is one object so far.
+    tracks: in the order of their first observation. kinds: which labels are names so far.
     landmark_of_track: id of the last landmark of each detector track. novelty: share of boxes that match no landmark, as an
     exponential average over about 50 frames. pose_covariance: (6, 6) of the newest keyframe's predicted pose, in its camera
     frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
@@ -111,7 +112,7 @@ class MapState:
     counters: Counters
     graph: IncrementalGraph
     course: Course
-    by_label: bool
+    kinds: LabelKinds
     rng: np.random.Generator
     given: Settings
     cameras: list[Camera] = field(default_factory=list)
@@ -132,6 +133,11 @@ class MapState:
     robot_parts: dict[int, RobotPartFinder] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     calibration: Calibration | None = None
+
+    @property
+    def by_label(self) -> bool:
+        """Whether every label is one object so far."""
+        return self.kinds.all_names
 
     def newest_before(self, stamp: float) -> int | None:
         """Return the row of the newest keyframe at or before a stamp, s, None if there is none."""
@@ -259,7 +265,24 @@ class MapState:
             if track.last >= since:
                 track.move(new_T_old)
 
-    def tell_apart_within_labels(self) -> None:
-        """Allow several objects per label, and drop the tracks that were grouped by label alone."""
-        self.by_label = False
-        self.tracks = [track for track in self.tracks if not track.by_label]
+    def note_class(self, label: int, judged: bool = False) -> None:
+        """Allow several objects for a label, and drop its track, which was grouped by label alone. judged: as in
+        `LabelKinds.add_class`."""
+        self.kinds.add_class(label, judged)
+        self._drop_old_tracks()
+
+    def note_name(self, label: int) -> None:
+        """Allow one object for a label, as a solve did. The caller leaves it at most one landmark."""
+        self.kinds.add_name(label, self.next_id.ray)
+        self._drop_old_tracks()
+
+    def note_moving(self, label: int) -> None:
+        """Leave the boxes of a label out of the map, because they show things that move. The caller drops its landmarks."""
+        self.kinds.add_moving(label)
+        self._drop_old_tracks()
+
+    def _drop_old_tracks(self) -> None:
+        """Drop the tracks that were begun when their label was of another kind."""
+        label = np.array([track.label for track in self.tracks], dtype=np.int64)
+        stays = zip(self.tracks, self.kinds.name(label).tolist(), self.kinds.moves(label).tolist(), strict=True)
+        self.tracks = [track for track, named, moves in stays if track.by_label == named and not moves]

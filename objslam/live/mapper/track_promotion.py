@@ -89,14 +89,21 @@ def try_promote(track: Track, graph: IncrementalGraph, settings: Settings, rng: 
 
 
 def fit_if_observable(
-    obs: Observations, least: int, share: float, settings: Settings, rng: np.random.Generator, early: bool = False
+    obs: Observations,
+    least: int,
+    share: float,
+    settings: Settings,
+    rng: np.random.Generator,
+    early: bool = False,
+    slack: float = SLACK,
 ) -> PointFit | None:
     """Triangulate rays in map, or return None.
 
     There are three reasons for None. The inliers are fewer than `least`, or a smaller share than `share`. The position is
     uncertain. The parallax is low and there are no ranges. early: whether less parallax suffices if the position is certain.
+    slack: m, as in `fit_point`.
     """
-    fit = fit_point(obs, rng, SLACK)
+    fit = fit_point(obs, rng, slack)
     if fit is None or fit.inlier.sum() < least or fit.inlier.mean() < share:
         return None
     full = np.radians(settings.joint.min_parallax_deg)

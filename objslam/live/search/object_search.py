@@ -19,7 +19,7 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.counters import Counters
-from objslam.live.mapper.maintenance import drop_landmarks
+from objslam.live.mapper.landmark_update import drop_landmarks
 from objslam.live.mapper.mapper import Mapper
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.track_promotion import add_landmark
@@ -48,10 +48,12 @@ keeps more rays for its first position."""
 
 @dataclass(frozen=True)
 class SearchRequest:
-    """The drive of a session so far. owner: (R,) the session's landmark of each of its rays, -1 without one."""
+    """The drive of a session so far. owner: (R,) the session's landmark of each of its rays, -1 without one. classes: (R,)
+    whether the label of a ray may have several objects."""
 
     found: Collected
     owner: Ints
+    classes: Bools
     cameras: tuple[Camera, ...]
     settings: Settings
 
@@ -72,11 +74,12 @@ class SearchRequest:
         objects, _ = describe(solution, self.cameras, self.settings)
         used, new = solution.estimate.weight > 0, []
         for j, one in enumerate(objects.objects):
-            mine = used & (solution.association.object == j)
+            mine = used & (solution.association.object == j) & self.classes
             placed = one.parallax_deg >= self.settings.joint.min_parallax_deg or bool(np.isfinite(f.rays.range[mine]).any())
             if one.status == "ok" and placed and mine.any() and (self.owner[mine] >= 0).mean() < _NEW:
                 new.append(np.sort(f.numbers[mine & (self.owner < 0)]))
-        return ObjectsMessage(0, tuple(new), no_objects(self.owner, used & (solution.association.object >= 0)))
+        gone = no_objects(self.owner, used & (solution.association.object >= 0))
+        return ObjectsMessage(0, tuple(new), gone[np.isin(gone, self.owner[self.classes])])
 
 
 def no_objects(owner: Ints, explained: Bools) -> Ints:
@@ -111,17 +114,18 @@ class ObjectSearch(Rounds[ObjectsMessage, ObjectsMessage]):
         self._counters, self._name = counters, name
 
     def _request(self) -> SearchRequest | None:
-        """Return the drive so far. None if labels name the objects, if all boxes belong to objects, or if there are too many
-        boxes."""
+        """Return the drive so far. None if no label has several objects, if all of their boxes belong to objects, or if
+        there are too many boxes."""
         m = self._mapper.state
-        free = m.rays.owner < 0
-        if m.by_label or not len(m.landmarks) or free.sum() < m.settings.live.min_rays:
+        classes = m.kinds.classes(m.rays.label)
+        free = (m.rays.owner < 0) & classes
+        if not classes.any() or not len(m.landmarks) or free.sum() < m.settings.live.min_rays:
             return None
         if len(free) > m.settings.live.reassociate:
             return None
         found = collect(m, self._name, count_dropped=False)
-        owner = m.rays.owner[np.searchsorted(m.rays.number, found.numbers)]
-        return SearchRequest(found, owner, tuple(one.camera for one in found.log.cameras), m.given)
+        at = np.searchsorted(m.rays.number, found.numbers)
+        return SearchRequest(found, m.rays.owner[at], classes[at], tuple(one.camera for one in found.log.cameras), m.given)
 
     def _correction(self, number: int, answer: ObjectsMessage | None) -> ObjectsMessage | None:
         if answer is None:

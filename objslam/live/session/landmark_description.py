@@ -19,12 +19,15 @@ _MOST = 200  # The most rays that describe an object. They are spread evenly ove
 _FEW = 60  # The most rays that give the parallax of an object, as the widest angle of all pairs. More rays take longer.
 
 
-def describe_landmark(m: MapState, row: int, position: Floats, covariance: Floats, *, from_graph: bool = False) -> MapObject:
+def describe_landmark(
+    m: MapState, row: int, position: Floats, covariance: Floats, *, from_graph: bool = False, sure: bool = True
+) -> MapObject:
     """Describe the landmark in a row of `m.landmarks`, at a position (3,) m with a covariance (3, 3) m^2.
 
     If the mean square of the landmark's normalised residuals is above 1, the covariance is multiplied by it. Box offsets are
     added. from_graph: whether the covariance includes the drift of the map. Such a covariance may be too large. Then the
-    landmark is still resolved if its covariance relative to the last keyframe that saw it is small.
+    landmark is still resolved if its covariance relative to the last keyframe that saw it is small. sure: False if its name
+    is `contradicted`. Then the landmark is not resolved.
     """
     landmarks, rays, j = m.landmarks, m.rays, int(m.landmarks.id[row])
     mine = np.flatnonzero((rays.owner == j) & rays.used)
@@ -40,6 +43,7 @@ def describe_landmark(m: MapState, row: int, position: Floats, covariance: Float
         seen = m.graph.seen_covariance(j, int(rays.keyframe[mine].max()))
         sigma = float(largest_sigma(wider * seen[None])[0])
     status = status_of(sigma, away, count, parallax, bool(np.isfinite(obs.range).any()), limits)
+    status = status if sure or status != "ok" else "unresolved"
     fixed, extent = status == "ok", _extent(m, some, position) if count else None
     if fixed and count:
         size = np.array(extent) if extent else np.full(2, m.settings.rays.unknown_size)

@@ -22,6 +22,7 @@ from objslam.live.bodies.description import BodyEstimator
 from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
+from objslam.live.names.name_judge import NameJudge
 from objslam.live.rounds import Rounds
 from objslam.live.search.object_search import ObjectSearch
 from objslam.live.session.finalize import finish
@@ -71,6 +72,7 @@ class Session(Intake):
         of_session = settings, self.counters, self._mapper, self._record
         self._rounds: tuple[Rounds[Any, Any], ...] = (
             Calibrator(*of_session, name, patient),
+            NameJudge(*of_session, name, patient),
             ObjectSearch(*of_session, name, patient),
             BodyCentring(*of_session, patient),
         )

@@ -15,6 +15,7 @@ from objslam.live.bodies.description import BodyEstimator
 from objslam.live.mapper.landmark_table import covariances
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
+from objslam.live.names.contradicted import contradicted
 from objslam.live.session.landmark_description import describe_landmark, describe_track
 
 _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
@@ -26,8 +27,9 @@ class Describer:
     def __init__(self, bodies: BodyEstimator | None = None) -> None:
         """Prepare for a session. bodies: gives the landmarks bodies, None for points only."""
         self._bodies = bodies
-        # By landmark id: the number of its rays and its last stamp, s, when it was described, and the description.
-        self._described: dict[int, tuple[tuple[int, float], MapObject]] = {}
+        # By landmark id: the number of its rays, its last stamp, s, and whether its name was contradicted, when it was
+        # described, and the description.
+        self._described: dict[int, tuple[tuple[int, float, bool], MapObject]] = {}
         self._covariances: dict[int, Floats] = {}  # (3, 3) m^2, in the graph, of the described landmarks, by id.
         # By track id: the number of its rays when it was described, and the description.
         self._waiting: dict[int, tuple[int, MapObject]] = {}
@@ -45,20 +47,22 @@ class Describer:
             self._tied, self._described = not self._tied, {}
         landmarks, known = m.landmarks, self._described
         points = m.graph.points(landmarks.id)
-        found: dict[int, tuple[tuple[int, float], MapObject]] = {}
+        found: dict[int, tuple[tuple[int, float, bool], MapObject]] = {}
+        against = contradicted(m)
         order = np.argsort([known[j][0][1] if j in known else -np.inf for j in landmarks.id.tolist()], kind="stable")
         for row in order.tolist():
             j = int(landmarks.id[row])
-            state = (int(landmarks.seen[row]), float(landmarks.last[row]))
+            sure = not against[row]
+            state = (int(landmarks.seen[row]), float(landmarks.last[row]), sure)
             before = known.get(j)
             if before is not None and (before[0] == state or time.perf_counter() > end):
                 described, state = replace(before[1], position=points[row]), before[0]
             elif time.perf_counter() > end:  # a new landmark, for which the rays alone give a covariance for now
-                described = describe_landmark(m, row, points[row], covariances(landmarks, np.array([row]))[0])
-                state = (-1, -np.inf)
+                described = describe_landmark(m, row, points[row], covariances(landmarks, np.array([row]))[0], sure=sure)
+                state = (-1, -np.inf, sure)
             else:
                 self._covariances[j] = self._covariance(m, j)
-                described = describe_landmark(m, row, points[row], self._covariances[j], from_graph=True)
+                described = describe_landmark(m, row, points[row], self._covariances[j], from_graph=True, sure=sure)
             found[j] = (state, described)
         self._described = found
         objects = [found[j][1] for j in sorted(found)]

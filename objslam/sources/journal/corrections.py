@@ -13,7 +13,7 @@ from objslam.core.noise import MOST_POSE_NOISE, NOMINAL, NoiseFactors
 from objslam.core.validity import MAX_POSITION, covariance_fault
 from objslam.sources.journal.fields import as_array, as_count, as_name
 
-_CALIBRATION_KIND, _BODIES_KIND, _OBJECTS_KIND = b"S", b"B", b"A"
+_CALIBRATION_KIND, _BODIES_KIND, _OBJECTS_KIND, _NAMES_KIND = b"S", b"B", b"A", b"K"
 _OF_LOCALIZATION = ("heading", "heading_share", "heading_seconds", "place", "place_share", "place_seconds")
 """The fields of `NoiseFactors` that a calibration message has."""
 
@@ -60,7 +60,21 @@ class ObjectsMessage:
     gone: Ints
 
 
-Correction = CalibrationMessage | BodiesMessage | ObjectsMessage
+@dataclass(frozen=True)
+class NamesMessage:
+    """What the labels of a session are. A label in none of the arrays, which have no label in common, stays what it is.
+
+    keyframe: the number of keyframes in the map before the correction. names: (n,) the numbers of the labels that name one
+    object. several: (m,) of the labels with several objects. moving: (k,) of the labels of things that move.
+    """
+
+    keyframe: int
+    names: Ints
+    several: Ints
+    moving: Ints
+
+
+Correction = CalibrationMessage | BodiesMessage | ObjectsMessage | NamesMessage
 """What a session found itself, and then corrected in its map."""
 
 
@@ -74,6 +88,9 @@ def encode_correction(message: Correction) -> bytes:
     if isinstance(message, BodiesMessage):
         arrays = (message.ids, message.shape, message.half, message.yaw, message.covariance)
         return _BODIES_KIND + json.dumps([message.keyframe, *(array.tolist() for array in arrays)]).encode()
+    if isinstance(message, NamesMessage):
+        kinds = [labels.tolist() for labels in (message.names, message.several, message.moving)]
+        return _NAMES_KIND + json.dumps([message.keyframe, *kinds]).encode()
     objects = [rays.tolist() for rays in message.rays]
     return _OBJECTS_KIND + json.dumps([message.keyframe, objects, message.gone.tolist()]).encode()
 
@@ -125,9 +142,19 @@ def _read_objects(data: bytes) -> ObjectsMessage:
     return ObjectsMessage(as_count(keyframe), rays, np.array([as_count(one) for one in gone], dtype=np.int64))
 
 
+def _read_names(data: bytes) -> NamesMessage:
+    keyframe, *kinds = json.loads(data[1:])
+    names, several, moving = (np.array([as_count(one) for one in labels], dtype=np.int64) for labels in kinds)
+    every = np.concatenate([names, several, moving])
+    if len(np.unique(every)) < len(every):
+        raise ValueError("a label that is of two kinds")
+    return NamesMessage(as_count(keyframe), names, several, moving)
+
+
 CORRECTION_READERS: dict[bytes, Callable[[bytes], Correction]] = {
     _CALIBRATION_KIND: _read_calibration,
     _BODIES_KIND: _read_bodies,
     _OBJECTS_KIND: _read_objects,
+    _NAMES_KIND: _read_names,
 }
 """The reader of each kind of correction, by the first byte of its record."""
