@@ -1,14 +1,15 @@
 """Map recorded drives with default settings, and compare each map with its truth and with its own sigmas.
 
-    python tools/bench_recordings.py [--parts named robots short poses late cube ycbv unnamed] [--only 6-1] [--set KEY=VALUE]
+    python tools/bench_recordings.py [--parts named robots short poses late cube ycbv classes unnamed] [--only 6-1]
+        [--set KEY=VALUE]
 
 named: UTIAS MRCLAM 6 and 7 (15 landmarks, the odometry of wheels) and Lost in the Woods (17 posts, one observation a
 second), each landmark with a label of its own, from bearings and with ranges. robots: the MRCLAM drives, with the boxes of
 the other robots, which drive around, each with a label of its own. Their objects are false. short: parts of the MRCLAM
 drives of two to five minutes. poses: whole drives at the poses of the motion capture. late: drives whose motion capture
 begins after two fifths of the time, beside the odometry, with mode fixed and auto. cube: a cabinet of TUM fr3 at the poses
-of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses. unnamed: the named drives with
-ranges, and one label for all landmarks.
+of the motion capture. ycbv: five objects that DOPE found, at the cameras' true poses. classes, unnamed: the named drives
+with ranges, and eight labels for all landmarks, or one.
 
 Maps from odometry are compared after SE(2) alignment. The truth is inside a 95 % ellipsoid in 95 % of the cases, if the
 covariances are right. Times are of the processor, for the map alone.
@@ -27,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "real"))
-from log_parts import part, without_names
+from log_parts import part, with_classes
 from lost_in_the_woods import read_lost_in_the_woods
 from other_robots import read_with_other_robots
 from ycbv import RUNS, read_ycbv
@@ -44,7 +45,7 @@ from objslam.sources import SourceOptions, read
 RADIUS = 2.0
 """The radius of a match, m, of landmarks whose labels identify them. A large error must not count as a missed landmark."""
 UNNAMED_RADIUS = 0.5
-"""The radius of a match, m, where all labels are equal. The landmarks are 0.1 m and more apart."""
+"""The radius of a match, m, where landmarks share labels. The landmarks are 0.1 m and more apart."""
 DRIVES = (("mrclam_ds6", (1, 3, 5)), ("mrclam_ds7", (1, 3)))
 PARTS = ((0, 300), (300, 600), (600, 900), (200, 320), (800, 1000))
 """The begins and ends, s, of the parts of a drive."""
@@ -84,20 +85,24 @@ def judged(log: Log, result: RunResult, radius: float = RADIUS, align: str = "se
     return evaluate(result.map, log.truth, path, align=align, radius=radius).to_dict()
 
 
-def compare(data: Path, only: str, overrides: list[str], names: bool, other_robots: bool = False) -> None:
-    """Print a line for each drive."""
-    labels = "each landmark with its own label" if names else "one label for all landmarks"
-    print(f"whole drives{'' if names else ' with ranges'}, {labels}{', and boxes of other robots' if other_robots else ''}")
+def compare(data: Path, only: str, overrides: list[str], classes: int = 0, other_robots: bool = False) -> None:
+    """Print a line for each drive. classes: the number of labels of all landmarks, 0 if each has its own."""
+    labels = (
+        f"{classes} label{'s' if classes > 1 else ''} for all landmarks" if classes else "each landmark with its own label"
+    )
+    print(
+        f"whole drives{' with ranges' if classes else ''}, {labels}{', and boxes of other robots' if other_robots else ''}"
+    )
     print(
         f"{'drive':<7}{'range':>6}{'right':>7}{'false':>7}{'missed':>8}{'RMSE m':>8}{'without scale':>15}{'inside 95 %':>13}"
         f"{'median Mahalanobis^2':>22}{'ATE m':>8}{'s':>7}"
     )
-    for with_range in (False, True) if names else (True,):
+    for with_range in (True,) if classes else (False, True):
         for name, log in drives(data, only, with_range, other_robots):
-            log = log if names else without_names(log)
+            log = with_classes(log, classes) if classes else log
             result, seconds = solve(log, overrides)
-            found = judged(log, result, RADIUS if names else UNNAMED_RADIUS)
-            scaled = judged(log, result, RADIUS if names else UNNAMED_RADIUS, "sim2")
+            found = judged(log, result, UNNAMED_RADIUS if classes else RADIUS)
+            scaled = judged(log, result, UNNAMED_RADIUS if classes else RADIUS, "sim2")
             inside = f"{round(found['inside_95_3d'] * found['matched'])} of {found['matched']}"
             print(
                 f"{name:<7}{'yes' if with_range else 'no':>6}{found['matched']:7d}{found['false']:7d}{found['missed']:8d}"
@@ -219,7 +224,7 @@ def ycbv(data: Path, overrides: list[str]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = ("named", "robots", "short", "poses", "late", "cube", "ycbv", "unnamed")
+    parts = ("named", "robots", "short", "poses", "late", "cube", "ycbv", "classes", "unnamed")
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--only", default="", help="only the drives whose name contains this, such as 6-1 or woods")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of all runs")
@@ -229,14 +234,15 @@ def main() -> None:
         sys.exit("OBJSLAM_DATA names no folder with the recordings")
     data, only, overrides = Path(folder), arguments.only, arguments.set
     work = {
-        "named": lambda: compare(data, only, overrides, names=True),
+        "named": lambda: compare(data, only, overrides),
         "short": lambda: short(data, only, overrides),
         "poses": lambda: poses(data, only, overrides),
         "late": lambda: late(data, only, overrides),
         "cube": lambda: cube(data, overrides),
         "ycbv": lambda: ycbv(data, overrides),
-        "robots": lambda: compare(data, only, overrides, names=True, other_robots=True),
-        "unnamed": lambda: compare(data, only, overrides, names=False),
+        "robots": lambda: compare(data, only, overrides, other_robots=True),
+        "classes": lambda: compare(data, only, overrides, classes=8),
+        "unnamed": lambda: compare(data, only, overrides, classes=1),
     }
     for name in arguments.parts:
         work[name]()
