@@ -135,10 +135,17 @@ def existence(state: State, gate: float) -> Floats:
     return np.asarray(logistic(static_odds(state, gate)) * logistic(chance_odds(state, gate)))
 
 
+def rates_of_classes(state: State) -> Rates:
+    """Return the `detection_rates` of the landmarks of a state. With a localisation, the rate of a class always tells the
+    rate of its objects, because they may be detected more rarely anyway (`rarer_objects`)."""
+    rates = detection_rates(state.history, state.label, len(state.unassigned))
+    return replace(rates, untold=0.0) if state.view.localized else rates
+
+
 def static_odds(state: State, gate: float, fitted: int = 0) -> Floats:
     """Return the log odds (N,) of a static object over a phantom or a moving thing, from detections, misses, sizes and
     motion. gate: see `rarer_objects`. fitted: see `rest_odds`."""
-    rates = detection_rates(state.history, state.label, len(state.unassigned))
+    rates = rates_of_classes(state)
     by_rate = prior_odds(state) + rates.log_odds(state.history, state.label, rarer_objects(state, rates, gate))
     return np.asarray(by_rate + size_odds(state) + rest_odds(state, fitted))
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from objslam.association.existence import chance_odds, detection_rates, prior_odds, rarer_objects, rest_odds, size_odds
+from objslam.association.existence import chance_odds, prior_odds, rarer_objects, rates_of_classes, rest_odds, size_odds
 from objslam.association.refinement import velocity_gain
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
@@ -136,7 +136,7 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
     points, known, count = fit_points(evidence, groups), evidence.state.count, len(groups)
     state = as_landmarks(evidence, points)
     obs, label = state.obs, state.label[known:]
-    rates = detection_rates(state.history, state.label, len(state.unassigned))
+    rates = rates_of_classes(state)
     rarer = rarer_objects(state, rates, evidence.gate)
     by_rate = rates.log_odds(state.history, state.label, rarer) + prior_odds(state)
     odds: dict[Reason, Floats] = {
