@@ -169,7 +169,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
 
         starts = [lambda: _from_tracks(begin), lambda: _from_start(begin.attempt(), None), along_tracks]
         if np.isfinite(state.rays.range).any():
-            starts = [by_windows if sure else along_tracks]
+            starts = [along_tracks] if not sure else [by_windows] if _shows_copies(state) else []
         for other_start in starts:  # The first ones take less time.
             if not _unclear(state):
                 break
@@ -224,8 +224,11 @@ def _unclear(state: JointState) -> bool:
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
     agree = state.agree[tracked] if tracked.any() else state.agree
-    if agree.mean() < _CLEAR or noise > _NOISIER:
-        return True
+    return bool(agree.mean() < _CLEAR or noise > _NOISIER) or _shows_copies(state)
+
+
+def _shows_copies(state: JointState) -> bool:
+    """Return whether the map of a state shows the same things at several places (`shows_copies`)."""
     assert state.association is not None
     assert state.estimate is not None
     positions = np.where(state.estimate.solved[:, None], state.estimate.positions, np.nan)
