@@ -13,7 +13,7 @@ from objslam.sources import SourceOptions, read
 
 @pytest.mark.long
 def test_landmarks_of_eight_labels(data_dir):
-    """The filter for ranges was sure of a map with up to three copies of each landmark, and none was right."""
+    """With another draw of the labels, the filter for ranges was sure of a map with up to three copies of each landmark."""
     log = with_classes(read(data_dir / "mrclam_ds7", Ledger(), SourceOptions(robot=3, with_range=True)), 8)
     more = ("checks.use=false", "bodies.use=false", "output.recording=false")
     result = pipeline.run(log, load_settings(None, ("mode=joint", *more)), Ledger())
