@@ -47,7 +47,7 @@ def solve(
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     doubted: tuple[str, ...] = ()
-    unsettled = 0
+    unsettled = copied = 0
     estimated = errors
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
@@ -62,6 +62,7 @@ def solve(
         from objslam.mapping.bodies.centre_bearings import solve_to_centres
         from objslam.mapping.joint.joint_alternation import JointState
         from objslam.mapping.joint_solve import solve_joint
+        from objslam.mapping.moves.missed_loops import largest_copy_in
 
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
         state = solve_joint(begin, start)
@@ -72,6 +73,7 @@ def solve(
         assert state.estimate is not None
         association, estimate, rounds = state.association, state.estimate, state.rounds
         doubted, unsettled = state.doubted, state.unsettled
+        copied = 0 if keyframes.localized_every else largest_copy_in(state)
         estimate, added = solve_to_centres(begin, association, estimate)
         if added is not None and added.ranges is not None:
             rays_of_keyframes = added.ranges.apply(rays_of_keyframes, settings)
@@ -83,4 +85,4 @@ def solve(
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     solved = Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)
-    return replace(solved, doubted=doubted, unsettled=unsettled, errors=estimated)
+    return replace(solved, doubted=doubted, unsettled=unsettled, copied=copied, errors=estimated)

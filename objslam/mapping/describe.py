@@ -205,6 +205,7 @@ def summarise(
         "cut_off": _cut_off(rays),
         "doubted_labels": list(solution.doubted),
         "unsettled_objects": solution.unsettled,
+        "copied_objects": solution.copied,
         "uncalibrated": estimate.uncalibrated,
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),

@@ -29,7 +29,7 @@ from objslam.mapping.joint.doubted_labels import (
 from objslam.mapping.joint.held_errors import Solved, with_gross_errors
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.joint.labels import may_be_by_label, scatter_alone
-from objslam.mapping.moves.missed_loops import shows_copies, with_missed_loops
+from objslam.mapping.moves.missed_loops import largest_copy_in, with_missed_loops
 from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
 from objslam.mapping.solution import seen_something
@@ -169,7 +169,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
 
         starts = [lambda: _from_tracks(begin), lambda: _from_start(begin.attempt(), None), along_tracks]
         if np.isfinite(state.rays.range).any():
-            starts = [along_tracks] if not sure else [by_windows] if _shows_copies(state) else []
+            starts = [along_tracks] if not sure else [by_windows] if largest_copy_in(state) else []
         for other_start in starts:  # The first ones take less time.
             if not _unclear(state):
                 break
@@ -224,15 +224,7 @@ def _unclear(state: JointState) -> bool:
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
     agree = state.agree[tracked] if tracked.any() else state.agree
-    return bool(agree.mean() < _CLEAR or noise > _NOISIER) or _shows_copies(state)
-
-
-def _shows_copies(state: JointState) -> bool:
-    """Return whether the map of a state shows the same things at several places (`shows_copies`)."""
-    assert state.association is not None
-    assert state.estimate is not None
-    positions = np.where(state.estimate.solved[:, None], state.estimate.positions, np.nan)
-    return shows_copies(state.rays, state.association, positions, state.solved_poses, state.settings.association)
+    return bool(agree.mean() < _CLEAR or noise > _NOISIER or largest_copy_in(state))
 
 
 def _with_few_rays(state: JointState) -> JointState:

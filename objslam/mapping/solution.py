@@ -94,7 +94,8 @@ class Solution:
     a point. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
     object in the box of each ray. bodies, to_centre and hidden are None if no bodies were solved. doubted: the
     labels that may name one object or several. unsettled: the objects that the last round changed, as in `objects_changed`,
-    although no further round was allowed. errors: the estimated errors, as a function of the measurements. None if none were
+    although no further round was allowed. copied: the objects in the largest part of the map that shows the same things as
+    another part. errors: the estimated errors, as a function of the measurements. None if none were
     estimated. If a held error is gross, it is among them too.
     """
 
@@ -109,6 +110,7 @@ class Solution:
     hidden: Bools | None = None
     doubted: tuple[str, ...] = ()
     unsettled: int = 0
+    copied: int = 0
     errors: SharedErrors | None = None
 
 

@@ -12,12 +12,13 @@ from scipy.stats import chi2
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse
+from objslam.core.noise import NoiseFactors
 from objslam.core.types import Trajectory
 from objslam.frontend.known_errors import shared_errors
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.graph.assembly import Measurements
 from objslam.graph.batch_solver import solve_joint
-from objslam.graph.calibration import correlated_errors, shared_error_jacobian
+from objslam.graph.calibration import correlated_errors, self_calibration, shared_error_jacobian
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.noise_in_instruments import noise_shares
@@ -365,3 +366,12 @@ def test_products_with_instruments_need_no_columns(localized):
     if system.motions is not None:
         back = system.motions.to_rows @ system.motions.to_twist
         np.testing.assert_allclose(back, np.broadcast_to(np.eye(6), back.shape), atol=1e-6)
+
+
+def test_a_noise_with_which_most_rays_disagree_is_refused(monkeypatch):
+    """The rays of things that move can make the estimated noise smaller and smaller, until few rays agree."""
+    made, errors = drive({}, frames=150)
+    monkeypatch.setattr(self_calibration, "estimate_noise", lambda *_: NoiseFactors(rays=0.02))
+    found = solve(made, errors)
+    assert found.noise == errors.noise
+    assert (found.weight > 0).mean() > 0.7

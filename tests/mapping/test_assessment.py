@@ -38,6 +38,7 @@ def test_a_usual_result_is_good() -> None:
         ({"findings": ("rays miss",)}, "check", "The input has an error that the warnings explain (rays miss)."),
         ({"findings": ("noise",)}, "check", "The poses or depths are far noisier than the settings say, and the warnings"),
         ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
+        ({"copied": 7}, "check", "A part of the map with 7 objects looks like another part, at another place"),
         ({"unsettled": 3}, "check", "It is not settled which boxes show which object: the last round of association still"),
         ({"uncalibrated": True}, "check", "The errors that all measurements share could not be estimated"),
         ({"doubted": ("mug", "cup")}, "check", "It is not clear whether mug, cup name one object each, or several."),

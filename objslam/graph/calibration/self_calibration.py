@@ -41,6 +41,10 @@ shared errors."""
 _HALVINGS = 3
 """The most times that a step is halved if it does not lower the cost. A larger number tries shorter steps. If no step lowers
 the cost, the parameters stay as they are."""
+_KEPT = 0.8
+"""A step is halved, or a new noise is refused, if less than this share of the rays that agreed before still agrees after it.
+The rays of things that move fit no place. With them, a solve can move far from the others, and lose one ray after another.
+Right steps of recorded robots kept 0.99, these kept 0.77 and less. A smaller share refuses fewer steps."""
 _NOISE_ROUNDS = 3
 """The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
 _SAME_NOISE = 0.1
@@ -95,12 +99,15 @@ def calibrate(
         if "localization" in errors.unknown_noise:
             noise = noise_of_localization(state, fit.errors.with_noise(noise), theta)
         before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
-        fit = replace(fit, errors=fit.errors.with_noise(noise))
-        state = fit.remeasured(state, theta)
+        other = replace(fit, errors=fit.errors.with_noise(noise))
+        settled = other.remeasured(state, theta)
         if nearly or not same:  # Otherwise, the last solve below settles what little the new noise moves.
-            state = state.fresh().solved().settled()
-            at = fit.shared_errors(state, theta, _CONVERGED, at.noise if noise.like(before, _SAME_SHARES) else None)
-            state, theta, steps, nearly = at.state, at.theta, steps + at.steps, False
+            settled = settled.fresh().solved().settled()
+            if settled.used.sum() < _KEPT * state.used.sum():
+                break
+            at = other.shared_errors(settled, theta, _CONVERGED, at.noise if noise.like(before, _SAME_SHARES) else None)
+            settled, theta, steps, nearly = at.state, at.theta, steps + at.steps, False
+        fit, state = other, settled
         if same:
             break
     if len(theta):
@@ -254,6 +261,7 @@ class _Fit:
             return _Outer(state, theta, linear, system, gradient, information, information + prior, np.asarray(step))
 
         now, history, steps = outer(state, theta, first), list[tuple[Floats, Floats]](), 0
+        fewest = _KEPT * state.used.sum()
         while steps < _ROUNDS and not now.converged(now.step, converged):
             history = [*history[-MEMORY:], (now.theta, now.step)]
             target = accelerated(history, sigma)
@@ -264,7 +272,8 @@ class _Fit:
                 settled = trial.settled()
                 after = outer(settled, other, linearise(settled, errors, other))
                 # The noise of the odometry makes the cost rugged along the clocks. There, the gradient tells more.
-                if now.cost_of_signal(trial.cost + deviation(other), other) <= before or after.left < now.left / 2:
+                lower = now.cost_of_signal(trial.cost + deviation(other), other) <= before or after.left < now.left / 2
+                if lower and settled.used.sum() >= fewest:
                     better = after
                     break
                 target, history = now.theta + (target - now.theta) / 2, []

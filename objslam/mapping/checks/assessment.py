@@ -54,7 +54,8 @@ class Evidence:
     the given poses. findings: the names of the faults of the input. spoilt: whether these faults make positions unreliable.
     frames, late: the camera frames of a log or session, and the frames that a live session dropped because they came too
     late. journal: the file with all messages of a live session, "" without one. doubted: the labels that may name one object
-    or several. unsettled: the objects that the last round of association still changed. uncalibrated: whether the estimation
+    or several. unsettled: the objects that the last round of association still changed. copied: the objects in the largest
+    part of the map that shows the same things as another part. uncalibrated: whether the estimation
     of the shared errors failed. odometry: the largest factor on a noise of the odometry that the log shows. scale: the
     standard deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log
     that is a part of a recording, as in `Log`. odometry_unused: whether the mode was left to the log, and a `fixed` run did
@@ -78,6 +79,7 @@ class Evidence:
     journal: str = ""
     doubted: tuple[str, ...] = ()
     unsettled: int = 0
+    copied: int = 0
     uncalibrated: bool = False
     odometry: float = 1.0
     scale: float | None = None
@@ -124,6 +126,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         journal=summary["log_path"] or "",
         doubted=tuple(summary["doubted_labels"]),
         unsettled=summary.get("unsettled_objects", 0),
+        copied=summary.get("copied_objects", 0),
         uncalibrated=summary.get("uncalibrated", False),
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
         scale=_untold_scale(summary),
@@ -207,6 +210,12 @@ def _check(e: Evidence) -> list[str]:
         found.append(
             "It is not settled which boxes show which object: the last round of association still changed "
             f"{_objects(e.unsettled)}."
+        )
+    if e.copied:
+        found.append(
+            f"A part of the map with {_objects(e.copied)} looks like another part, at another place: the robot probably "
+            "came back there unnoticed. Then the path is bent, and the map shows things twice. Depths, or more labels, "
+            "would show where the robot was."
         )
     if e.uncalibrated:
         found.append("The errors that all measurements share could not be estimated, so the sigmas lack them.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.mapping.exploration.second_exploration import surface_of
-from objslam.mapping.moves.missed_loops import shows_copies
+from objslam.mapping.moves.missed_loops import largest_copy
 
 if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
@@ -27,7 +27,7 @@ def explored(state: JointState, filtered: bool = True) -> tuple[InitialEstimate,
         surface = 0.0 if state.errors is None else surface_of(state.errors, state.theta)
         start = ekf_exploration.explore(state.keyframes, state.rays, state.settings, exploring, state.errors, surface)
         found = start.association, start.positions, start.map_T_camera
-        if ekf_exploration.is_sure(start) and not shows_copies(state.rays, *found, state.settings.association):
+        if ekf_exploration.is_sure(start) and not largest_copy(state.rays, *found, state.settings.association):
             return start, True
     return initialize_unknown(state.keyframes, state.rays, state.cameras, state.settings, exploring), False
 

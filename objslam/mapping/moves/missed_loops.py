@@ -82,15 +82,25 @@ def _with_all_loops(state: JointState) -> JointState:
     return state.better(best)
 
 
-def shows_copies(
+def largest_copy(
     rays: Rays, association: Association, positions: Floats, map_T_camera: Floats, of: AssociationSettings
-) -> bool:
-    """Return whether a part of a map is a copy of another part, at another place, so that a loop was missed.
+) -> int:
+    """Return the number of landmarks in the largest part of a map that is a copy of another part, at another place. Such a
+    map has missed a loop. 0 without a copy.
 
     All rays can agree with such a map. A copy is sure if more than `_BY_CHANCE` landmarks have the relative positions of
     others, with the evidence of a loop (`association.loop_evidence`). positions: (N, 3) m, NaN if unknown. map_T_camera: (K,
     4, 4)."""
-    return len(_copies(*_landmarks(rays, association, positions, map_T_camera, of.min_rays), map_T_camera, of)) > 0
+    copies = _copies(*_landmarks(rays, association, positions, map_T_camera, of.min_rays), map_T_camera, of)
+    return max((len(loop.now) for loop in copies), default=0)
+
+
+def largest_copy_in(state: JointState) -> int:
+    """Return the number of landmarks in the largest copy in the map of a state (`largest_copy`)."""
+    assert state.association is not None
+    assert state.estimate is not None
+    positions = np.where(state.estimate.solved[:, None], state.estimate.positions, np.nan)
+    return largest_copy(state.rays, state.association, positions, state.solved_poses, state.settings.association)
 
 
 def _copies(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, of: AssociationSettings) -> list[Closure]:
