@@ -20,7 +20,7 @@ import time
 from typing import Any
 
 import numpy as np
-from log_parts import without_names
+from log_parts import with_classes, without_names
 
 from objslam.config import load_settings
 from objslam.core.arrays import Floats
@@ -49,6 +49,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, default=8, help="robots of each kind")
     parser.add_argument("--first", type=int, default=0, help="the seed of the first robot")
     parser.add_argument("--unnamed", action="store_true", help="one label for all objects of a robot")
+    parser.add_argument("--classes", type=int, default=0, help="this number of labels for all objects of a robot, by chance")
     options = parser.parse_args()
     settings = load_settings(None, ("mode=joint", "output.recording=false"))
     for kind in options.kinds:
@@ -57,6 +58,7 @@ def main() -> None:
         for seed in range(options.first, options.first + options.robots):
             (log, true), ranged, begin = robot(seed, kind), seed % 2 == 0, time.process_time()
             log = without_names(log) if options.unnamed else log
+            log = with_classes(log, options.classes, seed) if options.classes else log
             try:
                 result = pipeline.run(log, settings, Ledger())
             except ObjslamError as error:
@@ -64,7 +66,7 @@ def main() -> None:
                 continue
             seconds = time.process_time() - begin
             assert log.truth is not None
-            radius = UNNAMED_RADIUS if options.unnamed else RADIUS
+            radius = UNNAMED_RADIUS if options.unnamed or options.classes else RADIUS
             found = evaluate(result.map, log.truth, align="se2", radius=radius).to_dict()
             inside, squared = found["inside_95_3d"] * found["matched"], found["mahalanobis_median"]
             rows[ranged].append(

@@ -206,6 +206,7 @@ def summarise(
         "doubted_labels": list(solution.doubted),
         "unsettled_objects": solution.unsettled,
         "copied_objects": solution.copied,
+        "several_objects_a_label": len({one.label for one in objects}) < len(objects),
         "uncalibrated": estimate.uncalibrated,
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),

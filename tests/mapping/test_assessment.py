@@ -167,3 +167,11 @@ def test_a_hint_at_the_mode_that_uses_the_odometry_too_is_no_doubt() -> None:
     assert hints(log) == 1
     assert hints(log, mode="fixed") == hints(log, mode="joint") == hints(replace(log, odometry=None)) == 0
     assert hints(log, poses={"use": "localization"}) == hints(replace(log, localization=None)) == 0
+
+
+@pytest.mark.parametrize("change", [{"several": False}, {"scale": None}, {"odometry": 2.2}])
+def test_noisy_odometry_is_no_flaw_if_labels_or_depths_hold_the_path(change: dict[str, object]) -> None:
+    bent = replace(GOOD, odometry=5.2, several=True, scale=0.03)
+    assert assess(bent).level == "check"
+    assert assess(bent).reasons[0].startswith("The boxes agree only if the odometry is 5.2 times as noisy")
+    assert assess(replace(bent, **change)).level == "good"
