@@ -1,6 +1,7 @@
 """Measure whether maps are honest on robots whose errors come from hardware, not from the noise model of the package.
 
     python tools/bench_robots.py [--kinds wheels gyro vio slow] [--robots 8] [--first 0] [--unnamed]
+        [--classes 6]
 
 Each robot drives to random points of a room, with stops. wheels: encoders with ticks, wrong radii, a wrong track width, slip
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
@@ -10,7 +11,8 @@ even number measure depths too, of surfaces that are before the centres by 0 to 
 defaults of joint mode. A line for each robot, then for each kind. Then,
 for each parameter of the calibration, the robots whose true value is within 1.96 and within 3 of its standard deviations.
 
-With --unnamed, all objects of a robot have one label, so the map must also find out which box is of which object.
+With --unnamed, all objects of a robot have one label, so the map must also find out which box is of which object. With
+--classes 6, they have six labels by chance, as a detector would give them.
 """
 
 from __future__ import annotations
