@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -108,6 +109,20 @@ def test_poses_that_the_settings_leave_unused_are_no_loss(log):
     assert session.push_odometry(1.0, np.eye(4))
     assert session.counters.accepted() == {"localization not used": 1, "odometry": 1}
     assert not session.counters.dropped()
+
+
+def test_an_object_whose_covariance_is_not_computed_yet_is_not_surer_than_the_path(log, monkeypatch):
+    """The first snapshot of a map has time for one covariance of the graph. The rays alone know nothing of the path."""
+    session = drive(log)
+    state = session._mapper.state
+    exact = {o.id: np.trace(o.covariance) for o in Describer().map(state, whole=True).resolved()}
+    monkeypatch.setattr("objslam.live.session.snapshots._BUDGET", 1.5)
+    monkeypatch.setattr("objslam.live.session.snapshots.time.perf_counter", lambda ticks=count(): float(next(ticks)))
+    soon = {o.id: np.trace(o.covariance) for o in Describer().map(state).resolved()}
+    monkeypatch.undo()
+    session.stop()
+    assert len(soon) >= 10
+    assert np.median([soon[j] / exact[j] for j in soon]) > 0.7
 
 
 @pytest.mark.parametrize("share", [0.5, 0.01, 1e-4])

@@ -12,7 +12,7 @@ from objslam.core.snapshot import CameraFrame, Snapshot
 from objslam.core.types import Trajectory
 from objslam.graph.maps.live_prior_map import covariance_in_map, map_T_graph
 from objslam.live.bodies.description import BodyEstimator
-from objslam.live.mapper.landmark_table import covariances
+from objslam.live.mapper.landmark_table import LandmarkTable, covariances
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 from objslam.live.names.contradicted import contradicted
@@ -39,7 +39,7 @@ class Describer:
         """Return first the landmarks, in the order of ids, and then the tracks with enough rays, as unresolved objects.
 
         After the time budget is spent, objects keep their last description, but landmarks get their present position.
-        New landmarks get a covariance from their rays alone, and new tracks are left out. whole: ignore the time budget.
+        New landmarks get a wide covariance for now (`_for_now`), and new tracks are left out. whole: ignore the time budget.
         """
         end = np.inf if whole else time.perf_counter() + _BUDGET
         m.graph.refresh()
@@ -57,8 +57,8 @@ class Describer:
             before = known.get(j)
             if before is not None and (before[0] == state or time.perf_counter() > end):
                 described, state = replace(before[1], position=points[row]), before[0]
-            elif time.perf_counter() > end:  # a new landmark, for which the rays alone give a covariance for now
-                described = describe_landmark(m, row, points[row], covariances(landmarks, np.array([row]))[0], sure=sure)
+            elif time.perf_counter() > end:
+                described = describe_landmark(m, row, points[row], self._for_now(landmarks, row), sure=sure)
                 state = (-1, -np.inf, sure)
             else:
                 self._covariances[j] = self._covariance(m, j)
@@ -79,6 +79,13 @@ class Describer:
         self._waiting = {number: entry for number, entry in now.items() if entry is not None}
         objects += [replace(o, id=first + i) for i, (_, o) in enumerate(self._waiting.values())]
         return ObjectMap(tuple(objects))
+
+    def _for_now(self, landmarks: LandmarkTable, row: int) -> Floats:
+        """Return a covariance (3, 3), m^2, of a new landmark: from its rays at the present path, plus the widest one that is
+        known from the graph. So the error of the path is not left out."""
+        alone = covariances(landmarks, np.array([row]))[0]
+        known = [self._covariances[j] for j in landmarks.id.tolist() if j in self._covariances]
+        return alone + max(known, key=np.trace, default=np.zeros((3, 3)))
 
     def _covariance(self, m: MapState, j: int) -> Floats:
         """Return the covariance (3, 3), m^2, of landmark j, along the axes of the session.
