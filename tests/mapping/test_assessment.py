@@ -175,3 +175,9 @@ def test_noisy_odometry_is_no_flaw_if_labels_or_depths_hold_the_path(change: dic
     assert assess(bent).level == "check"
     assert assess(bent).reasons[0].startswith("The boxes agree only if the odometry is 5.2 times as noisy")
     assert assess(replace(bent, **change)).level == "good"
+
+
+def test_noisy_odometry_is_said_beside_other_reasons() -> None:
+    found = assess(replace(GOOD, odometry=5.2, several=True, scale=0.03, misses=3.0))
+    assert found.level == "check"
+    assert sum("5.2 times as noisy" in reason for reason in found.reasons) == 1

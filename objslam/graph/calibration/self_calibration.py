@@ -44,7 +44,8 @@ the cost, the parameters stay as they are."""
 _KEPT = 0.8
 """A step is halved, or a new noise is refused, if less than this share of the rays that agreed before still agrees after it.
 The rays of things that move fit no place. With them, a solve can move far from the others, and lose one ray after another.
-Right steps of recorded robots kept 0.99, these kept 0.77 and less. A smaller share refuses fewer steps."""
+Right steps of recorded robots kept 0.99, and wrong ones of a robot among others 0.77 and less. A smaller share refuses fewer
+steps."""
 _NOISE_ROUNDS = 3
 """The most estimations of the noise, each followed by a solve with it. Later rounds are slower and change the noise less."""
 _SAME_NOISE = 0.1

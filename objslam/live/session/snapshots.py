@@ -39,16 +39,17 @@ class Describer:
         """Return first the landmarks, in the order of ids, and then the tracks with enough rays, as unresolved objects.
 
         After the time budget is spent, objects keep their last description, but landmarks get their present position.
-        New landmarks get a wide covariance for now (`_for_now`), and new tracks are left out. whole: ignore the time budget.
+        New landmarks get a covariance from their rays and the widest one of the others for now, and new tracks are left out.
+        whole: ignore the time budget.
         """
         end = np.inf if whole else time.perf_counter() + _BUDGET
         m.graph.refresh()
         if self._tied != (map_T_graph(m.graph) is not None):
-            self._tied, self._described = not self._tied, {}
+            self._tied, self._described, self._covariances = not self._tied, {}, {}
         landmarks, known = m.landmarks, self._described
         points = m.graph.points(landmarks.id)
         found: dict[int, tuple[tuple[int, float, bool], MapObject]] = {}
-        against = contradicted(m)
+        against, widest = contradicted(m), None
         order = np.argsort([known[j][0][1] if j in known else -np.inf for j in landmarks.id.tolist()], kind="stable")
         for row in order.tolist():
             j = int(landmarks.id[row])
@@ -58,7 +59,9 @@ class Describer:
             if before is not None and (before[0] == state or time.perf_counter() > end):
                 described, state = replace(before[1], position=points[row]), before[0]
             elif time.perf_counter() > end:
-                described = describe_landmark(m, row, points[row], self._for_now(landmarks, row), sure=sure)
+                widest = self._widest(landmarks) if widest is None else widest
+                alone = covariances(landmarks, np.array([row]))[0]
+                described = describe_landmark(m, row, points[row], alone + widest, sure=sure)
                 state = (-1, -np.inf, sure)
             else:
                 self._covariances[j] = self._covariance(m, j)
@@ -80,12 +83,11 @@ class Describer:
         objects += [replace(o, id=first + i) for i, (_, o) in enumerate(self._waiting.values())]
         return ObjectMap(tuple(objects))
 
-    def _for_now(self, landmarks: LandmarkTable, row: int) -> Floats:
-        """Return a covariance (3, 3), m^2, of a new landmark: from its rays at the present path, plus the widest one that is
-        known from the graph. So the error of the path is not left out."""
-        alone = covariances(landmarks, np.array([row]))[0]
+    def _widest(self, landmarks: LandmarkTable) -> Floats:
+        """Return the widest covariance (3, 3), m^2, of a landmark that is known from the graph, 0 without one. The rays of a
+        new landmark leave out the error of the path, which this one contains."""
         known = [self._covariances[j] for j in landmarks.id.tolist() if j in self._covariances]
-        return alone + max(known, key=np.trace, default=np.zeros((3, 3)))
+        return max(known, key=np.trace, default=np.zeros((3, 3)))
 
     def _covariance(self, m: MapState, j: int) -> Floats:
         """Return the covariance (3, 3), m^2, of landmark j, along the axes of the session.

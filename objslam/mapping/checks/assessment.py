@@ -33,7 +33,7 @@ _NAMED = 3.0
 """An assessment names the noise of the odometry if it is at least this multiple of the settings. Nine tenths of its variance
 are then not in the settings. The cause may be wheels that slip, or a path that was bent to make one object of two things.
 From bearings alone, with several objects for a label, the result then needs a look: right maps of simulated robots have at
-most 2.2, wrong maps of recorded ones 5 and more. With ranges, a right map of a recorded robot has 5.0. A larger value names
+most 1.7, wrong maps of recorded ones 5 and more. With ranges, a right map of a recorded robot has 5.0. A larger value names
 it less often."""
 _FEW = 60
 """A result needs a look if it has fewer rays than this. The checks of the input do not judge fewer boxes. A larger value
@@ -210,7 +210,7 @@ def _check(e: Evidence) -> list[str]:
             f"The boxes agree only if the odometry is {e.odometry:.0f} times as noisy as the settings say: it may slip, or "
             "the camera may turn on the robot (camera_poses)."
         )
-    elif _may_be_bent(e):
+    if _may_be_bent(e):
         found.append(
             f"The boxes agree only if the odometry is {e.odometry:.1f} times as noisy as the settings say, and labels do "
             "not tell which box shows which object. So the path may be bent, and an object may be two things. Depths would "
@@ -256,7 +256,7 @@ def _check(e: Evidence) -> list[str]:
 
 def _may_be_bent(e: Evidence) -> bool:
     """Return whether the path may be bent to a wrong association. One object for each label prevents this, or depths."""
-    return e.scale is not None and e.several and e.odometry >= _NAMED
+    return e.scale is not None and e.several and _NAMED <= e.odometry < _LOOSE
 
 
 def _objects(count: int) -> str:

@@ -91,6 +91,8 @@ def largest_copy(
     All rays can agree with such a map. A copy is sure if more than `_BY_CHANCE` landmarks have the relative positions of
     others, with the evidence of a loop (`association.loop_evidence`). positions: (N, 3) m, NaN if unknown. map_T_camera: (K,
     4, 4)."""
+    if len(np.unique(association.label)) == association.count:  # Of each label there is one object.
+        return 0
     copies = _copies(*_landmarks(rays, association, positions, map_T_camera, of.min_rays), map_T_camera, of)
     return max((len(loop.now) for loop in copies), default=0)
 
