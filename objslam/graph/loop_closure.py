@@ -42,6 +42,8 @@ drive). Larger values propose more loops, and a solve judges each."""
 _CUTS = 20
 """The most keyframes that divide a path into a part before a missed loop and a part after it. Most keyframes near a loop
 show it, so few are enough. A larger number takes longer."""
+SEARCHES = _CUTS * len(_BENDS)
+"""The most searches for a missed loop in a solved path. Each of them may find a loop by chance."""
 
 
 @dataclass

@@ -7,12 +7,13 @@ import pytest
 from log_parts import without_names
 from turning_drive import errors_of
 
+from objslam.config import AssociationSettings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, inverse
-from objslam.core.types import Association
+from objslam.core.types import Association, Rays
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.moves import missed_loops
-from objslam.mapping.moves.missed_loops import largest_copy_in, with_missed_loops
+from objslam.mapping.moves.missed_loops import largest_copy, largest_copy_in, with_missed_loops
 from objslam.simulation import preset, simulate
 
 SLIP = np.array([0.0, 0.0, np.radians(25), 0.3, -0.2, 0.0])
@@ -81,3 +82,37 @@ def test_copies_of_the_first_lap_are_noticed(laps, apart):
 def test_a_map_without_missed_loops_stays(laps):
     state = solved(laps, apart=False)
     assert with_missed_loops(state) is state
+
+
+def test_trees_that_stand_by_chance_like_others_are_no_copies():
+    """A robot drives through a wood in five lanes, with ranges. It sees each tree once, for twenty frames.
+
+    There are many trees and many places, so fifteen of them stand like others, with log odds of 8.3 for a single place."""
+    trees, size, seen = 100, 200.0, 20
+    place = np.random.default_rng(3).uniform(0.0, size, (trees, 2))
+    path = np.tile(np.eye(4), (5 * int(size), 1, 1))
+    lane, along = np.divmod(np.arange(len(path)), int(size))
+    path[:, 0, 3] = np.where(lane % 2, size - along, along)
+    path[:, 1, 3] = (lane + 0.5) * size / 5
+    nearest = np.linalg.norm(place[:, None] - path[:, :2, 3], axis=2).argmin(axis=1)
+    keyframe = np.clip(nearest[:, None] + np.arange(seen) - seen // 2, 0, len(path) - 1).ravel()
+    order = np.argsort(keyframe, kind="stable")
+    keyframe, owner = keyframe[order], np.repeat(np.arange(trees), seen)[order]
+    way = np.pad(place[owner] - path[keyframe, :2, 3], ((0, 0), (0, 1)))
+    distance, every = np.linalg.norm(way, axis=1), np.ones(len(keyframe))
+    label = np.zeros(len(keyframe), dtype=np.int64)
+    rays = Rays(
+        keyframe,
+        way / distance[:, None],
+        0.01 * every,
+        distance,
+        0.5 * every,
+        0.0 * every,
+        label,
+        every,
+        np.zeros((len(keyframe), 4)),
+        label - 1,
+        ("tree",),
+    )
+    of_tree = Association(owner, np.zeros(trees, dtype=np.int64))
+    assert largest_copy(rays, of_tree, np.pad(place, ((0, 0), (0, 1))), path, AssociationSettings()) == 0

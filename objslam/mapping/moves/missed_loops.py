@@ -89,8 +89,7 @@ def largest_copy(
     map has missed a loop. 0 without a copy.
 
     All rays can agree with such a map. A copy is sure if more than `_BY_CHANCE` landmarks have the relative positions of
-    others, with the evidence of a loop (`association.loop_evidence`). positions: (N, 3) m, NaN if unknown. map_T_camera: (K,
-    4, 4)."""
+    others, with the evidence of a loop (`_copies`). positions: (N, 3) m, NaN if unknown. map_T_camera: (K, 4, 4)."""
     if len(np.unique(association.label)) == association.count:  # Of each label there is one object.
         return 0
     copies = _copies(*_landmarks(rays, association, positions, map_T_camera, of.min_rays), map_T_camera, of)
@@ -106,11 +105,14 @@ def largest_copy_in(state: JointState) -> int:
 
 
 def _copies(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, of: AssociationSettings) -> list[Closure]:
-    """Return the loops that copies show, with the most evidence first. middle: (N,), map_T_camera: (K, 4, 4)."""
-    from objslam.graph.loop_closure import find_missed_closures
+    """Return the loops that copies show, with the most evidence first. middle: (N,), map_T_camera: (K, 4, 4).
 
-    found = find_missed_closures(landmarks, middle, map_T_camera)
-    return [loop for loop in found if len(loop.now) > _BY_CHANCE and loop.evidence >= of.loop_evidence]
+    The best of many places is looked for, and some place fits by chance. So the evidence must be larger than that of one
+    loop (`association.loop_evidence`) by the logarithm of the number of places (Bonferroni)."""
+    from objslam.graph.loop_closure import SEARCHES, find_missed_closures
+
+    found, enough = find_missed_closures(landmarks, middle, map_T_camera), of.loop_evidence + np.log(SEARCHES)
+    return [loop for loop in found if len(loop.now) > _BY_CHANCE and loop.evidence >= enough]
 
 
 def _with_rounds(state: JointState) -> JointState:
