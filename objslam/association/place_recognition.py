@@ -31,6 +31,9 @@ costs time."""
 _HYPOTHESES = 2000  # The most hypotheses of two pairs, those with the longest bases. A larger number costs time.
 _VERIFIED = 20  # The number of hypotheses with the best quick scores that get an assignment. A larger number costs time.
 _GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
+_ROWS_AT_ONCE = 64
+"""The number of pairs that are combined with all later pairs at once. With a larger number, the arrays do not fit into the
+cache of a processor."""
 _MIN_BASE = 0.3
 """The least distance (m) between two landmarks that determine a heading. A larger distance leaves fewer hypotheses of two
 pairs."""
@@ -181,15 +184,19 @@ def _seeds(problem: _Problem, a: Ints, b: Ints) -> Ints:
     """Return hypotheses (H, 2, 2) of two pairs each. Either the distance between the two landmarks `here` fits the distance
     between the two landmarks `there`, or both pairs are the same."""
     single = np.stack([np.arange(len(a))] * 2, axis=1)
-    i, j = np.triu_indices(len(a), 1)
-    differ = (a[i] != a[j]) & (b[i] != b[j])
-    i, j = i[differ], j[differ]
-    one = np.linalg.norm(problem.offset[a[i], :2] - problem.offset[a[j], :2], axis=1)
-    two = np.linalg.norm(problem.target[b[i], :2] - problem.target[b[j], :2], axis=1)
-    fits = (np.abs(one - two) <= 3 * np.hypot(problem.spread[a[i], b[i]], problem.spread[a[j], b[j]])) & (one > _MIN_BASE)
-    i, j = i[fits], j[fits]
+    here, there = (np.linalg.norm(p[:, None, :2] - p[None, :, :2], axis=2) for p in (problem.offset, problem.target))
+    variance = (3 * problem.spread[a, b]) ** 2
+    found = []
+    for begin in range(0, len(a), _ROWS_AT_ONCE):
+        rows, later = slice(begin, begin + _ROWS_AT_ONCE), slice(begin, None)
+        one, two = here[a[rows]][:, a[later]], there[b[rows]][:, b[later]]
+        fits = (one - two) ** 2 <= variance[rows, None] + variance[later]
+        fits &= (one > _MIN_BASE) & (b[rows, None] != b[later])
+        i, j = np.nonzero(np.triu(fits, 1))
+        found.append(np.stack([i, j]) + begin)
+    i, j = np.concatenate(found, axis=1)
     if len(i) > _HYPOTHESES:  # A longer base determines the heading better.
-        longest = np.argsort(-one[fits], kind="stable")[:_HYPOTHESES]
+        longest = np.argsort(-here[a[i], a[j]], kind="stable")[:_HYPOTHESES]
         i, j = i[longest], j[longest]
     pairs = np.concatenate([single, np.stack([i, j], axis=1)])
     return np.stack([a[pairs], b[pairs]], axis=2)
