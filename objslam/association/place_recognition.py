@@ -33,7 +33,7 @@ _VERIFIED = 20  # The number of hypotheses with the best quick scores that get a
 _GAINS_AT_ONCE = 200_000  # The most gains computed together. A larger value needs more memory.
 _ROWS_AT_ONCE = 64
 """The number of pairs that are combined with all later pairs at once. With a larger number, the arrays do not fit into the
-cache of a processor."""
+cache of a processor: 256 took 1.5 times as long as 64, and 1024 took 2.8 times as long. 16 took as long as 64."""
 _MIN_BASE = 0.3
 """The least distance (m) between two landmarks that determine a heading. A larger distance leaves fewer hypotheses of two
 pairs."""

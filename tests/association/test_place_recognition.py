@@ -59,6 +59,23 @@ def test_a_moved_constellation_is_found_among_others(seed):
     assert abs(np.arctan2(off[1, 0], off[0, 0])) < 0.05
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_moved_constellation_is_found_behind_many_new_landmarks(seed):
+    """The landmarks of this place are the last of all, so their pairs come after hundreds of others."""
+    rng = np.random.default_rng(seed)
+    points, labels = constellation(rng, 30, labels=1, size=20.0)
+    mine = np.flatnonzero(np.hypot(*(points[:, :2] - PIVOT).T) < 7)
+    seen, correction = moved(points[mine], np.array([0.8, -0.7, 0.9]))
+    new = constellation(rng, 12, size=20.0)[0] + [40.0, 0.0, 0.0]
+    here = of(np.concatenate([new, seen]), np.zeros(len(new) + len(mine), dtype=np.int64))
+    there = of(points, labels)
+    wide = np.diag([15.0, 15.0, 0.5]) ** 2
+    found = recognise_place(here, there, PIVOT, wide, density(here, there, 24.0), everything(here, there))
+    assert found is not None
+    assert {(i + len(new), int(j)) for i, j in enumerate(mine)} <= set(map(tuple, found.pairs.tolist()))
+    np.testing.assert_allclose(found.correction, correction, atol=0.1)
+
+
 def test_other_places_are_not_taken_for_this_one():
     taken = 0
     for seed in range(40):

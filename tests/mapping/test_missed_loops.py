@@ -87,7 +87,7 @@ def test_a_map_without_missed_loops_stays(laps):
 def test_trees_that_stand_by_chance_like_others_are_no_copies():
     """A robot drives through a wood in five lanes, with ranges. It sees each tree once, for twenty frames.
 
-    There are many trees and many places, so fifteen of them stand like others, with log odds of 8.3 for a single place."""
+    There are many trees and many places, so fifteen of them stand like others, with log odds of 10.5 in one search."""
     trees, size, seen = 100, 200.0, 20
     place = np.random.default_rng(3).uniform(0.0, size, (trees, 2))
     path = np.tile(np.eye(4), (5 * int(size), 1, 1))

@@ -107,8 +107,8 @@ def largest_copy_in(state: JointState) -> int:
 def _copies(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, of: AssociationSettings) -> list[Closure]:
     """Return the loops that copies show, with the most evidence first. middle: (N,), map_T_camera: (K, 4, 4).
 
-    The best of many places is looked for, and some place fits by chance. So the evidence must be larger than that of one
-    loop (`association.loop_evidence`) by the logarithm of the number of places (Bonferroni)."""
+    Of many searches, one may find a loop by chance. So the evidence must be larger than for a loop of a single search
+    (`association.loop_evidence`), by the logarithm of the number of searches (Bonferroni)."""
     from objslam.graph.loop_closure import SEARCHES, find_missed_closures
 
     found, enough = find_missed_closures(landmarks, middle, map_T_camera), of.loop_evidence + np.log(SEARCHES)
