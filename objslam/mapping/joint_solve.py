@@ -29,6 +29,7 @@ from objslam.mapping.joint.doubted_labels import (
 from objslam.mapping.joint.held_errors import Solved, with_gross_errors
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.joint.labels import may_be_by_label, scatter_alone
+from objslam.mapping.joint.relocalization import relocalized
 from objslam.mapping.moves.missed_loops import largest_copy_in, with_missed_loops
 from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
@@ -143,7 +144,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve from a known start, or from an exploration of the log."""
     if start is not None or state.keyframes.localized_every:
         doubtful = begins_with_lasting_errors(state)
-        found = _improved(_from_start(state, start), JointState.relocalized)
+        found = _improved(_from_start(state, start), relocalized)
         state = _or_as_in_fixed_mode(state, found) if start is None else found
         if doubtful or has_lasting_errors(state):
             state = _anew(state.split())
@@ -193,7 +194,7 @@ def _settled(state: JointState) -> JointState:
 
 def _searched(state: JointState) -> JointState:
     """Return the state after searches for a more likely path through its map, and for loops that it missed."""
-    return with_missed_loops(_improved(state, JointState.relocalized))
+    return with_missed_loops(_improved(state, relocalized))
 
 
 def _from_tracks(begin: JointState) -> JointState:

@@ -13,8 +13,9 @@ from objslam.core.types import Association, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
-from objslam.mapping.joint import joint_alternation
+from objslam.mapping.joint import relocalization
 from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.joint.relocalization import relocalized
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import objects_changed, seen_something
 from objslam.simulation import DepthNoise, preset, simulate
@@ -40,7 +41,7 @@ def test_the_end_of_a_drive_finds_its_objects_again_after_a_turn_of_the_odometry
     first = state.alternated(mine.map_T_base, None).association
     cut = state.solve("association", replace(first, object=np.where(early, first.object, -1)))
     plain = cut.alternated(cut.estimate.map_T_base, (cut.association, cut.estimate.positions))
-    followed = cut.relocalized()
+    followed = relocalized(cut)
     assert followed.association.count == 8
     assert followed.agree.all()
     assert plain.agree.mean() < 0.95
@@ -61,7 +62,7 @@ def taking_turns(monkeypatch, turns, errors=None):
         estimate = SimpleNamespace(log_evidence=held_rays, map_T_base=np.eye(4)[None], **placed)
         return replace(state, association=association, estimate=estimate)
 
-    monkeypatch.setattr(JointState, "_associate", lambda state, *_, rough: turns[len(state.rounds)])
+    monkeypatch.setattr(JointState, "associated", lambda state, *_, rough: turns[len(state.rounds)])
     monkeypatch.setattr(JointState, "merged", lambda state: state)
     monkeypatch.setattr(JointState, "solve", solve)
     return replace(begin, association=Association(np.full(30, -1), np.zeros(0, dtype=np.int64))), held
@@ -147,10 +148,10 @@ def along_paths(monkeypatch):
         solve, value = JointState.solve, {one.count: evidence for one, evidence in zip(names, evidences, strict=True)}
         monkeypatch.setattr(JointState, "explained", property(lambda state: value[state.association.count]))
         monkeypatch.setattr(JointState, "_explained_like", lambda state, other: state.explained)
-        monkeypatch.setattr(JointState, "_associate", lambda state, *_, rough: names[state.association.count])
+        monkeypatch.setattr(JointState, "associated", lambda state, *_, rough: names[state.association.count])
         monkeypatch.setattr(JointState, "alternated", lambda state, *_: state)
-        monkeypatch.setattr(joint_alternation, "relocalize", lambda *_: (np.eye(4)[None], None))
-        monkeypatch.setattr(joint_alternation, "rays_moved", lambda *_: 30)
+        monkeypatch.setattr(relocalization, "relocalize", lambda *_: (np.eye(4)[None], None))
+        monkeypatch.setattr(relocalization, "rays_moved", lambda *_: 30)
         keyframes = SimpleNamespace(base_T_camera=np.eye(4)[None], odom_T_base=np.eye(4)[None], localized_every=0.0)
         return solve(replace(begin, keyframes=keyframes, rays=range(30)), "association", names[0], None), held
 
@@ -170,7 +171,7 @@ def test_rounds_along_the_path_end_after_two_worse_ones_and_the_best_counts(alon
     """Every second round holds the shared errors. They are estimated once more if the best round held them."""
     begin, held = along_paths(evidences)
     held.clear()
-    found = begin.relocalized()
+    found = relocalized(begin)
     assert found.explained == expected
     assert not found.hold
     assert held == solves

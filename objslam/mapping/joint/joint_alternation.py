@@ -19,7 +19,6 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.joint.merge_and_split import merge_unseen_together, split_at_gaps
-from objslam.mapping.joint.relocalization import relocalize
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import objects_changed, rays_moved, without_errors
 
@@ -31,16 +30,9 @@ _SOLVED_XY, _SOLVED_YAW = 0.02, 0.005
 _FIRST = 2.0
 """The factor on `_SOLVED_XY` and `_SOLVED_YAW` before the first solve, and on a path from a grid. A larger factor tolerates
 larger residuals."""
-_STILL = 0.01
-"""The rounds along the most likely path stop when at most this share of the rays changes its object. A larger share stops
-them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
 _RUINED = 200.0
 """If the log odds of the best round over the last round are at least this, the best round counts, not the last. A merge that
 is right may first cost 80, and ruined maps cost 500 to 5000. With a larger value, a worse map may stay."""
-_WORSE = 2
-"""The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
-takes longer, but gets over more rounds in which close objects merge."""
-
 Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
 
@@ -136,7 +128,7 @@ class JointState:
         held = False  # Whether the last solve held the shared errors.
         for number in range(self.settings.joint.max_rounds):
             self.progress(f"association, round {number + 1}", 0, 0)
-            found = state._associate(map_T_base, guess, rough=not state.rounds)
+            found = state.associated(map_T_base, guess, rough=not state.rounds)
             state, key = state.counted(found), found.object.tobytes()
             same = state.rounds[-1]["rays_changed"] == 0
             if same or key in earlier:
@@ -196,47 +188,6 @@ class JointState:
             assert chosen.estimate is not None
             self.trace.end_round("association", chosen.association, chosen.estimate)
         return replace(chosen, rounds=self.rounds, unsettled=0)
-
-    def relocalized(self) -> Self:
-        """Do rounds along the most likely path through the map. Return the new state if it is `better`, else this one.
-
-        The rounds of `alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each round
-        here begins with another path. It is the most likely one if any ray may belong to any landmark. Every second round
-        holds the shared errors and the noise, because one round changes them little.
-        """
-        if self.keyframes.odom_T_base is None or self.keyframes.localized_every:
-            return self
-        state, worse = self.attempt(), 0
-        best = state
-        for number in range(self.settings.joint.max_rounds):
-            self.progress(f"most likely path, round {number + 1}", 0, 0)
-            assert state.association is not None
-            assert state.estimate is not None
-            before = state.association
-            found = relocalize(state.keyframes, state.rays, state.cameras, state.settings, before, state.estimate)
-            if found is None:
-                break
-            path, objects = found
-            association = state._associate(path, (objects, state.estimate.positions), rough=True)
-            if rays_moved(before.object, association.object) <= _STILL * len(state.rays):
-                break
-            start = path @ state.keyframes.base_T_camera
-            state = replace(state, hold=self.hold or (self.errors is not None and number % 2 == 1))
-            state = state.counted(association).solve("association", association, start).merged()
-            # Close objects may merge in one round, and part again.
-            best, worse = (state, 0) if state.explained > best.explained else (best, worse + 1)
-            if worse == _WORSE:
-                break
-        if best.association is self.association:
-            return self
-        if best.hold != self.hold:
-            best = best.released(self.hold)
-        assert best.association is not None
-        assert best.estimate is not None
-        turns = best.alternated(best.estimate.map_T_base, (best.association, best.estimate.positions))
-        if turns.explained < best.explained:
-            turns = replace(turns.continued_from(best), unsettled=turns.unsettled)
-        return self.better(turns)
 
     def split(self) -> Self:
         """Split the objects that may be two. Return the new state if it is `better`, else this one.
@@ -324,7 +275,9 @@ class JointState:
         at = correct_poses(frames.stamps, frames.map_T_base, mine.stamps, mine.map_T_base, map_T_base)
         return frames, rays, at @ frames.base_T_camera
 
-    def _associate(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
+    def associated(self, map_T_base: Floats, guess: Guess | None, *, rough: bool) -> Association:
+        """Return an association of the rays at poses map_T_base (K, 4, 4). guess: it begins there. rough: whether the poses
+        are not those of a solve, so that residuals are larger."""
         from objslam.association.global_association import associate_globally
         from objslam.association.observations import PosedRays
         from objslam.graph.fixed_pose_triangulation import noise_of_poses, noise_up

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,9 +15,60 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.camera import Camera
 from objslam.core.types import Association, Keyframes, Rays
+from objslam.mapping.solution import rays_moved
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
+    from objslam.mapping.joint.joint_alternation import JointState
+
+_STILL = 0.01
+"""The rounds along the most likely path stop when at most this share of the rays changes its object. A larger share stops
+them sooner. The share is not zero, because the path is rounded to a grid, so that a few rays change in every round."""
+_WORSE = 2
+"""The rounds along the most likely path end after this number of consecutive rounds without improvement. A larger number
+takes longer, but gets over more rounds in which close objects merge."""
+
+
+def relocalized(begin: JointState) -> JointState:
+    """Do rounds along the most likely path through the map. Return the new state if it is `better`, else the given one.
+
+    The rounds of `JointState.alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each
+    round here begins with another path. It is the most likely one if any ray may belong to any landmark. Every second round
+    holds the shared errors and the noise, because one round changes them little.
+    """
+    if begin.keyframes.odom_T_base is None or begin.keyframes.localized_every:
+        return begin
+    state, worse = begin.attempt(), 0
+    best = state
+    for number in range(begin.settings.joint.max_rounds):
+        begin.progress(f"most likely path, round {number + 1}", 0, 0)
+        assert state.association is not None
+        assert state.estimate is not None
+        before = state.association
+        found = relocalize(state.keyframes, state.rays, state.cameras, state.settings, before, state.estimate)
+        if found is None:
+            break
+        path, objects = found
+        association = state.associated(path, (objects, state.estimate.positions), rough=True)
+        if rays_moved(before.object, association.object) <= _STILL * len(state.rays):
+            break
+        start = path @ state.keyframes.base_T_camera
+        state = replace(state, hold=begin.hold or (begin.errors is not None and number % 2 == 1))
+        state = state.counted(association).solve("association", association, start).merged()
+        # Close objects may merge in one round, and part again.
+        best, worse = (state, 0) if state.explained > best.explained else (best, worse + 1)
+        if worse == _WORSE:
+            break
+    if best.association is begin.association:
+        return begin
+    if best.hold != begin.hold:
+        best = best.released(begin.hold)
+    assert best.association is not None
+    assert best.estimate is not None
+    turns = best.alternated(best.estimate.map_T_base, (best.association, best.estimate.positions))
+    if turns.explained < best.explained:
+        turns = replace(turns.continued_from(best), unsettled=turns.unsettled)
+    return begin.better(turns)
 
 
 def relocalize(
