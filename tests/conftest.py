@@ -114,10 +114,10 @@ def pytest_collection_finish() -> None:
 def one_start() -> Iterator[None]:
     """No map of a joint solve is tried from other starts, as unclear maps are. Other starts take most of the time of a test
     that asks what the first start finds, and can hide that it finds nothing."""
-    from objslam.mapping import joint_solve
+    from objslam.mapping import several_starts
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(joint_solve, "_unclear", lambda state: False)
+        patch.setattr(several_starts, "_unclear", lambda state: False)
         yield
 
 

@@ -27,7 +27,7 @@ import objslam
 from objslam import ObjectMap
 from objslam.cli.commands import build_app
 from objslam.config import Settings, load_settings
-from objslam.mapping import joint_solve
+from objslam.mapping import several_starts
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -150,7 +150,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert "Traceback" not in done.err
             if text.startswith("objslam demo --boxes"):
                 thinned(folder / "demo_boxes" / "log" / "detections.jsonl")
-                patch.setattr(joint_solve, "_unclear", lambda state: False)  # As `one_start` does.
+                patch.setattr(several_starts, "_unclear", lambda state: False)  # As `one_start` does.
     return folder
 
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.core.geometry import inverse
 from objslam.errors import SolveError
-from objslam.frontend.tracks import associate_tracks
 from objslam.frontend.turning_clocks import clocks_of_turns
-from objslam.mapping.exploration.errors_of_tracks import along, with_errors_of_tracks
-from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
-from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
+from objslam.mapping.exploration.second_exploration import finds_same_objects
 from objslam.mapping.fixed.camera_calibration import associate_at_poses
 from objslam.mapping.fixed.fixed_poses import FixedPoses
 from objslam.mapping.joint.by_label import at_other_labels, by_label
@@ -30,21 +25,13 @@ from objslam.mapping.joint.held_errors import Solved, with_gross_errors
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.joint.labels import may_be_by_label, scatter_alone
 from objslam.mapping.joint.relocalization import relocalized
-from objslam.mapping.moves.missed_loops import largest_copy_in, with_missed_loops
 from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
+from objslam.mapping.several_starts import from_several_starts, from_start, improved
 from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
     from objslam.graph.init_unknown_correspondences import InitialEstimate
-
-_CLEAR = 0.98
-"""The least share of agreeing rays of a clear map, among the rays of tracks. With a larger share, more logs are tried from
-other starts, which takes time. Of 15 simulated robots, right maps had 0.983 and more, and most maps with doubles at most
-0.963. A bent map of a real robot, with ranges, had 0.976."""
-_NOISIER = 1.5
-"""The largest factor on the noise of rays of a clear map. Rays that are given to wrong objects make it large: 12 in a
-simulated map with doubles. With a smaller factor, more logs are tried from other starts."""
 
 
 def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
@@ -144,38 +131,15 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve from a known start, or from an exploration of the log."""
     if start is not None or state.keyframes.localized_every:
         doubtful = begins_with_lasting_errors(state)
-        found = _improved(_from_start(state, start), relocalized)
+        found = improved(from_start(state, start), relocalized)
         state = _or_as_in_fixed_mode(state, found) if start is None else found
         if doubtful or has_lasting_errors(state):
             state = _anew(state.split())
             if state.keyframes.odom_T_base is not None:  # It tells the motions of the path through a map without phantoms.
                 state = without_phantoms(state)
     else:
-        begin, path = with_errors_of_tracks(state)
-        start, sure = explored(begin)
-        first = _from_start(*solved_if_sure(begin, start, sure))
-        state = _searched(first)
-        noisier = with_loose_odometry(first, begin.theta, sure)
-        if noisier is not None:
-            other, sure = explored(noisier)
-            if not finds_same_objects(state, other.association):
-                attempt = _from_start(*solved_if_sure(noisier, other, sure))
-                state = state.better(_searched(attempt))
-
-        def along_tracks() -> JointState:
-            return _from_start(begin.attempt(), explored(along(begin, path))[0])
-
-        def by_windows() -> JointState:
-            return _from_start(begin.attempt(), explored(begin, filtered=False)[0])
-
-        starts = [lambda: _from_tracks(begin), lambda: _from_start(begin.attempt(), None), along_tracks]
-        if np.isfinite(state.rays.range).any():
-            starts = [along_tracks] if not sure else [by_windows] if largest_copy_in(state) else []
-        for other_start in starts:  # The first ones take less time.
-            if not _unclear(state):
-                break
-            state = _or_from(other_start, state)
-        state = _improved(state, JointState.split)
+        state = from_several_starts(state)
+        state = improved(state, JointState.split)
     return _settled(state)
 
 
@@ -190,42 +154,6 @@ def _settled(state: JointState) -> JointState:
         state = replace(state, hold=False).solve("association", state.association, state.solved_poses).merged()
     # The search for objects from few rays leaves out the rays of dropped objects.
     return without_moving_things(_with_few_rays(associated_at_rest(state)))
-
-
-def _searched(state: JointState) -> JointState:
-    """Return the state after searches for a more likely path through its map, and for loops that it missed."""
-    return with_missed_loops(_improved(state, relocalized))
-
-
-def _from_tracks(begin: JointState) -> JointState:
-    """Return the state after a solve of the tracks of boxes as landmarks, and closures of the loops between them.
-
-    No gate of an exploration takes part, so this finds the drives of wheels that slip more than their odometry says."""
-    found = associate_tracks(begin.keyframes, begin.rays)
-    return with_missed_loops(begin.attempt().counted(found).solve("association", found))
-
-
-def _or_from(start: Callable[[], JointState], state: JointState) -> JointState:
-    """Return the state from another start if it explains the log better, else the given state. If nothing can be solved from
-    that start, the given state is returned."""
-    try:
-        attempt = _searched(start())
-    except SolveError:  # The map of the state is there, whatever is wrong with the other start.
-        return state
-    return state.better(attempt)
-
-
-def _unclear(state: JointState) -> bool:
-    """Return whether a map may be wrong, so that other starts are worth their time.
-
-    An exploration goes wrong by chance, so another start may be right. The false boxes of a detector agree with no object in
-    the best of maps, but they are single boxes. So only the rays of tracks are judged, if there are any. All rays may agree
-    with a map that shows the same things at several places. Copies of their relative positions then tell.
-    """
-    noise = 1.0 if state.errors is None else state.errors.noise.rays
-    tracked = associate_tracks(state.keyframes, state.rays).object >= 0
-    agree = state.agree[tracked] if tracked.any() else state.agree
-    return bool(agree.mean() < _CLEAR or noise > _NOISIER or largest_copy_in(state))
 
 
 def _with_few_rays(state: JointState) -> JointState:
@@ -273,13 +201,6 @@ def _with_noise_of_poses(state: JointState) -> JointState:
     return replace(state, errors=errors, keyframes=keyframes, rays=rays)
 
 
-def _from_start(state: JointState, start: InitialEstimate | None) -> JointState:
-    """Return the state after rounds from a start, or from the poses of the keyframes."""
-    map_T_camera = state.keyframes.map_T_camera if start is None else start.map_T_camera
-    guess = None if start is None else (start.association, start.positions)
-    return state.alternated(map_T_camera @ inverse(state.keyframes.base_T_camera), guess)
-
-
 def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
     """Return the better of two states: the given one, and one that begins with the association of the fixed mode.
 
@@ -307,14 +228,3 @@ def _anew(state: JointState) -> JointState:
     assert state.estimate is not None
     attempt = replace(state.attempt(), association=None)
     return state.better(attempt.alternated(state.estimate.map_T_base, None))
-
-
-def _improved(state: JointState, step: Callable[[JointState], JointState]) -> JointState:
-    """Repeat a step until it no longer explains the rays better, and return the state. step: returns the state itself if it
-    finds nothing better."""
-    for _ in range(state.settings.joint.max_rounds):
-        found = step(state)
-        if found is state:
-            break
-        state = found
-    return state

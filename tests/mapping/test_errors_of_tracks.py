@@ -13,10 +13,10 @@ from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
-from objslam.mapping import joint_solve, pipeline
+from objslam.mapping import pipeline, several_starts
 from objslam.mapping.exploration.errors_of_tracks import with_errors_of_tracks
 from objslam.mapping.joint.joint_alternation import JointState
-from objslam.mapping.joint_solve import _or_from
+from objslam.mapping.several_starts import _Found
 from objslam.simulation import preset, simulate
 
 TURN_SCALE, TURN_BIAS, CLOCK = "odometry.turn_scale", "odometry.turn_bias", "front.clock"
@@ -96,8 +96,8 @@ def test_a_start_from_which_nothing_is_solved_loses_no_map():
     def nowhere():
         raise SolveError("no object has enough rays")
 
-    state = begin(drive(1))
-    assert _or_from(nowhere, state) is state
+    found = _Found(*[begin(drive(1))] * 2)
+    assert found.after(nowhere) is found
 
 
 def test_false_boxes_call_for_no_other_start(monkeypatch):
@@ -106,7 +106,7 @@ def test_false_boxes_call_for_no_other_start(monkeypatch):
     def another(*_: object) -> None:
         raise AssertionError("a right map was sought again")
 
-    monkeypatch.setattr(joint_solve, "_or_from", another)
+    monkeypatch.setattr(several_starts._Found, "after", another)
     log = simulate(preset("demo", frames=200, localization=None, odometry=Odometry(), classes=3, false=0.25), 1)
     settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
     result = pipeline.run(log, settings, Ledger())

@@ -11,7 +11,7 @@ from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.types import Association, Log
-from objslam.mapping import joint_solve, pipeline
+from objslam.mapping import pipeline, several_starts
 from objslam.mapping.joint.labels import labels_tell
 from objslam.simulation import preset, simulate
 
@@ -154,7 +154,7 @@ def test_a_label_without_a_position_tells_nothing():
 def test_a_cart_that_drives_is_no_object_and_makes_no_boxes_noisy(seed, monkeypatch):
     """With one object for each label, its few boxes fit if all boxes are noisy. The path by the other labels is known, so
     nothing is explored."""
-    monkeypatch.setattr(joint_solve, "explored", lambda *_: pytest.fail("the log is explored"))
+    monkeypatch.setattr(several_starts, "explored", lambda *_: pytest.fail("the log is explored"))
     log = with_cart_that_drives(drive(seed, frames=200, laps=2, pixel_sigma=1.0, room=(8.0, 6.0)), seed)
     result, _ = mapped(log)
     assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)
@@ -163,7 +163,7 @@ def test_a_cart_that_drives_is_no_object_and_makes_no_boxes_noisy(seed, monkeypa
 
 def test_carts_with_names_of_their_own_bend_no_path(monkeypatch):
     """Five of seventeen labels are of carts. At the path that all labels show, things at rest seem to move as well."""
-    monkeypatch.setattr(joint_solve, "explored", lambda *_: pytest.fail("the log is explored"))
+    monkeypatch.setattr(several_starts, "explored", lambda *_: pytest.fail("the log is explored"))
     log = drive(1, frames=300, laps=2, pixel_sigma=1.0, room=(8.0, 6.0))
     for number in range(5):
         log = with_cart_that_drives(log, 10 + number, f"cart {number}")

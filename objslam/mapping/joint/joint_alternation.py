@@ -223,13 +223,16 @@ class JointState:
 
     def better(self, attempt: Self) -> Self:
         """Return the result of an attempt if its association explains more than the association of this state. Otherwise
-        return this state.
+        return this state."""
+        return self.replaced(attempt) if self.gain(attempt) > 0 else self
+
+    def gain(self, attempt: Self) -> float:
+        """Return how much more the association of an attempt explains than the association of this state (log odds).
 
         The two associations are compared twice: at the shared errors and the noise of each state. The two gains are added.
         Otherwise an estimate of the noise that is wrong by chance could decide.
         """
-        gain = attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
-        return self.replaced(attempt) if gain > 0 else self
+        return attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
 
     def replaced(self, attempt: Self) -> Self:
         """Return the result of an attempt, with the ledger and the trace of this state."""
