@@ -13,6 +13,7 @@ from objslam.mapping.exploration.second_exploration import finds_same_objects
 from objslam.mapping.fixed.camera_calibration import associate_at_poses
 from objslam.mapping.fixed.fixed_poses import FixedPoses
 from objslam.mapping.joint.by_label import at_other_labels, by_label
+from objslam.mapping.joint.diverging_rays import labels_diverge
 from objslam.mapping.joint.doubted_labels import (
     CLEAR_ODDS,
     doubted_names,
@@ -41,7 +42,7 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     errors. start: a known start. With it, the log is not explored, and labels are not trusted.
     """
     state = _begun(begin)
-    if start is not None or not may_be_by_label(state.settings, state.all_rays):
+    if start is not None or not _may_be_names(state):
         return _associated_again(begin, state, start)
     before = state.ledger.copy()
     named = by_label(state)
@@ -72,13 +73,20 @@ def solve_names(begin: JointState) -> JointState | None:
     Nothing is explored, so this takes less time than `solve_joint`. Of the other labels, the state has the objects at rest.
     """
     state = _begun(begin)
-    if not may_be_by_label(state.settings, state.all_rays):
+    if not _may_be_names(state):
         return None
     named = by_label(state)
     if named.agree:
         return named.state
     found = None if named.others is None else at_other_labels(state, named.others)
     return None if found is None else without_moving_things(associated_at_rest(found))
+
+
+def _may_be_names(state: JointState) -> bool:
+    """Return whether to try one object for each label (`may_be_by_label`). For `auto`, the rays of most labels must not
+    diverge."""
+    known = state.settings.association.method != "auto"
+    return may_be_by_label(state.settings, state.all_rays) and (known or not labels_diverge(state.keyframes, state.rays))
 
 
 def _associated_again(begin: JointState, state: JointState, start: InitialEstimate | None) -> JointState:

@@ -1,0 +1,77 @@
+"""Rays of one label that can show no single place, which tells without a solve that labels do not name objects."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.rotation import cross
+from objslam.core.types import Keyframes, Rays
+from objslam.frontend.tracks import associate_tracks
+
+_SOON = 3.0
+"""The longest time (s) between two rays that are compared. In a longer time, the odometry may turn by too much. In a shorter
+time, the robot sees fewer things of a label."""
+_APART = np.radians(20.0)
+"""Two rays diverge if one of them must turn by more than this angle (rad) to meet the other. Errors of clock, camera and
+odometry turn rays too. In 36 recorded drives with names, with clocks that are off by up to 1 s or turns by 20 %, at most one
+pair of a drive was beyond it, and up to 4 pairs were beyond 15 degrees. A larger angle finds fewer labels of several
+things."""
+_MANY, _SHARE = 5, 0.1
+"""A label diverges if at least `_MANY` of its pairs diverge, and more than the share `_SHARE` of them. In drives of 8 to 15
+minutes, five labels of three things each had 44 to 700 such pairs. Larger values find fewer labels."""
+_MOST = 0.5
+"""Labels are no names if the labels that diverge have at least this share of the rays. Things that move make rays diverge
+too. If half of the boxes show them, a map of names is of no use either. A larger share tries more maps of names, each of
+which takes a solve of up to a minute."""
+
+
+def labels_diverge(keyframes: Keyframes, rays: Rays) -> bool:
+    """Return whether the labels of most rays diverge, so that they name no single objects at rest.
+
+    A robot that looks from one chair to another sees two rays of the label within seconds, and the odometry knows how far it
+    turned. If the rays diverge, no place is on both. Only rays of tracks are compared, because false boxes are single. A ray
+    is compared with the ray of its label before it, if that ray is in another track.
+
+    keyframes: with odometry. Without it, the result is False.
+    """
+    if keyframes.odom_T_base is None:
+        return False
+    label, off = _pairs(keyframes, rays)
+    count = len(rays.label_names)
+    number, far = np.bincount(label, minlength=count), np.bincount(label[off > _APART], minlength=count)
+    diverge = (far >= _MANY) & (far > _SHARE * number)
+    return bool(diverge[rays.label].sum() >= _MOST * len(rays)) if len(rays) else False
+
+
+def _pairs(keyframes: Keyframes, rays: Rays) -> tuple[Ints, Floats]:
+    """Return the label (P,) of each compared pair of rays, and the angle (P,), rad, by which the pair misses one place."""
+    assert keyframes.odom_T_base is not None
+    track, time = associate_tracks(keyframes, rays).object, keyframes.stamps[rays.keyframe]
+    some = np.flatnonzero(track >= 0)
+    some = some[np.lexsort((time[some], rays.label[some]))]
+    one, two = some[:-1], some[1:]
+    near = (rays.label[one] == rays.label[two]) & (track[one] != track[two]) & (time[two] - time[one] <= _SOON)
+    one, two = one[near], two[near]
+    origin, direction = rays.in_map(keyframes.odom_T_base @ keyframes.base_T_camera)
+    return rays.label[two], angles_to_ray(origin[one], direction[one], origin[two], direction[two])
+
+
+def angles_to_ray(origin: Floats, direction: Floats, seen_from: Floats, look: Floats) -> Floats:
+    """Return the smallest angles (P,), rad, between other rays and the places on a ray.
+
+    From another origin, the places on a ray lie on an arc, from the direction of the ray's origin to the direction of the
+    ray. origin, direction: (P, 3) of the ray. seen_from, look: (P, 3) origin and direction of the other ray. Origins are in
+    m, and directions are unit vectors.
+    """
+    back = origin - seen_from
+    far = np.linalg.norm(back, axis=1, keepdims=True)
+    begin = np.where(far > 0, back / np.maximum(far, 1e-12), direction)
+    normal = cross(begin, direction)
+    size = np.linalg.norm(normal, axis=1)
+    between = (np.einsum("pi,pi->p", cross(normal, begin), look) > 0) & (
+        np.einsum("pi,pi->p", cross(direction, normal), look) > 0
+    )
+    beside = np.arcsin(np.clip(np.abs(np.einsum("pi,pi->p", normal, look)) / np.maximum(size, 1e-12), 0.0, 1.0))
+    ends = [np.arccos(np.clip(np.einsum("pi,pi->p", end, look), -1.0, 1.0)) for end in (begin, direction)]
+    return np.where(between & (size > 1e-9), beside, np.minimum(*ends))
