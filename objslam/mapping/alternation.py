@@ -48,6 +48,7 @@ def solve(
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
     doubted: tuple[str, ...] = ()
     unsettled = copied = 0
+    unfinished = False
     estimated = errors
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
@@ -72,7 +73,7 @@ def solve(
         assert state.association is not None
         assert state.estimate is not None
         association, estimate, rounds = state.association, state.estimate, state.rounds
-        doubted, unsettled = state.doubted, state.unsettled
+        doubted, unsettled, unfinished = state.doubted, state.unsettled, state.unfinished
         copied = 0 if keyframes.localized_every else largest_copy_in(state)
         estimate, added = solve_to_centres(begin, association, estimate)
         if added is not None and added.ranges is not None:
@@ -85,4 +86,5 @@ def solve(
     warn_of_unexplained(rays_of_keyframes, association, ledger)
     recorded = tuple(trace.rounds if trace else ())
     solved = Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)
-    return replace(solved, doubted=doubted, unsettled=unsettled, copied=copied, errors=estimated)
+    judged = replace(solved, doubted=doubted, unsettled=unsettled, unfinished=unfinished, copied=copied)
+    return replace(judged, errors=estimated)

@@ -205,6 +205,7 @@ def summarise(
         "cut_off": _cut_off(rays),
         "doubted_labels": list(solution.doubted),
         "unsettled_objects": solution.unsettled,
+        "unfinished_search": solution.unfinished,
         "copied_objects": solution.copied,
         "several_objects_a_label": len({one.label for one in objects}) < len(objects),
         "uncalibrated": estimate.uncalibrated,

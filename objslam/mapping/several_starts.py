@@ -14,7 +14,7 @@ from objslam.frontend.tracks import associate_tracks
 from objslam.mapping.exploration.errors_of_tracks import along, with_errors_of_tracks
 from objslam.mapping.exploration.first_exploration import explored, solved_if_sure
 from objslam.mapping.exploration.second_exploration import finds_same_objects, with_loose_odometry
-from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.joint.joint_alternation import Effort, JointState
 from objslam.mapping.joint.relocalization import relocalized
 from objslam.mapping.moves.missed_loops import largest_copy_in, with_missed_loops
 
@@ -34,14 +34,15 @@ def from_several_starts(state: JointState) -> JointState:
     """Return the state after a search from the first exploration, or from the best of further starts while it is unclear.
 
     A search for a more likely path takes many solves. So a further start is searched only if its first map explains the log
-    better than the first maps of all earlier starts. state: before the first association.
+    better than the first maps of all earlier starts. The search ends after `joint.max_solves` solves. state: before the
+    first association.
     """
-    begin, path = with_errors_of_tracks(state)
+    begin, path = with_errors_of_tracks(replace(state, effort=Effort()))
     start, sure = explored(begin)
     first = from_start(*solved_if_sure(begin, start, sure))
     found = _Found(first, _searched(first))
     noisier = with_loose_odometry(first, begin.theta, sure)
-    if noisier is not None:
+    if noisier is not None and not begin.spent:
         other, sure = explored(noisier)
         if not finds_same_objects(found.state, other.association):
             found = found.after(lambda: from_start(*solved_if_sure(noisier, other, sure)))
@@ -56,10 +57,10 @@ def from_several_starts(state: JointState) -> JointState:
     if np.isfinite(begin.rays.range).any():
         starts = [along_tracks] if not sure else [by_windows] if largest_copy_in(found.state) else []
     for other_start in starts:  # The first ones take less time.
-        if not _unclear(found.state):
+        if not _unclear(found.state) or begin.spent:
             break
         found = found.after(other_start)
-    return found.state
+    return replace(found.state, unfinished=begin.spent and _unclear(found.state))
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,7 @@ def improved(state: JointState, step: Callable[[JointState], JointState]) -> Joi
     """Repeat a step until it no longer explains the rays better, and return the state. step: returns the state itself if it
     finds nothing better."""
     for _ in range(state.settings.joint.max_rounds):
-        found = step(state)
-        if found is state:
+        if state.spent or (found := step(state)) is state:
             break
         state = found
     return state

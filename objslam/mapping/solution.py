@@ -94,9 +94,10 @@ class Solution:
     a point. to_centre: turns each ray to the centre of its body. hidden: (R,) whether something may hide a part of the
     object in the box of each ray. bodies, to_centre and hidden are None if no bodies were solved. doubted: the
     labels that may name one object or several. unsettled: the objects that the last round changed, as in `objects_changed`,
-    although no further round was allowed. copied: the objects in the largest part of the map that shows the same things as
-    another part. errors: the estimated errors, as a function of the measurements. None if none were
-    estimated. If a held error is gross, it is among them too.
+    although no further round was allowed. unfinished: whether the search for a clear map took all its solves
+    (`joint.max_solves`). copied: the objects in the largest part of the map that shows the same things as another part.
+    errors: the estimated errors, as a function of the measurements. None if none were estimated. If a held error is gross,
+    it is among them too.
     """
 
     keyframes: Keyframes
@@ -110,6 +111,7 @@ class Solution:
     hidden: Bools | None = None
     doubted: tuple[str, ...] = ()
     unsettled: int = 0
+    unfinished: bool = False
     copied: int = 0
     errors: SharedErrors | None = None
 

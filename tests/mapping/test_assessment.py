@@ -40,6 +40,11 @@ def test_a_usual_result_is_good() -> None:
         ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
         ({"copied": 7}, "check", "A part of the map with 7 objects looks like another part, at another place"),
         ({"unsettled": 3}, "check", "It is not settled which boxes show which object: the last round of association still"),
+        (
+            {"unfinished": True},
+            "check",
+            "The search for a map that explains the boxes took all its solves",
+        ),
         ({"uncalibrated": True}, "check", "The errors that all measurements share could not be estimated"),
         ({"doubted": ("mug", "cup")}, "check", "It is not clear whether mug, cup name one object each, or several."),
         ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),

@@ -57,6 +57,7 @@ class Evidence:
     positions unreliable. frames, late: the camera frames of a log or session, and the frames that a live session dropped
     because they came too late. journal: the file with all messages of a live session, "" without one. doubted: the
     labels that may name one object or several. unsettled: the objects that the last round of association still changed.
+    unfinished: whether the search for a clear map took all its solves (joint.max_solves).
     copied: the objects in the largest part of the map that shows the same things as another part. several: whether a
     label has several objects. uncalibrated: whether the estimation of the shared errors failed. odometry: the largest
     factor on a noise of the odometry that the log shows. scale: the standard deviation of the scale of the odometry, as
@@ -81,6 +82,7 @@ class Evidence:
     journal: str = ""
     doubted: tuple[str, ...] = ()
     unsettled: int = 0
+    unfinished: bool = False
     copied: int = 0
     several: bool = False
     uncalibrated: bool = False
@@ -129,6 +131,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         journal=summary["log_path"] or "",
         doubted=tuple(summary["doubted_labels"]),
         unsettled=summary.get("unsettled_objects", 0),
+        unfinished=summary.get("unfinished_search", False),
         copied=summary.get("copied_objects", 0),
         several=summary.get("several_objects_a_label", False),
         uncalibrated=summary.get("uncalibrated", False),
@@ -220,6 +223,11 @@ def _check(e: Evidence) -> list[str]:
         found.append(
             "It is not settled which boxes show which object: the last round of association still changed "
             f"{_objects(e.unsettled)}."
+        )
+    if e.unfinished:
+        found.append(
+            "The search for a map that explains the boxes took all its solves (joint.max_solves), and the best map is still "
+            "unclear. Depths, more labels or a better odometry would help."
         )
     if e.copied:
         found.append(

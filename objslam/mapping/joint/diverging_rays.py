@@ -14,8 +14,8 @@ _SOON = 3.0
 time, the robot sees fewer things of a label."""
 _APART = np.radians(20.0)
 """Two rays diverge if one of them must turn by more than this angle (rad) to meet the other. Errors of clock, camera and
-odometry turn rays too. In 36 recorded drives with names, with clocks that are off by up to 1 s or turns by 20 %, at most one
-pair of a drive was beyond it, and up to 4 pairs were beyond 15 degrees. A larger angle finds fewer labels of several
+odometry turn rays too. In six recorded drives with names, with clocks that were off by up to 1 s or turns by 20 %, at most
+one pair of a drive was beyond it, and up to 4 pairs were beyond 15 degrees. A larger angle finds fewer labels of several
 things."""
 _MANY, _SHARE = 5, 0.1
 """A label diverges if at least `_MANY` of its pairs diverge, and more than the share `_SHARE` of them. In drives of 8 to 15

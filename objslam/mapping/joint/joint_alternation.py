@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Self
 
@@ -37,6 +37,13 @@ Guess = tuple[Association, Floats]
 """An association of the rays, and the positions (N, 3) m of its objects."""
 
 
+@dataclass
+class Effort:
+    """How many solves a search has taken. All its attempts share one."""
+
+    solves: int = 0
+
+
 @dataclass(frozen=True)
 class JointState:
     """The present state of the rounds of a joint solve.
@@ -44,7 +51,8 @@ class JointState:
     frames, all_rays: all keyframes with a pose, also without rays, as measured. keyframes, rays: the keyframes that have a
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
     (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
-    until the last solve. unsettled: as in `Solution`. doubted: the labels that may name one object or several.
+    until the last solve. unsettled, unfinished: as in `Solution`. effort: of the search that the state is a part of.
+    doubted: the labels that may name one object or several.
     """
 
     frames: Keyframes
@@ -60,6 +68,8 @@ class JointState:
     theta: Floats | None = None
     hold: bool = False
     unsettled: int = 0
+    unfinished: bool = False
+    effort: Effort = field(default_factory=Effort)
     doubted: tuple[str, ...] = ()
     rounds: tuple[dict[str, int], ...] = ()
     association: Association | None = None
@@ -76,6 +86,7 @@ class JointState:
         """Solve an association. start: (K, 4, 4) map_T_camera. begin: (P,) the first shared errors, else theta."""
         from objslam.graph import batch_solver
 
+        self.effort.solves += 1
         at = self.theta if begin is None else begin
         given = self.keyframes, self.rays, association, self.settings, self.ledger, partial(self.progress, "solve")
         return batch_solver.solve_joint(*given, start, trace, errors, at, self.hold)
@@ -103,6 +114,11 @@ class JointState:
         """(K, 4, 4) map_T_camera of the last solve."""
         assert self.estimate is not None
         return np.asarray(self.estimate.map_T_base @ self.keyframes.base_T_camera)
+
+    @property
+    def spent(self) -> bool:
+        """Whether the search has taken all the solves that it may take."""
+        return self.effort.solves >= self.settings.joint.max_solves
 
     def merged(self) -> Self:
         """Return the state after objects that appear twice were merged and solved again."""

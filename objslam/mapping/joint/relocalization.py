@@ -57,7 +57,7 @@ def relocalized(begin: JointState) -> JointState:
         state = state.counted(association).solve("association", association, start).merged()
         # Close objects may merge in one round, and part again.
         best, worse = (state, 0) if state.explained > best.explained else (best, worse + 1)
-        if worse == _WORSE:
+        if worse == _WORSE or state.spent:
             break
     if best.association is begin.association:
         return begin

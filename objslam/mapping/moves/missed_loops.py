@@ -44,7 +44,7 @@ def with_missed_loops(state: JointState) -> JointState:
     """
     held = replace(state, hold=state.errors is not None)
     best = held
-    while (closed := _with_a_loop(best)) is not None:
+    while not best.spent and (closed := _with_a_loop(best)) is not None:
         best = closed
     if best is not held:
         try:
@@ -64,7 +64,7 @@ def _with_all_loops(state: JointState) -> JointState:
     closure is not merged, because landmarks of parts that are not closed yet stand between the others.
     """
     best = replace(state.attempt(), hold=state.errors is not None)
-    for _ in range(_TRIED):
+    for _ in range(0 if best.spent else _TRIED):
         landmarks, middle = _of_state(best)
         copies = _copies(landmarks, middle, best.solved_poses, state.settings.association)
         closed = [one for closure in copies[:_COMPARED] if (one := _closed(best, closure, landmarks)) is not None]

@@ -1,0 +1,60 @@
+"""The search from several starts: which of them are searched, and when it ends."""
+
+from dataclasses import dataclass
+
+import pytest
+from log_parts import without_names
+
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
+from objslam.mapping import pipeline, several_starts
+from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.several_starts import _Found
+from objslam.simulation import preset, simulate
+
+
+@dataclass(frozen=True)
+class Map:
+    """A map with its log evidence."""
+
+    explained: float
+
+    def gain(self, other):
+        return other.explained - self.explained
+
+    def better(self, other):
+        return other if self.gain(other) > 0 else self
+
+
+@pytest.mark.parametrize(
+    ("first", "searched", "expected"),
+    [(90.0, None, (100.0, 150.0)), (110.0, 140.0, (110.0, 150.0)), (110.0, 160.0, (110.0, 160.0))],
+    ids=["a worse start is not searched", "a search that leads to less", "a search that leads to more"],
+)
+def test_only_a_start_with_a_better_first_map_is_searched(monkeypatch, first, searched, expected):
+    """Two first maps are compared. The map after the first search has more evidence than both."""
+    search = (lambda one: pytest.fail("it was searched")) if searched is None else (lambda one: Map(searched))
+    monkeypatch.setattr(several_starts, "_searched", search)
+    found = _Found(Map(100.0), Map(150.0)).after(lambda: Map(first))
+    assert (found.first.explained, found.state.explained) == expected
+
+
+def test_a_search_ends_after_its_solves(monkeypatch):
+    """A log whose map stays unclear is tried from all starts, or until the solves are taken."""
+    monkeypatch.setattr(several_starts, "_unclear", lambda state: True)
+    solves, solve_once = [], JointState.solve_once
+    monkeypatch.setattr(JointState, "solve_once", lambda state, *of, **by: solves.append(1) or solve_once(state, *of, **by))
+    log = without_names(simulate(preset("demo", objects=6, frames=80, localization=None, odometry=Odometry(), false=0.0), 1))
+    taken, told = [], []
+    for most in (1000, 3):
+        solves.clear()
+        settings = load_settings(
+            None, ("mode=joint", "output.recording=false", "bodies.use=false", f"joint.max_solves={most}")
+        )
+        summary = pipeline.run(log, settings, Ledger()).summary
+        taken.append(len(solves))
+        told.append(
+            (summary["unfinished_search"], any("joint.max_solves" in one for one in summary["assessment"]["reasons"]))
+        )
+    assert told == [(False, False), (True, True)]
+    assert taken[1] < taken[0]
