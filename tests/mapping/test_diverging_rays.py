@@ -39,6 +39,7 @@ def test_names_are_no_classes_whatever_the_errors(errors):
     log = add_shared_errors(robot(9003, "gyro")[0], errors)
     found = errors_of(log, "mode=joint")
     assert not labels_diverge(found.keyframes, found.rays)
+    assert not labels_diverge(found.keyframes, found.rays.take(np.zeros(len(found.rays), dtype=bool)))
 
 
 def test_a_log_whose_labels_have_several_things_takes_no_solve_of_names(monkeypatch):

@@ -21,9 +21,9 @@ _MANY, _SHARE = 5, 0.1
 """A label diverges if at least `_MANY` of its pairs diverge, and more than the share `_SHARE` of them. In drives of 8 to 15
 minutes, five labels of three things each had 44 to 700 such pairs. Larger values find fewer labels."""
 _MOST = 0.5
-"""Labels are no names if the labels that diverge have at least this share of the rays. Things that move make rays diverge
-too. If half of the boxes show them, a map of names is of no use either. A larger share tries more maps of names, each of
-which takes a solve of up to a minute."""
+"""Labels are no names if the labels that diverge are at least this share of the labels with `_MANY` rays, and have at least
+this share of the rays. Rays to things that move diverge too, but seldom to half of the labels. A larger share tries more
+maps of names, each of which takes a solve of up to a minute."""
 
 
 def labels_diverge(keyframes: Keyframes, rays: Rays) -> bool:
@@ -33,15 +33,17 @@ def labels_diverge(keyframes: Keyframes, rays: Rays) -> bool:
     turned. If the rays diverge, no place is on both. Only rays of tracks are compared, because false boxes are single. A ray
     is compared with the ray of its label before it, if that ray is in another track.
 
-    keyframes: with odometry. Without it, the result is False.
+    keyframes: with odometry. Without it, or without rays, the result is False.
     """
-    if keyframes.odom_T_base is None:
+    if keyframes.odom_T_base is None or not len(rays):
         return False
     label, off = _pairs(keyframes, rays)
     count = len(rays.label_names)
+    rays_of = np.bincount(rays.label, minlength=count)
     number, far = np.bincount(label, minlength=count), np.bincount(label[off > _APART], minlength=count)
     diverge = (far >= _MANY) & (far > _SHARE * number)
-    return bool(diverge[rays.label].sum() >= _MOST * len(rays)) if len(rays) else False
+    labels = int(diverge.sum()), int((rays_of >= _MANY).sum())
+    return bool(labels[0] and labels[0] >= _MOST * labels[1] and rays_of[diverge].sum() >= _MOST * len(rays))
 
 
 def _pairs(keyframes: Keyframes, rays: Rays) -> tuple[Ints, Floats]:
