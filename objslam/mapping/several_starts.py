@@ -33,9 +33,10 @@ simulated map with doubles. With a smaller factor, more logs are tried from othe
 def from_several_starts(state: JointState) -> JointState:
     """Return the state after a search from the first exploration, or from the best of further starts while it is unclear.
 
-    A search for a more likely path takes many solves. So a further start is searched only if its first map explains the log
-    better than the first maps of all earlier starts. The search ends after `joint.max_solves` solves. state: before the
-    first association.
+    A search for a more likely path takes many solves, and ends after `joint.max_solves`. So a further start is searched at
+    once only if its first map explains the log better than the first maps of all earlier starts. The others are searched at
+    last, and first the one that explains most: a start may be poor and still lead to the best map. state: before the first
+    association.
     """
     begin, path = with_errors_of_tracks(replace(state, effort=Effort()))
     start, sure = explored(begin)
@@ -60,24 +61,42 @@ def from_several_starts(state: JointState) -> JointState:
         if not _unclear(found.state) or begin.spent:
             break
         found = found.after(other_start)
+    found = found.with_the_others()
     return replace(found.state, unfinished=begin.spent and _unclear(found.state))
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What the starts of a search led to. first: the best first map of a start. state: the best map after a search."""
+    """What the starts of a search led to. first: the best first map of a start. state: the best map after a search. left:
+    the first maps that are not searched yet."""
 
     first: JointState
     state: JointState
+    left: tuple[JointState, ...] = ()
 
     def after(self, start: Callable[[], JointState]) -> Self:
         """Return what is found with one more start. It is searched only if its first map is better than all before."""
         try:
             first = start()
-            if self.first.gain(first) <= 0:
-                return self
-            return replace(self, first=first, state=self.state.better(_searched(first)))
+            promising = self.first.gain(first) > 0
         except SolveError:  # The map so far is there, whatever is wrong with the other start.
+            return self
+        return replace(self, first=first).searched(first) if promising else replace(self, left=(*self.left, first))
+
+    def with_the_others(self) -> Self:
+        """Return what is found with the starts that are left, while the map is unclear and solves are left."""
+        found = self
+        for first in sorted(self.left, key=lambda one: -one.explained):
+            if first.spent or not _unclear(found.state):
+                break
+            found = found.searched(first)
+        return found
+
+    def searched(self, first: JointState) -> Self:
+        """Return what is found with a search from the first map of a start."""
+        try:
+            return replace(self, state=self.state.better(_searched(first)))
+        except SolveError:
             return self
 
 

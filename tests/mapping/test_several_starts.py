@@ -7,6 +7,7 @@ from log_parts import without_names
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.errors import SolveError
 from objslam.mapping import pipeline, several_starts
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.several_starts import _Found
@@ -18,6 +19,7 @@ class Map:
     """A map with its log evidence."""
 
     explained: float
+    spent: bool = False
 
     def gain(self, other):
         return other.explained - self.explained
@@ -37,6 +39,27 @@ def test_only_a_start_with_a_better_first_map_is_searched(monkeypatch, first, se
     monkeypatch.setattr(several_starts, "_searched", search)
     found = _Found(Map(100.0), Map(150.0)).after(lambda: Map(first))
     assert (found.first.explained, found.state.explained) == expected
+    assert found.left == ((Map(first),) if searched is None else ())
+
+
+def test_the_other_starts_are_searched_at_last(monkeypatch):
+    """The best of them is searched first. The search of a start that cannot be solved loses no map."""
+    searched = []
+
+    def search(one):
+        searched.append(one.explained)
+        if one.explained == 80.0:
+            raise SolveError("the loop bends the path too far")
+        return Map(one.explained + 100)
+
+    monkeypatch.setattr(several_starts, "_searched", search)
+    monkeypatch.setattr(several_starts, "_unclear", lambda one: True)
+    found = _Found(Map(100.0), Map(150.0))
+    for explained in (70.0, 90.0, 80.0):
+        found = found.after(lambda explained=explained: Map(explained))
+    assert not searched
+    assert found.with_the_others().state.explained == 190.0
+    assert searched == [90.0, 80.0, 70.0]
 
 
 def test_a_search_ends_after_its_solves(monkeypatch):
