@@ -196,7 +196,7 @@ class Joint(Section):
     """Maximum number of rounds of association and solving. The rounds stop early if no ray changes its object."""
     max_solves: Count = 150
     """Maximum number of solves in the search for the map of a log without names and without a localisation. After it, no
-    other start and no other path are tried. Searches that ended with right maps took up to 121 solves."""
+    other start, path or loop is tried. Searches that ended with right maps took up to 121 solves."""
     max_iterations: Count = 100
 
 

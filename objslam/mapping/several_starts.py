@@ -96,7 +96,7 @@ class _Found:
         """Return what is found with a search from the first map of a start."""
         try:
             return replace(self, state=self.state.better(_searched(first)))
-        except SolveError:
+        except SolveError:  # The map so far is there.
             return self
 
 
@@ -137,7 +137,8 @@ def improved(state: JointState, step: Callable[[JointState], JointState]) -> Joi
     """Repeat a step until it no longer explains the rays better, and return the state. step: returns the state itself if it
     finds nothing better."""
     for _ in range(state.settings.joint.max_rounds):
-        if state.spent or (found := step(state)) is state:
+        found = step(state)
+        if found is state:
             break
         state = found
     return state

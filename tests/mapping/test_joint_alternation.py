@@ -14,7 +14,7 @@ from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.mapping.joint import relocalization
-from objslam.mapping.joint.joint_alternation import JointState
+from objslam.mapping.joint.joint_alternation import Effort, JointState
 from objslam.mapping.joint.relocalization import relocalized
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import objects_changed, seen_something
@@ -174,6 +174,9 @@ def test_rounds_along_the_path_end_after_two_worse_ones_and_the_best_counts(alon
     found = relocalized(begin)
     assert found.explained == expected
     assert not found.hold
+    assert held == solves
+    spent = replace(begin, effort=Effort(begin.settings.joint.max_solves))
+    assert relocalized(spent) is spent
     assert held == solves
 
 

@@ -30,13 +30,14 @@ takes longer, but gets over more rounds in which close objects merge."""
 
 
 def relocalized(begin: JointState) -> JointState:
-    """Do rounds along the most likely path through the map. Return the new state if it is `better`, else the given one.
+    """Do rounds along the most likely path through the map. Return the new state if it is `better`, else the given one,
+    which is also returned if the search has taken all its solves.
 
     The rounds of `JointState.alternated` keep a path that is bent onto wrong landmarks, because all its rays agree. So each
     round here begins with another path. It is the most likely one if any ray may belong to any landmark. Every second round
     holds the shared errors and the noise, because one round changes them little.
     """
-    if begin.keyframes.odom_T_base is None or begin.keyframes.localized_every:
+    if begin.keyframes.odom_T_base is None or begin.keyframes.localized_every or begin.spent:
         return begin
     state, worse = begin.attempt(), 0
     best = state
