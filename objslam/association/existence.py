@@ -179,10 +179,24 @@ def chance_odds(state: State, gate: float) -> Floats:
     Any two stray rays of a class define a point. The number of further strays in the gate of the point is Poisson
     distributed. Strays are the rays without a landmark, and the rays of landmarks with no more rays than this one.
     """
+    return _odds_of_share(state, stray_share(state, gate))
+
+
+def beyond_chance(state: State, gate: float, least: float) -> Bools:
+    """Return which landmarks (N,) have `chance_odds` of at least a value.
+
+    More frames that look at a landmark lower its odds. If even all frames would not lower them enough, nobody needs to know
+    which frames look at it. That takes most of the time otherwise.
+    """
+    surely = _odds_of_share(state, _gate_area(state, gate) / (state.view.solid_angle * state.obs.scale)) >= least
+    return surely if surely.all() else chance_odds(state, gate) >= least
+
+
+def _odds_of_share(state: State, share: Floats) -> Floats:
+    """Return `chance_odds` (N,). share: (N,) as `stray_share` returns it."""
     strays = _no_stronger(state.ray_count, state.label) + state.unassigned[state.label]
-    expected = strays * stray_share(state, gate)
     points = np.log(np.maximum(strays * (strays - 1) / 2, 1.0))
-    chance = np.log(np.maximum(poisson_tail(state.ray_count - 2, expected), 1e-300))
+    chance = np.log(np.maximum(poisson_tail(state.ray_count - 2, strays * share), 1e-300))
     return np.clip(-points - chance, -_MOST_ODDS, _MOST_ODDS)
 
 
@@ -194,10 +208,14 @@ def prior_odds(state: State) -> Floats:
 
 def stray_share(state: State, gate: float) -> Floats:
     """Return the share (N,) of boxes at random pixels of the images whose rays would pass each landmark within its gate."""
+    looks = np.maximum(state.history.inside, state.history.expected) / max(len(state.view.camera), 1)
+    return looks * _gate_area(state, gate) / (state.view.solid_angle * state.obs.scale)
+
+
+def _gate_area(state: State, gate: float) -> Floats:
+    """Return the mean solid angle (N,), in sr, within the gates of each landmark's rays."""
     angle2 = state.variance / np.maximum(state.distance, 1e-3) ** 2
-    area = np.pi * gate * np.bincount(state.owner, angle2, state.count) / np.maximum(state.ray_count, 1)
-    looks = np.maximum(state.history.inside, state.history.expected)
-    return looks * area / (max(len(state.view.camera), 1) * state.view.solid_angle * state.obs.scale)
+    return np.asarray(np.pi * gate * np.bincount(state.owner, angle2, state.count) / np.maximum(state.ray_count, 1))
 
 
 def size_odds(state: State) -> Floats:

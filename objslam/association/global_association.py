@@ -13,7 +13,7 @@ from objslam import config
 from objslam.association.crossings.exchanged_rays import annealed, learned
 from objslam.association.crossings.ghost_pairs import replace_ghosts
 from objslam.association.crossings.one_or_two import find_crossings, without_smaller_bundles
-from objslam.association.existence import chance_odds, existence, rest_odds
+from objslam.association.existence import beyond_chance, existence, rest_odds
 from objslam.association.gating import alternate, gate_limit, near, size_costs
 from objslam.association.hypothesis_search import Search, discover
 from objslam.association.label_fusion import fused_labels
@@ -109,8 +109,10 @@ def associate_globally(
     if state.ratio is not None:
         state, likely = _drop_all(task, annealed(state, task.gate, lambda now: _alternate(task, now)))
     if settings.association.fuse_labels:
-        landmarks = replace(state.landmarks, accepts=fused_labels(state, task.gate))
-        state, likely = _drop_all(task, _alternate(task, replace(state, landmarks=landmarks)))
+        accepts = fused_labels(state, task.gate)
+        if (accepts != state.landmarks.accepts).any():
+            fused = replace(state, landmarks=replace(state.landmarks, accepts=accepts))
+            state, likely = _drop_all(task, _alternate(task, fused))
     state, likely = _by_size(task, state, likely, sized)
     if solved or keyframes.localized_every:
         # This comes last: the things of these bundles get no landmarks, so a further assignment would give their rays back.
@@ -129,7 +131,7 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
     for turn in range(_TURNS):
         before = state.count
         state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded), 2)
-        state = _merge_round(task, learned(state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)))
+        state = _merge_round(task, learned(state.keep(beyond_chance(state, task.gate, _CHANCE_ODDS))))
         likely = existence(state, task.gate)
         moving = moving.joined(state.keep(_seems_to_move(task, state, likely)))
         kept = _drop(task, state, likely)
@@ -184,8 +186,8 @@ def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: L
         search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device)
         points = discover(pool, search, rng, None if excluded is None else excluded.position[excluded.accepts[:, label]])
         new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
-        landmarks = landmarks.and_also(new)
-    return replace(state, landmarks=landmarks)
+        landmarks = landmarks.and_also(new) if len(points) else landmarks
+    return state if landmarks is state.landmarks else replace(state, landmarks=landmarks)
 
 
 def _add_distant(task: _Task, state: State) -> State:
@@ -199,7 +201,7 @@ def _add_distant(task: _Task, state: State) -> State:
     off = lengths(cross(direction, mean[index]))
     narrow = np.nan_to_num(grouped_quantile(off, index, len(mean), 1.0)) < np.sin(_PARALLAX)
     state = state.keep(narrow | (np.arange(len(narrow)) < known))
-    return state.keep(chance_odds(state, task.gate) >= _CHANCE_ODDS)
+    return state.keep(beyond_chance(state, task.gate, _CHANCE_ODDS))
 
 
 def _alternate(task: _Task, state: State, times: int = 3) -> State:

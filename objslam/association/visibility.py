@@ -149,7 +149,7 @@ def detection_history(
     obj, frame, away, pixel = _in_images(position, extent, reach, obs, view)
     inside = np.bincount(obj, minlength=count)
     usual = (away >= near[obj]) & (away <= far[obj])
-    usual &= _from_the_front(obs.origin[held], index, position, obj, view.map_T_camera[frame, :3, 3])
+    usual &= _from_the_front(obs.origin[held], index, position, obj, frame, view.map_T_camera)
     obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
     reach = np.where(np.isfinite(obs.range), obs.range, distance)
     clear = ~_hidden(frame, away, pixel, obs, reach, _mean_size(extent[obj]))
@@ -231,18 +231,21 @@ def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
     return grouped_quantiles(distance[core_box], label[index[core_box]], classes, _USUAL_DISTANCES)
 
 
-def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, camera: Floats) -> Bools:
-    """Return whether a camera at (V, 3) sees the front of its object (V,). A screen, for example, has a front.
+def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, frame: Ints, map_T_camera: Floats) -> Bools:
+    """Return whether the camera of each frame (V,) sees the front of its object (V,). A screen, for example, has a front.
 
     An object has a front if nearly all its boxes come from one half space. Misses from behind then mean nothing. origin,
-    index: (P, 3) m and (P,), the camera position and the object of each box.
+    index: (P, 3) m and (P,), the camera position and the object of each box. map_T_camera: (F, 4, 4) of the frames.
     """
     count, toward = len(position), origin - position[index]
     toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
-    front = grouped_sums(toward, index, count)
+    front, seen = grouped_sums(toward, index, count), np.ones(len(obj), dtype=bool)
     facing = np.einsum("pi,pi->p", toward, front[index])
     one_sided = np.nan_to_num(grouped_quantile(facing, index, count, 1 - _FRONT_SHARE)) >= 0
-    return ~one_sided[obj] | (np.einsum("vi,vi->v", camera - position[obj], front[obj]) >= 0)
+    asked = np.flatnonzero(one_sided[obj])
+    obj = obj[asked]
+    seen[asked] = np.einsum("vi,vi->v", map_T_camera[frame[asked], :3, 3] - position[obj], front[obj]) >= 0
+    return seen
 
 
 def _in_images(
@@ -339,8 +342,9 @@ def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, rea
     for k in range(int(number.max(initial=0))):  # Each step checks the k-th box of all frames that have one.
         rows = most[: np.searchsorted(fewer, -k)]
         box = useful[begin[rows] + k]
-        apart = np.where(size[rows] > 0, np.minimum((thick[box] + size[rows]) / 2, _CLOSER[0]), _CLOSER[0])
-        closer = reach[box] < distance[rows] - np.maximum(apart, _CLOSER[1] * distance[rows])
+        closer = reach[box] < (1 - _CLOSER[1]) * distance[rows]
         rows, box = rows[closer], box[closer]
-        hidden[rows] |= (np.abs(pixel[rows] - middle[box]) <= half[box]).all(axis=1)
+        apart = np.where(size[rows] > 0, np.minimum((thick[box] + size[rows]) / 2, _CLOSER[0]), _CLOSER[0])
+        over = (np.abs(pixel[rows] - middle[box]) <= half[box]).all(axis=1)
+        hidden[rows] |= over & (reach[box] < distance[rows] - apart)
     return hidden

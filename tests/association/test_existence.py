@@ -11,6 +11,7 @@ from scipy.stats import betabinom
 from objslam.association.existence import (
     Rates,
     _beta_binomial,
+    beyond_chance,
     chance_odds,
     detection_rates,
     existence,
@@ -20,6 +21,7 @@ from objslam.association.existence import (
     size_odds,
     static_odds,
 )
+from objslam.association.gating import alternate
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.association.observations import PosedRays, extents, observe, overlap
@@ -312,6 +314,38 @@ def test_more_rays_and_fewer_strays_are_less_like_chance():
     assert near.sum() >= 3
     assert chance_odds(chance, 13.8)[0] < 0
     assert len(ray) == 4000
+
+
+def test_looks_are_only_counted_where_they_decide():
+    points = np.array([[2.0, 0.2, 0.4]])
+    state = state_of(watch(points, np.concatenate([straight(), lift_se2(np.tile([0.0, 0.0, np.pi], (400, 1)))])))
+    answers = set()
+    for keep in (3, 4, 5, 8, 40):
+        few = np.flatnonzero((state.matched == 0) & (np.cumsum(state.matched == 0) <= keep))
+        less = replace(state, obs=state.obs.take(few), matched=state.matched[few])
+        for least in np.linspace(-20.0, 60.0, 41):
+            fresh = replace(less)
+            got = beyond_chance(fresh, 13.8, least)
+            assert (got == (chance_odds(less, 13.8) >= least)).all()
+            answers.add((bool(got[0]), "history" in vars(fresh)))
+    # Yes without a count, and yes and no with one. A no is never said without a count.
+    assert answers == {(True, False), (True, True), (False, True)}
+
+
+def test_a_settled_state_stays_the_same_state():
+    scene = drive(DriveSettings(), 3)
+    state = state_of(scene)
+    for _ in range(10):  # Without a limit, a fault here would never end.
+        before, state = state, alternate(state, 13.8, lambda now: np.ones(now.count, dtype=bool))
+        if state is before:
+            break
+    assert state is before
+    empty = replace(state, matched=np.full_like(state.matched, -1))
+    again = alternate(empty, 13.8, lambda now: np.ones(now.count, dtype=bool))
+    assert np.array_equal(again.matched, state.matched)
+    np.testing.assert_allclose(again.landmarks.position, state.landmarks.position, atol=1e-6)
+    none = alternate(state, 13.8, lambda now: np.zeros(now.count, dtype=bool))
+    assert none.count == 0
 
 
 def test_priors_and_sizes():
