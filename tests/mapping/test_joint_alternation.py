@@ -180,21 +180,35 @@ def test_rounds_along_the_path_end_after_two_worse_ones_and_the_best_counts(alon
     assert held == solves
 
 
-@pytest.mark.parametrize(("other", "wins"), [(-1.0, False), (2.0, True)])
-def test_maps_are_compared_at_the_same_noise(monkeypatch, other, wins):
-    """The estimated noise favours one of two maps. At the noise of either, the other may be better."""
+@pytest.mark.parametrize(
+    ("mine", "other", "wins"),
+    [
+        ((100.0, 111.0), (99.0, 110.0), False),
+        ((100.0, 108.0), (102.0, 110.0), True),
+        ((100.0, 30.0), (80.0, 60.0), False),
+        ((60.0, 80.0), (100.0, 30.0), True),
+    ],
+    ids=[
+        "wins at its own noise only",
+        "wins",
+        "is better at a noise at which both are bad",
+        "is bad at the noise of the other",
+    ],
+)
+def test_each_map_counts_at_the_noise_at_which_it_explains_more(monkeypatch, mine, other, wins):
+    """mine, other: what each of two maps explains at the noise of the first and of the second map."""
     one = Association(np.zeros(30, dtype=np.int64), np.zeros(1, dtype=np.int64))
     errors = [SimpleNamespace(at=lambda theta, name=name: (None, name, None), name=name) for name in ("quiet", "noisy")]
     settings = load_settings(None)
     states = []
-    for own, evidence in zip(errors, (100.0, 110.0), strict=True):
+    for own, evidence in zip(errors, (mine[0], other[1]), strict=True):
         state = JointState(None, None, None, None, (), settings, Ledger(), None, None, own, np.zeros(1))
         states.append(replace(state, association=one, estimate=SimpleNamespace(log_evidence=evidence)))
-    mine, attempt = states
-    told = {"quiet": SimpleNamespace(log_evidence=100.0 + other), "noisy": SimpleNamespace(log_evidence=110.0 - other)}
+    present, attempt = states
+    told = {"quiet": SimpleNamespace(log_evidence=other[0]), "noisy": SimpleNamespace(log_evidence=mine[1])}
     monkeypatch.setattr(JointState, "solved_poses", None)
     monkeypatch.setattr(JointState, "solve_once", lambda state, association, errors, start: told[state.rays])
-    assert (mine.better(attempt) is not mine) == wins
+    assert (present.better(attempt) is not present) == wins
 
 
 def test_an_odometry_far_noisier_than_the_settings_say_makes_no_second_map():

@@ -245,10 +245,12 @@ class JointState:
     def gain(self, attempt: Self) -> float:
         """Return how much more the association of an attempt explains than the association of this state (log odds).
 
-        The two associations are compared twice: at the shared errors and the noise of each state. The two gains are added.
-        Otherwise an estimate of the noise that is wrong by chance could decide.
+        Each association counts at the shared errors and the noise of the state at which it explains more. The noise that a
+        wrong map estimates may be far from that at which it explains most. The sum of the gains at both states would be too
+        kind to an attempt with much noise: at this noise, a good map explains little more than a bad one.
         """
-        return attempt.explained - self._explained_like(attempt) + attempt._explained_like(self) - self.explained
+        mine = max(self.explained, self._explained_like(attempt))
+        return max(attempt.explained, attempt._explained_like(self)) - mine
 
     def replaced(self, attempt: Self) -> Self:
         """Return the result of an attempt, with the ledger and the trace of this state."""
