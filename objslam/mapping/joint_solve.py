@@ -24,7 +24,7 @@ from objslam.mapping.joint.doubted_labels import (
 )
 from objslam.mapping.joint.held_errors import Solved, with_gross_errors
 from objslam.mapping.joint.joint_alternation import JointState
-from objslam.mapping.joint.labels import may_be_by_label, scatter_alone
+from objslam.mapping.joint.labels import may_be_by_label
 from objslam.mapping.joint.relocalization import relocalized
 from objslam.mapping.moves.moving_things import associated_at_rest, without_moving_things
 from objslam.mapping.moves.phantoms import begins_with_lasting_errors, has_lasting_errors, without_phantoms
@@ -60,10 +60,8 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
         return _with_several_a_label(state, named.state) if doubted else named.state
     if named.others is not None and (found := at_other_labels(state, named.others)) is not None:
         return _settled(found)
-    # The noise and the shared errors of a map with a bent path would bend the path again. So the search begins without them.
-    # With a localisation, such a path shows as noise of the localisation, and no label is doubted.
-    bent = doubted or scatter_alone(named.state).any() or state.keyframes.localized_every
-    return _associated_again(begin, state if bent else replace(named.state, association=None, estimate=None), None)
+    # The noise and the shared errors of a map that is wrong would bend the path again. So the search begins without them.
+    return _associated_again(begin, state, None)
 
 
 def solve_names(begin: JointState) -> JointState | None:

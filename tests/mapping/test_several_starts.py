@@ -1,6 +1,6 @@
 """The search from several starts: which of them are searched, and when it ends."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 from log_parts import without_names
@@ -8,7 +8,8 @@ from log_parts import without_names
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.errors import SolveError
-from objslam.mapping import pipeline, several_starts
+from objslam.mapping import joint_solve, pipeline, several_starts
+from objslam.mapping.joint.by_label import Named
 from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.several_starts import _Found
 from objslam.simulation import preset, simulate
@@ -81,3 +82,21 @@ def test_a_search_ends_after_its_solves(monkeypatch):
         )
     assert told == [(False, False), (True, True)]
     assert taken[1] < taken[0]
+
+
+def test_a_search_begins_without_the_errors_of_a_map_by_names(monkeypatch):
+    """One object for several things bends the path, and its noise and turn scale would bend the path of the search."""
+    begun, search, solved = [], joint_solve.from_several_starts, joint_solve.by_label
+
+    def wrong(state):
+        named = solved(state).state
+        return Named(replace(named, errors=named.errors.with_noise(replace(named.errors.noise, turning=20.0))), False)
+
+    monkeypatch.setattr(joint_solve, "by_label", wrong)
+    monkeypatch.setattr(joint_solve, "from_several_starts", lambda state: begun.append(state) or search(state))
+    log = simulate(preset("demo", objects=4, frames=80, localization=None, odometry=Odometry(), false=0.0), 1)
+    assert len({one.label for one in log.truth.objects}) == 4
+    settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
+    pipeline.run(log, settings, Ledger())
+    assert [state.errors.noise.turning for state in begun] == [1.0]
+    assert begun[0].estimate is begun[0].association is None

@@ -50,8 +50,7 @@ class Named:
 
 
 def by_label(state: JointState) -> Named:
-    """Return the map with one object per label. If the rays disagree at a few labels only, its shared errors and its noise
-    are still better than the nominal values."""
+    """Return the map with one object per label, or with one for each label that the rays agree with."""
     association = associate_by_label(state.rays)
     solved = state.solve("labels", association)
     assert solved.estimate is not None
