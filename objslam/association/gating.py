@@ -20,8 +20,8 @@ _ALTERNATIONS = 3  # The most alternations after a change. A larger value conver
 _FAR = 1e6
 """The distance (m) from the first camera beyond which only parallel rays meet. A larger distance keeps farther landmarks."""
 _SETTLED = 1e-9
-"""If no position moves by more than this (m), a refinement changed nothing. A larger value leaves positions that the solver
-would still move. Those of settled landmarks move by 1e-15 m."""
+"""If no position moves by more than this (m), and no noise factor changes by more, a refinement changed nothing. A larger
+value leaves positions that the solver would still move. Those of settled landmarks move by 1e-15 m."""
 _PAIRS_AT_ONCE = 1 << 15  # The most pairs of a ray and a landmark gated together. A larger value needs more memory.
 _FEW_PAIRS = 1 << 12  # Up to this number of pairs, computing all exact costs is faster than computing a bound first.
 _TABLE = 1 << 22  # The most entries of a dense table of gains. Larger tables are sparse.
@@ -293,7 +293,8 @@ def alternate(
         matched = best_assignment(edges, cost, obs.frame, most)
         held = np.flatnonzero(matched >= 0)
         position = refine(obs, held, matched[held], old.position, old.noise)
-        if np.array_equal(matched, before) and np.allclose(position, old.position, rtol=0.0, atol=_SETTLED):
+        same = np.array_equal(matched, before) and np.allclose(position, old.position, rtol=0.0, atol=_SETTLED)
+        if same and np.allclose(state.noise, old.noise, rtol=0.0, atol=_SETTLED):
             # The state stays, with all that is known of it. A new one would compute the history of its landmarks again.
             stays = plausible(state)
             return state if stays.all() else state.keep(stays)

@@ -55,8 +55,8 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
         again = by_label(other)
         if again.agree or again.others is not None:
             begin, state, named = wider, state.replaced(other), replace(again, state=state.replaced(again.state))
-    doubted = state.settings.association.method != "by_label" and bool(doubted_names(named.state))
     if named.agree:
+        doubted = state.settings.association.method != "by_label" and bool(doubted_names(named.state))
         return _with_several_a_label(state, named.state) if doubted else named.state
     if named.others is not None and (found := at_other_labels(state, named.others)) is not None:
         return _settled(found)

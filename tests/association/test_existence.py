@@ -340,6 +340,9 @@ def test_a_settled_state_stays_the_same_state():
         if state is before:
             break
     assert state is before
+    louder = replace(state, landmarks=replace(state.landmarks, noise=1.5 * state.landmarks.noise))
+    again = alternate(louder, 13.8, lambda now: np.ones(now.count, dtype=bool))
+    np.testing.assert_allclose(again.landmarks.noise, state.landmarks.noise, rtol=0.1)
     empty = replace(state, matched=np.full_like(state.matched, -1))
     again = alternate(empty, 13.8, lambda now: np.ones(now.count, dtype=bool))
     assert np.array_equal(again.matched, state.matched)
