@@ -8,10 +8,9 @@ import numpy as np
 
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.observations import MIN_DEPTH, SIZED_BY, Observations, UsualSizes
-from objslam.association.refinement import dots, range_costs, refine, variance
+from objslam.association.refinement import range_costs, refine, variance
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.rotation import skew
-from objslam.core.statistics import order_by_group
+from objslam.core.rotation import dots, skew
 
 TRACK_GAIN = 2.0
 """The amount by which a match costs less if most other boxes of the ray's track have the same landmark. A larger value
@@ -110,32 +109,33 @@ def _near(obs: Observations, landmarks: Landmarks, gate: float, pose: Floats | N
         ray, index = np.nonzero(landmarks.accepts[:, obs.label].T)
         ahead = np.einsum("ei,ei->e", landmarks.position[index] - obs.origin[ray], obs.direction[ray]) > MIN_DEPTH
         return ray[ahead], index[ahead]
-    # Rays of one label are side by side, and the axis of x, y and z comes first: scattered and short rows are slow.
-    labels = landmarks.accepts.shape[1]
-    order = order_by_group(obs.label, labels)
-    bounds = np.searchsorted(obs.label[order], np.arange(labels + 1)).tolist()
-    centre, one = obs.origin.mean(axis=0), np.ones(len(order))
-    m, n = (np.ascontiguousarray(rows.take(order, axis=0).T) for rows in (obs.origin - centre, obs.direction))
-    to_depth, to_distance2 = np.stack([*n, -dots(m, n)]), np.stack([*(-2 * m), one, dots(m, m)])
-    sigma2, spread = obs.sigma[order] ** 2, np.linalg.eigvalsh(landmarks.covariance)[:, -1]
-    turn, move = np.zeros((2, len(order)))
+    lines, spread = obs.by_label, np.linalg.eigvalsh(landmarks.covariance)[:, -1]
     if pose is not None:  # Twice its diagonal blocks are an upper bound of the covariance for any correlation.
-        turn, move = (np.asarray(2 * np.linalg.eigvalsh(pose[order, i : i + 3, i : i + 3])[:, -1]) for i in (0, 3))
+        turn, move = (2 * gate * np.linalg.eigvalsh(pose[lines.order, i : i + 3, i : i + 3])[:, -1] for i in (0, 3))
     rays, found = list[Ints](), list[Ints]()
-    for label in np.flatnonzero(np.diff(bounds)).tolist():
+    for label in np.flatnonzero(np.diff(lines.bounds)).tolist():
         which = np.flatnonzero(landmarks.accepts[:, label])
-        p, noise2 = landmarks.position[which] - centre, landmarks.noise[which, None] ** 2
+        p, noise2 = landmarks.position[which] - lines.centre, gate * landmarks.noise[which, None] ** 2
         p4, p5 = np.column_stack([p, np.ones(len(p))]), np.column_stack([p, (p * p).sum(axis=1), np.ones(len(p))])
-        fixed = obs.position_sigma**2 * noise2 + spread[which, None] + 1e-9  # The constant covers rounding errors.
+        # The constant covers rounding errors.
+        fixed = obs.position_sigma**2 * noise2 + gate * (spread[which, None] + 1e-9)
         step = max(1, _PAIRS_AT_ONCE // max(len(which), 1))
-        for begin in range(bounds[label], bounds[label + 1], step):
-            r = slice(begin, min(begin + step, bounds[label + 1]))
-            depth, distance2 = p4 @ to_depth[:, r], p5 @ to_distance2[:, r]
-            limit = distance2 * (sigma2[r] * noise2 + turn[r]) + fixed + move[r]
-            at = np.flatnonzero((distance2 - depth * depth <= gate * limit) & (depth > MIN_DEPTH))
+        for begin in range(lines.bounds[label], lines.bounds[label + 1], step):
+            r = slice(begin, min(begin + step, lines.bounds[label + 1]))
+            depth, distance2 = p4 @ lines.depth[:, r], p5 @ lines.distance2[:, r]
+            limit = noise2 * lines.sigma2[r]
+            if pose is not None:
+                limit += turn[r]
+            limit *= distance2
+            limit += fixed if pose is None else fixed + move[r]
+            ahead = depth > MIN_DEPTH
+            depth *= depth
+            limit += depth
+            ahead &= distance2 <= limit
+            at = np.flatnonzero(ahead)
             b, a = np.divmod(at, r.stop - r.start)
-            rays.append(order[r][a])
-            found.append(which[b])
+            rays.append(lines.order[r].take(a))
+            found.append(which.take(b))
     return np.concatenate(rays), np.concatenate(found)
 
 

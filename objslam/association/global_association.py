@@ -20,13 +20,12 @@ from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import better_neighbours, merge_targets
 from objslam.association.observations import PosedRays, observe
-from objslam.association.refinement import grouped_sums
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import lengths
 from objslam.core.ground.flattening import flattened_points
 from objslam.core.rotation import cross
-from objslam.core.statistics import grouped_quantile
+from objslam.core.statistics import grouped_quantile, grouped_sums
 from objslam.core.types import Association
 
 _TURNS = 8

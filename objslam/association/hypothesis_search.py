@@ -8,7 +8,7 @@ from objslam.association.observations import MIN_DEPTH, Observations, closest_ap
 from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, as_tensor, module_of
 from objslam.core.arrays import Floats, Ints
 
-_PAIRS_AT_ONCE = {"numpy": 1 << 18, "cpu": 1 << 18, "cuda": 1 << 24}
+_PAIRS_AT_ONCE = {"numpy": 1 << 16, "cpu": 1 << 16, "cuda": 1 << 24}
 """The most pairs of a ray and a point scored together, for each backend. On a CPU they fit into the cache. On CUDA, fewer
 need more calls: on an H100, 400,000,000 pairs took 141 ms with 2^18, and 12 ms with 2^22 to 2^28."""
 _LARGE = 1 << 26

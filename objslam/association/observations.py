@@ -4,7 +4,7 @@ The sizes of boxes are evidence too: what a landmark usually measures, and what 
 """
 
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -13,8 +13,8 @@ from objslam.core.appearance.features import FeatureTable
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, box_sizes
 from objslam.core.ground.flattening import LEVEL, flattened_lines
-from objslam.core.rotation import cross
-from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
+from objslam.core.rotation import cross, dots
+from objslam.core.statistics import NORMAL_MEDIAN, grouped_median, order_by_group
 from objslam.core.types import Association, Keyframes, Rays
 
 MIN_DEPTH = 0.05
@@ -33,6 +33,24 @@ value, only larger differences of size count."""
 SIZE_LOSS = 6.0
 """The largest cost of a size. It is less than a usual gate, so that the bearing alone can still match a half hidden thing. A
 larger value loses more boxes of half hidden things."""
+
+
+@dataclass(frozen=True)
+class LinesByLabel:
+    """Lines (R,) in the map, sorted by label, such that products of matrices compare them with points.
+
+    order: (R,) the observations in this order. bounds: (L + 1,) where the lines of each label begin and end. centre: (3,) m,
+    the mean of the origins. For a point p in m from the centre, (p, 1) times the column of a line in `depth` (4, R) is the
+    depth of the point along it, and (p, p p, 1) times its column in `distance2` (5, R) the squared distance from its origin.
+    sigma2: (R,) rad^2, the noise.
+    """
+
+    order: Ints
+    bounds: Ints
+    centre: Floats
+    depth: Floats
+    distance2: Floats
+    sigma2: Floats
 
 
 @dataclass(frozen=True)
@@ -74,8 +92,21 @@ class Observations:
 
     def take(self, rays: Bools | Ints) -> Self:
         """Select rays by a mask or by increasing indices."""
-        selected: dict[str, Any] = {k: v[rays] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
+        rows = np.flatnonzero(rays) if rays.dtype == bool else rays
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        selected: dict[str, Any] = {k: v.take(rows, axis=0) if isinstance(v, np.ndarray) else v for k, v in values.items()}
         return type(self)(**selected)
+
+    @cached_property
+    def by_label(self) -> LinesByLabel:
+        """The lines, those of one label side by side."""
+        labels = int(self.label.max(initial=-1)) + 1
+        order = order_by_group(self.label, labels)
+        bounds = np.searchsorted(self.label[order], np.arange(labels + 1))
+        centre = self.origin.mean(axis=0)
+        m, n = (np.ascontiguousarray(rows.take(order, axis=0).T) for rows in (self.origin - centre, self.direction))
+        distance2 = np.stack([*(-2 * m), np.ones(len(order)), dots(m, m)])
+        return LinesByLabel(order, bounds, centre, np.stack([*n, -dots(m, n)]), distance2, self.sigma[order] ** 2)
 
     def noisier(self, factor: float) -> Self:
         """Return the rays with a factor on their nominal noise."""

@@ -4,7 +4,8 @@ import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations
 from objslam.core.arrays import Floats, Ints
-from objslam.core.statistics import HALF_RAY, grouped_quantiles, order_by_group
+from objslam.core.rotation import dots
+from objslam.core.statistics import HALF_RAY, grouped_quantiles, grouped_sums, order_by_group
 
 RANGE_GAIN = 6.0
 """A perfect range lowers the cost of a match by this, because another object would rarely have this range. A larger value
@@ -19,6 +20,9 @@ _DAMPING = 1e-6
 """The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
 refinement down."""
 _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, because association refines repeatedly.
+_STILL = 1e-11
+"""A point rests if its step (m) is at most this long. Rounding errors in a map of kilometres are as large. With a larger
+value, positions are less exact, and an association is less surely the same from another start."""
 _FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 """The rows and the columns of the six entries that determine a symmetric 3 x 3 matrix. The diagonal comes first."""
 
@@ -80,11 +84,11 @@ def ray_costs(obs: Observations, position: Floats, noise: Floats | float, gate: 
     )
 
 
-def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floats) -> Floats:
+def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floats, iterations: int = _ITERATIONS) -> Floats:
     """Refine positions (N, 3) m of points from P pairs of a ray and its point. A ray may be in several pairs.
 
     ray, index: (P,) the observation and the point of each pair. start: (N, 3) m. A point keeps its start value in directions
-    that its rays do not observe. noise: (N,) factor on the noise of the rays.
+    that its rays do not observe. noise: (N,) factor on the noise of the rays. iterations: the most steps.
     """
     count = len(start)
     order = order_by_group(index, count)
@@ -99,7 +103,7 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
     slope, floor = (factor * obs.sigma[ray]) ** 2, (factor * obs.position_sigma) ** 2  # As in `variance`.
     # For each pair: six entries of a matrix, the pull of the ray, its weight, and the distance.
     each, sums = np.empty((11, len(ray))), np.zeros((11, count))
-    for _ in range(_ITERATIONS):
+    for done in range(1, iterations + 1):
         to = position.T.take(index, axis=1) - origin
         depth, distance2 = dots(to, direction), np.maximum(dots(to, to), 1e-12)
         offset, each[10] = to - depth * direction, np.sqrt(distance2)
@@ -121,6 +125,11 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
         # With little parallax, full steps are unreliable. So no step is longer than the mean distance of the point.
         length, reach = np.sqrt(dots(step, step)), sums[10] / np.maximum(number, 1)
         position = position + (step * np.minimum(1.0, reach / np.maximum(length, 1e-12))).T
+        moving = length > _STILL
+        if 2 * number[moving].sum() < len(ray):  # Most rays belong to points that rest, and take no part in further steps.
+            left = np.flatnonzero(moving[index])
+            more = iterations - done if len(left) else 0
+            return refine(obs, ray[left], index[left], position, noise, more) if more else position
     return position
 
 
@@ -135,11 +144,6 @@ def _solve_symmetric(matrices: Floats, right: Floats) -> Floats:
     d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
     solution = np.stack([dots((a, b, c), right), dots((b, d, e), right), dots((c, e, f), right)])
     return np.asarray(solution / (xx * a + xy * b + xz * c))
-
-
-def dots(a: Floats | tuple[Floats, ...], b: Floats) -> Floats:
-    """Return the products (P,) of vectors (3, P)."""
-    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def refine_damped(obs: Observations, number: Ints, start: Floats, damping: Floats, steps: int) -> tuple[Floats, Floats]:
@@ -210,8 +214,3 @@ def _standard(time: Floats, index: Ints, count: int) -> Floats:
     centred = time - (np.bincount(index, time, count) / number)[index]
     spread = np.sqrt(np.bincount(index, centred**2, count) / number)
     return np.asarray(centred / np.maximum(spread[index], 1e-9))
-
-
-def grouped_sums(values: Floats, index: Ints, count: int) -> Floats:
-    """Return the sums (count, D) of the values (P, D) of each group. index: (P,) the group of each row."""
-    return np.stack([np.bincount(index, column, count) for column in values.T], axis=1).astype(np.float64)

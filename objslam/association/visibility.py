@@ -6,15 +6,14 @@ from functools import cached_property
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations
-from objslam.association.refinement import dots, grouped_sums
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.cut_boxes import CutBoxes
 from objslam.core.camera import Camera, depths, in_view
-from objslam.core.geometry import evenly_spread
 from objslam.core.ground.flattening import LEVEL, raised_points
 from objslam.core.object_map import SeenFrom
-from objslam.core.statistics import distinct, grouped_median, grouped_quantile, grouped_quantiles
+from objslam.core.rotation import dots
+from objslam.core.statistics import distinct, grouped_median, grouped_quantile, grouped_quantiles, grouped_sums
 from objslam.core.types import Keyframes
 
 _WHOLE = 0.25
@@ -34,7 +33,6 @@ _CLOSER = (0.3, 0.1)
 """The least distance from an occluder to the object behind it: in m, and as a share of the object's distance. The larger one
 counts. Half the sum of the two sizes replaces the first if it is smaller, because on a table a thing may hide its neighbour.
 Larger values hide fewer objects."""
-_SIDES = 103  # The number of sides of an object, evenly over the sphere, 20 degrees apart. A larger number is finer.
 _SAME_SIDE = np.cos(np.radians(45.0))
 """The cosine of the largest angle between two views of one side of an object. A smaller cosine counts more frames."""
 _FILLED = 0.6  # The share of a box's width and height that its object certainly fills. A larger value occludes more.
@@ -140,17 +138,20 @@ def detection_history(
     held = np.flatnonzero(matched >= 0)
     index = matched[held]
     distance, total = np.full(len(obs.frame), np.nan), len(view.camera)
-    distance[held] = np.linalg.norm(position[index] - obs.origin[held], axis=1)
-    extent = np.nan_to_num(grouped_median(obs.size[held] * distance[held, None], index, count))
-    near, far = _usual_ranges(distance[held], index, label)
-    own, furthest = (np.nan_to_num(quantile) for quantile in grouped_quantiles(distance[held], index, count, (0.5, 1.0)))
+    # NumPy takes rows in a seventh of the time of an index, and is slow if the last axis is short.
+    toward = obs.origin.T.take(held, axis=1) - position.T.take(index, axis=1)
+    distance[held] = length = np.sqrt(dots(toward, toward))
+    extent = np.nan_to_num(grouped_median(obs.size.take(held, axis=0) * length[:, None], index, count))
+    near, far = _usual_ranges(length, index, label)
+    own, furthest = (np.nan_to_num(quantile) for quantile in grouped_quantiles(length, index, count, (0.5, 1.0)))
     near, far = np.minimum(own, near[label]), np.maximum(own, far[label])
     reach = np.maximum(furthest, far)
     obj, frame, away, pixel = _in_images(position, extent, reach, obs, view)
     inside = np.bincount(obj, minlength=count)
     usual = (away >= near[obj]) & (away <= far[obj])
-    usual &= _from_the_front(obs.origin[held], index, position, obj, frame, view.map_T_camera)
-    obj, frame, away, pixel = obj[usual], frame[usual], away[usual], pixel[usual]
+    usual &= _from_the_front(toward / np.maximum(length, 1e-9), index, position, obj, frame, view.map_T_camera)
+    some = usual.nonzero()[0]
+    obj, frame, away, pixel = obj.take(some), frame.take(some), away.take(some), pixel.take(some, axis=0)
     reach = np.where(np.isfinite(obs.range), obs.range, distance)
     clear = ~_hidden(frame, away, pixel, obs, reach, _mean_size(extent[obj]))
     if view.cut is not None:
@@ -160,23 +161,6 @@ def detection_history(
     detected = np.zeros(len(key), dtype=bool)
     detected[np.searchsorted(key, there)] = True
     return DetectionHistory(*np.divmod(key, total), detected, inside)
-
-
-def seen_from(position: Floats, origins: Floats) -> SeenFrom:
-    """Return the distances and directions from which cameras at origins (n, 3), m, detected an object at a position (3,),
-    m."""
-    toward = origins - position
-    distance = np.linalg.norm(toward, axis=1)
-    sides = thinned(toward / np.maximum(distance, MIN_DEPTH)[:, None])
-    return SeenFrom(round(float(distance.min()), 3), round(float(distance.max()), 3), sides)
-
-
-def thinned(directions: Floats) -> Floats:
-    """Return the mean direction (S, 3) of each group of unit directions (n, 3). The groups are about 20 degrees wide."""
-    cell = (directions @ evenly_spread(_SIDES).T).argmax(axis=1)
-    number, group = np.unique(cell, return_inverse=True)
-    mean = grouped_sums(directions, group.ravel(), len(number))
-    return np.asarray(np.round(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9), 4))
 
 
 def count_looks(
@@ -231,20 +215,20 @@ def _usual_ranges(distance: Floats, index: Ints, label: Ints) -> list[Floats]:
     return grouped_quantiles(distance[core_box], label[index[core_box]], classes, _USUAL_DISTANCES)
 
 
-def _from_the_front(origin: Floats, index: Ints, position: Floats, obj: Ints, frame: Ints, map_T_camera: Floats) -> Bools:
+def _from_the_front(toward: Floats, index: Ints, position: Floats, obj: Ints, frame: Ints, map_T_camera: Floats) -> Bools:
     """Return whether the camera of each frame (V,) sees the front of its object (V,). A screen, for example, has a front.
 
-    An object has a front if nearly all its boxes come from one half space. Misses from behind then mean nothing. origin,
-    index: (P, 3) m and (P,), the camera position and the object of each box. map_T_camera: (F, 4, 4) of the frames.
+    An object has a front if nearly all its boxes come from one half space. Misses from behind then mean nothing. toward: (3,
+    P) unit, from the object of each box to the camera. index: (P,) this object. map_T_camera: (F, 4, 4) of the frames.
     """
-    count, toward = len(position), origin - position[index]
-    toward = toward / np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
-    front, seen = grouped_sums(toward, index, count), np.ones(len(obj), dtype=bool)
-    facing = np.einsum("pi,pi->p", toward, front[index])
+    count, seen = len(position), np.ones(len(obj), dtype=bool)
+    front = grouped_sums(toward.T, index, count).T
+    facing = dots(toward, front.take(index, axis=1))
     one_sided = np.nan_to_num(grouped_quantile(facing, index, count, 1 - _FRONT_SHARE)) >= 0
     asked = np.flatnonzero(one_sided[obj])
-    obj = obj[asked]
-    seen[asked] = np.einsum("vi,vi->v", map_T_camera[frame[asked], :3, 3] - position[obj], front[obj]) >= 0
+    obj, frame, origin = obj[asked], frame[asked], map_T_camera[:, :3, 3].T
+    ahead = sum(o.take(frame) * f.take(obj) for o, f in zip(origin, front, strict=True))
+    seen[asked] = ahead >= dots(position.T, front).take(obj)
     return seen
 
 
@@ -273,20 +257,26 @@ def _in_image(
     poses = view.map_T_camera[frames]
     centre = poses[:, :3, 3].mean(axis=0)
     point, origin, ahead = position - centre, (poses[:, :3, 3] - centre).T, poses[:, :3, 2].T
-    depth = point @ ahead - dots(ahead, origin)
-    distance2 = (-2 * point) @ origin + (dots(origin, origin) + (point**2).sum(axis=1)[:, None])
+    one, share = np.ones((len(point), 1)), np.cos(camera.view_angle) ** 2
+    depth = np.hstack([point, one]) @ np.vstack([ahead, -dots(ahead, origin)])
+    rows = np.hstack([-2 * point, one, (point**2).sum(axis=1)[:, None]])
+    distance2 = rows @ np.vstack([origin, dots(origin, origin), np.ones(len(frames))])
     # Most objects are outside the cone of view and need no projection.
     near = (distance2 > MIN_DEPTH**2) & (distance2 <= (reach[:, None] + 1e-6) ** 2) & (depth > 0)
-    near &= depth * depth >= np.maximum(distance2, 0.0) * np.cos(camera.view_angle) ** 2
+    depth *= depth
+    distance2 *= share
+    near &= depth >= distance2
     n, f = np.divmod(np.flatnonzero(near), len(frames))
-    apart = position.take(n, axis=0) - poses[:, :3, 3].take(f, axis=0)
-    local = np.einsum("vji,vj->vi", poses[:, :3, :3].take(f, axis=0), apart)
+    # The axis of x, y and z comes first, because NumPy is slow if the last axis is short.
+    apart = point.T.take(n, axis=1) - origin.take(f, axis=1)
+    local = np.stack([dots(axis.T.take(f, axis=1), apart) for axis in np.moveaxis(poses[:, :3, :3], 2, 0)], axis=1)
+    away = np.sqrt(np.einsum("vi,vi->v", local, local))
     half = np.zeros((len(n), 2))
     if view.margin >= 0 and extent is not None:
-        box = extent[n] * np.diag(camera.matrix)[:2] / depths(camera, local)[:, None]
+        box = (extent * np.diag(camera.matrix)[:2]).take(n, axis=0) / depths(camera, local)[:, None]
         half = box / 2 + np.maximum(view.margin, view.margin_share * box)
     inside, pixel = in_view(camera, local, half, camera.size - 1 - half)
-    return n[inside], frames[f[inside]], np.linalg.norm(local[inside], axis=1), pixel
+    return n[inside], frames[f[inside]], away[inside], pixel
 
 
 def _whole_boxes(obs: Observations, view: CameraFrames) -> Bools:
@@ -334,17 +324,21 @@ def _hidden(frame: Ints, distance: Floats, pixel: Floats, obs: Observations, rea
     frames = np.arange(int(max(frame.max(initial=0), obs.frame.max(initial=0))) + 2)
     start = np.searchsorted(obs.frame[useful], frames)
     begin, end = start[frame], start[frame + 1]
-    middle, half = (obs.box[:, :2] + obs.box[:, 2:]) / 2, _FILLED * (obs.box[:, 2:] - obs.box[:, :2]) / 2
+    low, high = obs.box[:, :2].T, obs.box[:, 2:].T
+    middle, half = (low + high) / 2, _FILLED * (high - low) / 2
     thick = _mean_size(obs.size) * np.nan_to_num(reach)
     number = end - begin
     most = np.argsort(-number, kind="stable")
     fewer = -number[most]
     for k in range(int(number.max(initial=0))):  # Each step checks the k-th box of all frames that have one.
         rows = most[: np.searchsorted(fewer, -k)]
-        box = useful[begin[rows] + k]
-        closer = reach[box] < (1 - _CLOSER[1]) * distance[rows]
-        rows, box = rows[closer], box[closer]
-        apart = np.where(size[rows] > 0, np.minimum((thick[box] + size[rows]) / 2, _CLOSER[0]), _CLOSER[0])
-        over = (np.abs(pixel[rows] - middle[box]) <= half[box]).all(axis=1)
-        hidden[rows] |= over & (reach[box] < distance[rows] - apart)
+        box = useful.take(begin.take(rows) + k)
+        closer = np.flatnonzero(reach.take(box) < (1 - _CLOSER[1]) * distance.take(rows))
+        rows, box = rows.take(closer), box.take(closer)
+        for axis in (0, 1):
+            over = np.flatnonzero(np.abs(pixel[:, axis].take(rows) - middle[axis].take(box)) <= half[axis].take(box))
+            rows, box = rows.take(over), box.take(over)
+        own = size.take(rows)
+        apart = np.where(own > 0, np.minimum((thick[box] + own) / 2, _CLOSER[0]), _CLOSER[0])
+        hidden[rows] |= reach[box] < distance[rows] - apart
     return hidden

@@ -39,6 +39,11 @@ def cross(a: Floats, b: Floats) -> Floats:
     return product
 
 
+def dots(a: Floats | tuple[Floats, ...], b: Floats) -> Floats:
+    """Return the products (P,) of vectors (3, P)."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
 def rotation_from_vector(omega: Floats) -> Floats:
     """Return the rotations (..., 3, 3) about vectors (..., 3) by their lengths, rad (Rodrigues' formula)."""
     squared = np.einsum("...i,...i->...", omega, omega)

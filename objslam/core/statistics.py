@@ -142,6 +142,11 @@ def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[flo
     return results
 
 
+def grouped_sums(values: Floats, index: Ints, count: int) -> Floats:
+    """Return the sums (count, D) of the values (P, D) of each group. index: (P,) the group of each row."""
+    return np.stack([np.bincount(index, column, count) for column in values.T], axis=1).astype(np.float64)
+
+
 def order_by_group(index: Ints, count: int) -> Ints:
     """Return the order (R,) that brings the members of each group together. Members of one group keep their order.
 

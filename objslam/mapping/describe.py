@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from objslam.association.observations import extents
-from objslam.association.visibility import seen_from
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Floats32, Ints
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off, is_planar, widest_angle
+from objslam.core.maps.seen_sides import seen_from
 from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult

@@ -9,9 +9,9 @@ import numpy as np
 from objslam.association.crossings.usual_views import UsualViews
 from objslam.association.landmarks import State
 from objslam.association.observations import MIN_DEPTH
-from objslam.association.refinement import grouped_sums, squared_offsets, variance
+from objslam.association.refinement import squared_offsets, variance
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.statistics import STRAY_RAY, grouped_median
+from objslam.core.statistics import STRAY_RAY, grouped_median, grouped_sums
 
 COUNTED = 10
 """The most boxes of a bundle that count as independent measurements of its growth, as in `existence`. A larger number trusts

@@ -8,8 +8,9 @@ import numpy as np
 
 from objslam.association.crossings.bundles import Bundles
 from objslam.association.observations import MIN_DEPTH
-from objslam.association.refinement import grouped_sums, refine, variance
+from objslam.association.refinement import refine, variance
 from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import grouped_sums
 
 _STEPS = 48
 """The number of distances that are tried for a bundle, evenly in ln distance. A larger number is more exact, and slower."""

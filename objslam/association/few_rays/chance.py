@@ -14,11 +14,11 @@ from objslam.association.existence import Rates
 from objslam.association.gating import Edges
 from objslam.association.landmarks import State
 from objslam.association.observations import Observations
-from objslam.association.refinement import grouped_sums, range_costs, variance
+from objslam.association.refinement import range_costs, variance
 from objslam.association.visibility import CameraFrames
 from objslam.core.arrays import Floats, Ints
 from objslam.core.ground.flattening import raised_points
-from objslam.core.statistics import grouped_median
+from objslam.core.statistics import grouped_median, grouped_sums
 
 MOST_ODDS = 20.0
 """The largest absolute log odds against chance. This limit only keeps them finite."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from objslam.association.landmarks import State
 from objslam.association.observations import MIN_DEPTH
-from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import grouped_sums
 
 _HALF = 3.0
 """The squared deviation at which a ray has half of its full weight. On 30 simulated streets, 2 and 4 give the same objects,

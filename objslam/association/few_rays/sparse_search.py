@@ -10,8 +10,8 @@ import numpy as np
 
 from objslam.association.few_rays.chance import Strays, log_volume, ray_odds
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
-from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.statistics import grouped_sums
 
 _MOST_PAIRS = 4096
 """The most pairs of rays whose odds are computed. The pairs that fit best are taken. A larger number finds more in dense

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from objslam.association.observations import size_per_metre
-from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.result import Doubt, RunResult
-from objslam.core.statistics import NORMAL_MEDIAN, grouped_median
+from objslam.core.statistics import NORMAL_MEDIAN, grouped_median, grouped_sums
 from objslam.frontend.up import up_axis, up_vector
 
 _FEWEST = 10

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.refinement import grouped_sums, refine
+from objslam.association.refinement import refine
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.statistics import CLIPPED_RAY
+from objslam.core.statistics import CLIPPED_RAY, grouped_sums
 from objslam.mapping.doubts.evidence import Evidence
 
 _FEWEST = 5

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH
-from objslam.association.refinement import grouped_sums
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.noise import MOST_POSE_NOISE
+from objslam.core.statistics import grouped_sums
 from objslam.mapping.fixed.few_box_search import Searched, SparseNoise
 from objslam.mapping.fixed.pose_noise import least_cost
 
