@@ -87,20 +87,20 @@ class Rates:
         return np.asarray(np.logaddexp(usual, unusual) - as_phantom)
 
 
-def detection_rates(history: DetectionHistory, label: Ints, labels: int) -> Rates:
+def detection_rates(history: DetectionHistory, label: Ints, labels: int, told: bool = False) -> Rates:
     """Estimate the rate of each class (L,) as the median over its boxes. If a class has few boxes, its rate is near the rate
     of all classes. The concentration is the lowest one whose likelihood is not clearly below the highest likelihood. In this
     likelihood, any object may be a phantom.
 
     The boxes of one object tell nothing about the differences between objects of its class. So the more objects a class
     has, the less likely is it that its rate does not tell the rate of an object (`untold`). label: (N,) of the objects.
-    labels: the number L of all labels."""
+    labels: the number L of all labels. told: whether the rate of a class always tells that of its objects."""
     seen, expected = history.seen.astype(float), history.expected
     own = seen / np.maximum(expected, 1)
     overall = _weighted_median(own, seen, np.zeros(len(seen), dtype=np.int64), 1)
     boxes = np.bincount(label, seen, labels)
     mean = (boxes * _weighted_median(own, seen, label, labels) + _POOLED_BOXES * overall) / (boxes + _POOLED_BOXES)
-    untold = 1 / np.maximum(np.bincount(label, minlength=labels), 1)
+    untold = 0.0 if told else 1 / np.maximum(np.bincount(label, minlength=labels), 1)
     of_all = float(np.clip(overall[0], *_RATE_LIMITS))
     rates = Rates(np.clip(mean, *_RATE_LIMITS), np.array(_CONCENTRATIONS)[:, None], of_all, untold)
     likelihood = np.logaddexp(0.0, rates.log_odds(history, label)).sum(axis=1)
@@ -138,8 +138,7 @@ def existence(state: State, gate: float) -> Floats:
 def rates_of_classes(state: State) -> Rates:
     """Return the `detection_rates` of the landmarks of a state. With a localisation, the rate of a class always tells the
     rate of its objects, because they may be detected more rarely anyway (`rarer_objects`)."""
-    rates = detection_rates(state.history, state.label, len(state.unassigned))
-    return replace(rates, untold=0.0) if state.view.localized else rates
+    return detection_rates(state.history, state.label, len(state.unassigned), state.view.localized)
 
 
 def static_odds(state: State, gate: float, fitted: int = 0) -> Floats:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from objslam.association.existence import detection_rates
+from objslam.association.existence import rates_of_classes
 from objslam.association.gating import gated_edges
 from objslam.association.label_fusion import SIZE_RATIO
 from objslam.association.landmarks import State
@@ -156,7 +156,7 @@ def _gains(state: State, gate: float, pairs: _Pairs, both_seen: Ints, both_expec
     saved = np.bincount(pairs.pair, two - one, count) + _OBJECT_COST + 3 * np.log(number[a] + number[b])
     if state.looks is not None:
         saved += 2 * state.looks.landmark_odds(a, b, state.label[a])
-    rates = detection_rates(history, state.label, len(state.unassigned))
+    rates = rates_of_classes(state)
     misses = rates.cost(history.seen, history.expected, state.label)
     stronger = np.where(number[a] >= number[b], state.label[a], state.label[b])
     seen = history.seen[a] + history.seen[b] - both_seen

@@ -10,7 +10,7 @@ import numpy as np
 
 from objslam import config
 from objslam.association.appearance.evidence import learn_ratio
-from objslam.association.existence import detection_rates, static_odds
+from objslam.association.existence import rates_of_classes, static_odds
 from objslam.association.few_rays.chance import Strays, chance_odds, log_evidence, unmatched_costs
 from objslam.association.few_rays.place_errors import moments, place_errors
 from objslam.association.few_rays.sparse_search import SparseSearch, discover_sparse
@@ -122,7 +122,7 @@ def few_ray_evidence(
         found = replace(found, landmarks=replace(found.landmarks, position=at))
     if not found.count:
         return FewRayEvidence(0.0, 0.0, 0.0, *members)
-    rates = detection_rates(found.history, found.label, len(found.unassigned))
+    rates = rates_of_classes(found)
     chance = log_evidence(found, few.gate, few.strays, rates)
     explained = float((found.matched >= 0).mean())
     return FewRayEvidence(chance, rates.log_likelihood(found.history, found.label), explained, *members)
@@ -247,7 +247,7 @@ class _Few:
     def existence(self, found: State) -> Floats:
         """Return the probability (N,) that each new landmark is a static object, and not strays that meet by chance."""
         every = self.joined(found)
-        rates = detection_rates(every.history, every.label, len(every.unassigned))
+        rates = rates_of_classes(every)
         odds = chance_odds(every, self.gate, self.strays, rates) + _alike_odds(every)
         return np.asarray(logistic(static_odds(every, self.gate, fitted=_MOVING)) * logistic(_POWER * odds))[
             self.known.count :
