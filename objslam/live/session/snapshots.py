@@ -17,6 +17,7 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 from objslam.live.names.contradicted import contradicted
 from objslam.live.session.landmark_description import describe_landmark, describe_track
+from objslam.live.session.map_scale import scale_covariances, scale_sigma
 
 _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
 
@@ -76,6 +77,7 @@ class Describer:
                 self._bodies.update(m, self._covariances)
             turned = set(landmarks.id[landmarks.shape > 0].tolist())
             objects = [self._bodies.described(o, o.id in turned) for o in objects]
+        objects = _of_unknown_scale(m, objects)
         first = int(landmarks.id.max(initial=-1)) + 1
         waiting = [track for track in m.tracks if len(track.rays) >= m.settings.live.min_rays]
         now = {track.id: self._wait(m, track, whole, end) for track in waiting}
@@ -104,6 +106,16 @@ class Describer:
         if not whole and ((before is not None and before[0] == len(track.rays)) or time.perf_counter() > end):
             return before
         return len(track.rays), describe_track(m, track)
+
+
+def _of_unknown_scale(m: MapState, objects: list[MapObject]) -> list[MapObject]:
+    """Return the objects with the covariances that the unknown scale of the map adds."""
+    known = [i for i, o in enumerate(objects) if o.covariance is not None]
+    if not known or scale_sigma(m) == 0:
+        return objects
+    more = scale_covariances(m, np.array([objects[i].position for i in known]))
+    wider = {i: replace(objects[i], covariance=objects[i].covariance + one) for i, one in zip(known, more, strict=True)}
+    return [wider.get(i, o) for i, o in enumerate(objects)]
 
 
 def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) -> Snapshot:
