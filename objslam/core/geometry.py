@@ -319,9 +319,10 @@ def widest_angle(directions: Floats) -> float:
 
 
 def angles_off(origins: Floats, directions: Floats, points: Floats) -> Floats:
-    """Return the angles (R,), rad in [0, pi], between unit directions (R, 3) and points (R, 3), seen from origins (R, 3)."""
+    """Return the angles (...), rad in [0, pi], between unit directions (..., 3) and points (..., 3), seen from origins
+    (..., 3)."""
     to = points - origins
-    return np.arctan2(lengths(cross(to, directions)), np.einsum("ri,ri->r", to, directions))
+    return np.arctan2(lengths(cross(to, directions)), np.einsum("...i,...i->...", to, directions))
 
 
 @lru_cache(maxsize=8)

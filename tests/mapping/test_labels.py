@@ -112,6 +112,25 @@ def test_boxes_drawn_twice_and_a_few_wrong_names_leave_one_object_per_label():
     assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)
 
 
+def test_boxes_of_one_object_with_the_name_of_another_are_no_second_object():
+    """The detector gives eight boxes of one object the name of another object, which has a box in the same frames."""
+    log = drive(2, pixel_sigma=1.0)
+    found = log.cameras[0].detections
+    seen = np.zeros((len(found.frame_stamps), len(found.label_names)), dtype=bool)
+    seen[found.frame, found.label] = True
+    together = seen.T.astype(int) @ seen
+    np.fill_diagonal(together, 0)
+    one, other = np.unravel_index(together.argmax(), together.shape)
+    wrong = np.flatnonzero((found.label == one) & seen[found.frame, other])[::5][:8]
+    assert len(wrong) == 8
+    label = found.label.copy()
+    label[wrong] = other
+    camera = replace(log.cameras[0], detections=replace(found, label=label))
+    result, _ = mapped(replace(log, cameras=(camera,)))
+    assert result.summary["rounds"] == []
+    assert Counter(o.label for o in result.map.resolved()) == Counter(o.label for o in log.truth.objects)
+
+
 def test_a_second_object_that_is_seldom_seen_is_found_beside_the_first():
     """Its few boxes are all in frames that show the first object of its label too."""
     log = drive(4, frames=200, laps=2)

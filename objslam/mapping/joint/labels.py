@@ -79,13 +79,15 @@ def shows_second_object(
 ) -> bool:
     """Return whether a label has a second object: rays without an object meet in one point, more closely than by chance.
 
-    Two kinds of rays do not count. The first agree with the object of their label. The second have a box around that object,
-    which has another box in the same keyframe. keyframes: of the rays. map_T_camera: (K, 4, 4) the solved poses.
+    Three kinds of rays do not count. The first agree with the object of their label. The second have a box around that
+    object, which has another box in the same keyframe. The third have a wrong name (`_misnamed`). keyframes: of the rays.
+    map_T_camera: (K, 4, 4) the solved poses.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
     off = angles_to_objects(rays, estimate, map_T_camera)
     other = (association.object < 0) & ~(off <= _AGREES * rays.sigma) & ~_drawn_twice(rays, association)
+    other &= ~_misnamed(rays, association, estimate, map_T_camera)
     others = Association(np.where(other, np.searchsorted(association.label, rays.label), -1), association.label)
     found = triangulate_at(map_T_camera, keyframes, rays, others, settings)
     return bool((found.ok & (found.counts >= settings.association.min_rays)).any())
@@ -100,6 +102,24 @@ def _drawn_twice(rays: Rays, association: Association) -> Bools:
     twin = order[np.minimum(np.searchsorted(key[order], key), len(order) - 1)]
     own, other = rays.box, rays.box[twin]
     return (key[twin] == key) & (_contains(own, other) | _contains(other, own))
+
+
+def _misnamed(rays: Rays, association: Association, estimate: Estimate, map_T_camera: Floats) -> Bools:
+    """Return which rays (R,) without an object agree with the object of another label, which has no box in their keyframe.
+
+    A detector sometimes gives a box a wrong name. Then the object misses a box, and the label has one too many. Several of
+    these boxes may be of one object, so their rays meet there.
+    """
+    asked = np.flatnonzero(association.object < 0)
+    origins, directions = rays.in_map(map_T_camera)
+    off = angles_off(origins[asked, None], directions[asked, None], estimate.positions)
+    seen = np.zeros((len(map_T_camera), association.count), dtype=bool)
+    held = association.object >= 0
+    seen[rays.keyframe[held], association.object[held]] = True
+    near = (off <= _AGREES * rays.sigma[asked, None]) & ~seen[rays.keyframe[asked]]
+    misnamed = np.zeros(len(rays), dtype=bool)
+    misnamed[asked] = near.any(axis=1)
+    return misnamed
 
 
 def _contains(boxes: Floats, others: Floats) -> Bools:
