@@ -117,7 +117,7 @@ def one_start() -> Iterator[None]:
     from objslam.mapping import several_starts
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(several_starts, "_unclear", lambda state: False)
+        patch.setattr(several_starts, "_unclear", lambda state, confirmed: False)
         yield
 
 

@@ -150,7 +150,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert "Traceback" not in done.err
             if text.startswith("objslam demo --boxes"):
                 thinned(folder / "demo_boxes" / "log" / "detections.jsonl")
-                patch.setattr(several_starts, "_unclear", lambda state: False)  # As `one_start` does.
+                patch.setattr(several_starts, "_unclear", lambda state, confirmed: False)  # As `one_start` does.
     return folder
 
 

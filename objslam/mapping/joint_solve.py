@@ -61,7 +61,7 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     if named.others is not None and (found := at_other_labels(state, named.others)) is not None:
         return _settled(found)
     # The noise and the shared errors of a map that is wrong would bend the path again. So the search begins without them.
-    return _associated_again(begin, state, None)
+    return _associated_again(begin, state, None, named.state)
 
 
 def solve_names(begin: JointState) -> JointState | None:
@@ -87,10 +87,13 @@ def _may_be_names(state: JointState) -> bool:
     return may_be_by_label(state.settings, state.all_rays) and (known or not labels_diverge(state.keyframes, state.rays))
 
 
-def _associated_again(begin: JointState, state: JointState, start: InitialEstimate | None) -> JointState:
-    """Return the state after association and solve. If its map shows a gross error that was held, this is done again."""
+def _associated_again(
+    begin: JointState, state: JointState, start: InitialEstimate | None, named: JointState | None = None
+) -> JointState:
+    """Return the state after association and solve. If its map shows a gross error that was held, this is done again. named:
+    as in `from_several_starts`."""
     before = state.ledger.copy()
-    found = _associated(state, start)
+    found = _associated(state, start, named)
     wider, found = _with_gross_errors(begin, found)
     if wider is None:
         return found
@@ -123,7 +126,7 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
     """
     doubted = doubted_names(named)
     try:
-        other = _associated(state.attempt(), None)
+        other = _associated(state.attempt(), None, named)
         odds = evidence_against(named, other) if has_several(other) else -np.inf
     except SolveError:  # The map by labels is there, whatever is wrong with the other one.
         return replace(named, doubted=doubted)
@@ -133,8 +136,9 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
     return replace(named, doubted=doubted) if unclear else named
 
 
-def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
-    """Return the state after association and solve from a known start, or from an exploration of the log."""
+def _associated(state: JointState, start: InitialEstimate | None, named: JointState | None = None) -> JointState:
+    """Return the state after association and solve from a known start, or from an exploration of the log. named: as in
+    `from_several_starts`."""
     if start is not None or state.keyframes.localized_every:
         doubtful = begins_with_lasting_errors(state)
         found = improved(from_start(state, start), relocalized)
@@ -144,7 +148,7 @@ def _associated(state: JointState, start: InitialEstimate | None) -> JointState:
             if state.keyframes.odom_T_base is not None:  # It tells the motions of the path through a map without phantoms.
                 state = without_phantoms(state)
     else:
-        state = from_several_starts(state)
+        state = from_several_starts(state, named)
         state = improved(state, JointState.split)
     return _settled(state)
 

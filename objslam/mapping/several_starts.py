@@ -25,23 +25,25 @@ _CLEAR = 0.98
 """The least share of agreeing rays of a clear map, among the rays of tracks. With a larger share, more logs are tried from
 other starts, which takes time. Of 15 simulated robots, right maps had 0.983 and more, and most maps with doubles at most
 0.963. A bent map of a real robot, with ranges, had 0.976."""
-_NOISIER = 1.5
-"""The largest factor on the noise of rays of a clear map. Rays that are given to wrong objects make it large: 12 in a
-simulated map with doubles. With a smaller factor, more logs are tried from other starts."""
+_NOISIER = 1.5, 2.5
+"""The largest factors on the noise of rays of a clear map: of one that only one start found, and of one that another start
+found too. Rays that have wrong objects make it large: 3.6 and 12 in simulated maps with doubles. Boxes that sit beside the
+things by a share of their sizes do so too: 1.5 to 1.8 in right maps. With smaller factors, more logs are tried from other
+starts."""
 
 
-def from_several_starts(state: JointState) -> JointState:
+def from_several_starts(state: JointState, named: JointState | None = None) -> JointState:
     """Return the state after a search from the first exploration, or from the best of further starts while it is unclear.
 
     A search for a more likely path takes many solves, and ends after `joint.max_solves`. So a further start is searched at
     once only if its first map explains the log better than the first maps of all earlier starts. The others are searched at
     last, and first the one that explains most: a start may be poor and still lead to the best map. state: before the first
-    association.
+    association. named: the state with one object for each label, if this was tried.
     """
     begin, path = with_errors_of_tracks(replace(state, effort=Effort()))
     start, sure = explored(begin)
     first = from_start(*solved_if_sure(begin, start, sure))
-    found = _Found(first, _searched(first))
+    found = _Found(first, _searched(first)).compared(named)
     noisier = with_loose_odometry(first, begin.theta, sure)
     if noisier is not None and not begin.spent:
         other, sure = explored(noisier)
@@ -58,21 +60,33 @@ def from_several_starts(state: JointState) -> JointState:
     if np.isfinite(begin.rays.range).any():
         starts = [along_tracks] if not sure else [by_windows] if largest_copy_in(found.state) else []
     for other_start in starts:  # The first ones take less time.
-        if not _unclear(found.state) or begin.spent:
+        if not found.unclear or begin.spent:
             break
         found = found.after(other_start)
     found = found.with_the_others()
-    return replace(found.state, unfinished=begin.spent and _unclear(found.state))
+    return replace(found.state, unfinished=begin.spent and found.unclear)
 
 
 @dataclass(frozen=True)
 class _Found:
     """What the starts of a search led to. first: the best first map of a start. state: the best map after a search. left:
-    the first maps that are not searched yet."""
+    the first maps that are not searched yet. confirmed: whether another start led to the objects of `state`."""
 
     first: JointState
     state: JointState
     left: tuple[JointState, ...] = ()
+    confirmed: bool = False
+
+    @property
+    def unclear(self) -> bool:
+        """Whether the best map may be wrong, so that other starts are worth their time."""
+        return _unclear(self.state, self.confirmed)
+
+    def compared(self, other: JointState | None) -> Self:
+        """Return what is found, and whether another map has the same objects."""
+        if other is None or other.association is None or len(other.rays) != len(self.state.rays):
+            return self
+        return replace(self, confirmed=self.confirmed or finds_same_objects(self.state, other.association))
 
     def after(self, start: Callable[[], JointState]) -> Self:
         """Return what is found with one more start. It is searched only if its first map is better than all before."""
@@ -81,13 +95,15 @@ class _Found:
             promising = self.first.gain(first) > 0
         except SolveError:  # The map so far is there, whatever is wrong with the other start.
             return self
-        return replace(self, first=first).searched(first) if promising else replace(self, left=(*self.left, first))
+        if promising:
+            return replace(self, first=first).searched(first)
+        return replace(self, left=(*self.left, first)).compared(first)
 
     def with_the_others(self) -> Self:
         """Return what is found with the starts that are left, while the map is unclear and solves are left."""
         found = self
         for first in sorted(self.left, key=lambda one: -one.explained):
-            if first.spent or not _unclear(found.state):
+            if first.spent or not found.unclear:
                 break
             found = found.searched(first)
         return found
@@ -95,7 +111,8 @@ class _Found:
     def searched(self, first: JointState) -> Self:
         """Return what is found with a search from the first map of a start."""
         try:
-            return replace(self, state=self.state.better(_searched(first)))
+            state = self.state.better(_searched(first))
+            return self if state is self.state else replace(self, state=state, confirmed=False)
         except SolveError:  # The map so far is there.
             return self
 
@@ -113,17 +130,20 @@ def _from_tracks(begin: JointState) -> JointState:
     return with_missed_loops(begin.attempt().counted(found).solve("association", found))
 
 
-def _unclear(state: JointState) -> bool:
+def _unclear(state: JointState, confirmed: bool = False) -> bool:
     """Return whether a map may be wrong, so that other starts are worth their time.
 
     An exploration goes wrong by chance, so another start may be right. The false boxes of a detector agree with no object in
     the best of maps, but they are single boxes. So only the rays of tracks are judged, if there are any. All rays may agree
-    with a map that shows the same things at several places. Copies of their relative positions then tell.
+    with a map that shows the same things at several places. Copies of their relative positions then tell. All rays may also
+    agree because wrong objects made their noise large. But wrong maps of two starts differ. So some noise says nothing
+    against objects that another start found too (confirmed). A second exploration is no other start: it goes wrong as the
+    first one did.
     """
     noise = 1.0 if state.errors is None else state.errors.noise.rays
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
     agree = state.agree[tracked] if tracked.any() else state.agree
-    return bool(agree.mean() < _CLEAR or noise > _NOISIER or largest_copy_in(state))
+    return bool(agree.mean() < _CLEAR or noise > _NOISIER[confirmed] or largest_copy_in(state))
 
 
 def from_start(state: JointState, start: InitialEstimate | None) -> JointState:

@@ -1,12 +1,16 @@
 """The search from several starts: which of them are searched, and when it ends."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from log_parts import without_names
 
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.noise import NoiseFactors
+from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.mapping import joint_solve, pipeline, several_starts
 from objslam.mapping.joint.by_label import Named
@@ -17,10 +21,31 @@ from objslam.simulation import preset, simulate
 
 @dataclass(frozen=True)
 class Map:
-    """A map with its log evidence."""
+    """A map with its log evidence, the objects of its rays, the noise of its rays, and whether they agree."""
 
     explained: float
     spent: bool = False
+    objects: tuple[int, ...] = (0, 0, 1, 1)
+    noise: float = 1.0
+    agrees: bool = True
+
+    @property
+    def association(self):
+        return Association(np.array(self.objects), np.zeros(2, dtype=np.int64))
+
+    @property
+    def rays(self):
+        return self.objects
+
+    @property
+    def agree(self):
+        return np.full(len(self.objects), self.agrees)
+
+    @property
+    def errors(self):
+        return SimpleNamespace(noise=NoiseFactors(rays=self.noise))
+
+    keyframes = None
 
     def gain(self, other):
         return other.explained - self.explained
@@ -54,7 +79,7 @@ def test_the_other_starts_are_searched_at_last(monkeypatch):
         return Map(one.explained + 100)
 
     monkeypatch.setattr(several_starts, "_searched", search)
-    monkeypatch.setattr(several_starts, "_unclear", lambda one: True)
+    monkeypatch.setattr(several_starts, "_unclear", lambda one, confirmed: True)
     found = _Found(Map(100.0), Map(150.0))
     for explained in (70.0, 90.0, 80.0):
         found = found.after(lambda explained=explained: Map(explained))
@@ -63,9 +88,32 @@ def test_the_other_starts_are_searched_at_last(monkeypatch):
     assert searched == [90.0, 80.0, 70.0]
 
 
+@pytest.mark.parametrize(
+    ("noise", "objects", "agrees", "unclear"),
+    [
+        (1.7, (0, 0, 1, 1), True, False),
+        (1.7, (1, 1, 0, 0), True, False),
+        (1.7, (0, 0, 0, 1), True, True),
+        (3.6, (0, 0, 1, 1), True, True),
+        (1.0, (0, 0, 1, 1), False, True),
+    ],
+    ids=["the same objects", "in another order", "other objects", "wrong maps have such noise", "rays that do not agree"],
+)
+@pytest.mark.parametrize("by_names", [True, False])
+def test_a_noisy_map_is_clear_if_another_start_finds_its_objects(monkeypatch, noise, objects, agrees, unclear, by_names):
+    """The other start is the map by names, or a start whose first map is no better."""
+    monkeypatch.setattr(several_starts, "associate_tracks", lambda keyframes, rays: Association(np.full(4, -1), np.zeros(0)))
+    monkeypatch.setattr(several_starts, "largest_copy_in", lambda state: 0)
+    found = _Found(Map(100.0), Map(150.0, noise=noise, agrees=agrees))
+    assert found.unclear
+    other = Map(90.0, objects=objects)
+    found = found.compared(other) if by_names else found.after(lambda: other)
+    assert found.unclear == unclear
+
+
 def test_a_search_ends_after_its_solves(monkeypatch):
     """A log whose map stays unclear is tried from all starts, or until the solves are taken."""
-    monkeypatch.setattr(several_starts, "_unclear", lambda state: True)
+    monkeypatch.setattr(several_starts, "_unclear", lambda state, confirmed: True)
     solves, solve_once = [], JointState.solve_once
     monkeypatch.setattr(JointState, "solve_once", lambda state, *of, **by: solves.append(1) or solve_once(state, *of, **by))
     log = without_names(simulate(preset("demo", objects=6, frames=80, localization=None, odometry=Odometry(), false=0.0), 1))
@@ -93,7 +141,7 @@ def test_a_search_begins_without_the_errors_of_a_map_by_names(monkeypatch):
         return Named(replace(named, errors=named.errors.with_noise(replace(named.errors.noise, turning=20.0))), False)
 
     monkeypatch.setattr(joint_solve, "by_label", wrong)
-    monkeypatch.setattr(joint_solve, "from_several_starts", lambda state: begun.append(state) or search(state))
+    monkeypatch.setattr(joint_solve, "from_several_starts", lambda state, named: begun.append(state) or search(state, named))
     log = simulate(preset("demo", objects=4, frames=80, localization=None, odometry=Odometry(), false=0.0), 1)
     assert len({one.label for one in log.truth.objects}) == 4
     settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
