@@ -16,7 +16,6 @@ from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.estimate import Estimate
 from objslam.core.geometry import angles_off, is_planar, widest_angle
-from objslam.core.maps.seen_sides import seen_from
 from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap
 from objslam.core.result import RunResult
@@ -26,6 +25,7 @@ from objslam.frontend.up import up_axis
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
 from objslam.mapping.doubts.find import with_doubts
+from objslam.mapping.seen_sides import seen_from
 from objslam.mapping.solution import Solution
 
 

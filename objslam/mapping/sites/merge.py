@@ -16,9 +16,9 @@ from objslam.core.arrays import Floats
 from objslam.core.bodies.body import Body, surer_body, turned
 from objslam.core.bodies.tag_pose import TagPose
 from objslam.core.geometry import inverse
-from objslam.core.maps.seen_sides import thinned
 from objslam.core.maps.shared_covariance import shared_covariance
 from objslam.core.object_map import MapObject, ObjectMap, SeenFrom
+from objslam.mapping.seen_sides import thinned
 from objslam.mapping.sites.covariances import Row, measured_objects, site_covariances
 from objslam.mapping.sites.lives import (
     FORGOTTEN,
