@@ -10,7 +10,7 @@ from driving import feed
 from objslam.config import Odometry, load_settings
 from objslam.core.types import Trajectory
 from objslam.evaluation.evaluate import evaluate
-from objslam.live.session import map_scale, snapshots
+from objslam.live.session import map_scale
 from objslam.live.session.map_scale import scale_covariances, scale_sigma
 from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
@@ -35,7 +35,7 @@ def test_objects_lie_inside_their_ellipsoids_though_the_odometry_is_too_long(see
     log = too_long(seed)
     session = feed(Session(load_settings(None, ("mode=joint", *settings)), patient=True).start(), log)
     inside = evaluate(session.snapshot().map, log.truth, align="se2").to_dict()["inside_95_3d"]
-    monkeypatch.setattr(snapshots, "scale_sigma", lambda m: 0.0)
+    monkeypatch.setattr(map_scale, "scale_sigma", lambda m: 0.0)
     surer = evaluate(session.snapshot().map, log.truth, align="se2").to_dict()["inside_95_3d"]
     session.stop()
     assert inside >= 11 / 12

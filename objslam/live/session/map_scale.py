@@ -13,8 +13,8 @@ def scale_sigma(m: MapState) -> float:
     """Return the standard deviation of the scale of the map, as a share. 0 if the scale is known, or not estimated.
 
     The odometry's metre may be too long or too short, and all distances of the map with it. The graph takes it as exact. A
-    localisation or a prior map knows the metre. Else the last calibration tells how well it is known, and before the first
-    one the priors of the odometry and of the ranges do.
+    localisation or a prior map knows the metre. Else the calibration that last corrected the map tells how well it is known,
+    or the calibration file. Without one, the priors of the odometry and of the ranges do.
     """
     if m.keyframes.localized.any() or map_T_graph(m.graph) is not None:
         return 0.0

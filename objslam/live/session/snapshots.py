@@ -17,7 +17,7 @@ from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 from objslam.live.names.contradicted import contradicted
 from objslam.live.session.landmark_description import describe_landmark, describe_track
-from objslam.live.session.map_scale import scale_covariances, scale_sigma
+from objslam.live.session.map_scale import scale_covariances
 
 _BUDGET = 0.012  # The time for a snapshot, s. A larger value delays frames. A smaller value leaves more descriptions old.
 
@@ -110,12 +110,13 @@ class Describer:
 
 def _of_unknown_scale(m: MapState, objects: list[MapObject]) -> list[MapObject]:
     """Return the objects with the covariances that the unknown scale of the map adds."""
-    known = [i for i, o in enumerate(objects) if o.covariance is not None]
-    if not known or scale_sigma(m) == 0:
+    more = scale_covariances(m, np.array([o.position for o in objects]).reshape(-1, 3))
+    if not more.any():
         return objects
-    more = scale_covariances(m, np.array([objects[i].position for i in known]))
-    wider = {i: replace(objects[i], covariance=objects[i].covariance + one) for i, one in zip(known, more, strict=True)}
-    return [wider.get(i, o) for i, o in enumerate(objects)]
+    return [
+        o if o.covariance is None else replace(o, covariance=o.covariance + one)
+        for o, one in zip(objects, more, strict=True)
+    ]
 
 
 def take_snapshot(m: MapState, describer: Describer, lag: float, whole: bool) -> Snapshot:
