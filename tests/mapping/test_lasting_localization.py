@@ -42,6 +42,20 @@ def test_lasting_errors_are_found_and_the_sigmas_contain_them():
     assert np.mean(first) < 0.5 * np.mean(run(0, Odometry(), *WHITE)[0])
 
 
+def test_how_a_localisation_errs_does_not_change_the_noise_of_the_rest():
+    """Two localisations of one drive, one with errors of places and one with errors of headings. Boxes and odometry are the
+    same. If errors of poses counted as noise of rays and odometry, the factor across the path would differ by 14 %."""
+    quiet = {"localization": PoseNoise(xy=0.003, yaw=0.001), "pixel_sigma": 1.0, "false": 0.0}
+    log = simulate(preset("demo", odometry=Odometry(), objects=8, classes=8, frames=800, **quiet), 0)
+    found = []
+    for xy, yaw in ((0.04, 0.005), (0.01, 0.03)):
+        errs = replace(with_lasting(log, 1.0, 16.0, 0, xy, yaw), name="lasting")
+        noise = pipeline.run(errs, load_settings(None, ("mode=joint", *QUIET)), Ledger()).summary["noise"]
+        found.append([noise[name] for name in ("rays", "along", "across", "turning")])
+    np.testing.assert_allclose(found[0], found[1], rtol=0.1)
+    np.testing.assert_allclose(found[0][1:], 1, atol=0.15)
+
+
 def test_without_odometry_the_rays_show_them():
     squares, _, noise = run(0, None)
     assert noise["place_share"] > 0.5

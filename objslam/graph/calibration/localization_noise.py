@@ -56,9 +56,8 @@ def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta:
 
 def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> ComparedPoses:
     """Return the localisation against a prediction by all other measurements."""
-    measured = replace(of.measured, keyframes=_white(of.measured.keyframes), settings=_without_places(of.measured.settings))
-    loose = replace(of, measured=measured, known=None)
-    system, keyframes, nominal = linearise(loose, errors, theta), measured.keyframes, errors.settings.localization
+    loose = without_localization(of)
+    system, keyframes, nominal = linearise(loose, errors, theta), loose.measured.keyframes, errors.settings.localization
     poses = _poses(keyframes)
     map_T_base = (of.map_T_camera @ inverse(keyframes.base_T_camera))[poses]
     apart = inverse(keyframes.map_T_base[poses]) @ map_T_base
@@ -91,6 +90,12 @@ def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> 
         free=errors.settings.finds_localization_noise,
         prior=errors.settings.noise.prior,
     )
+
+
+def without_localization(of: Linearised) -> Linearised:
+    """Return the graph at the same values, in which the localisation hardly counts."""
+    measured = replace(of.measured, keyframes=_white(of.measured.keyframes), settings=_without_places(of.measured.settings))
+    return replace(of, measured=measured, known=None)
 
 
 def _white(keyframes: Keyframes) -> Keyframes:

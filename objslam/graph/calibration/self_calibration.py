@@ -14,7 +14,7 @@ import numpy as np
 from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import CalibratedMeasurements, Calibration
-from objslam.core.noise import NOMINAL
+from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
@@ -22,7 +22,7 @@ from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.information import covariance_of, likelihood, without_shrinking
 from objslam.graph.calibration.inner_solve import InnerSolve
-from objslam.graph.calibration.localization_noise import noise_of_localization
+from objslam.graph.calibration.localization_noise import noise_of_localization, without_localization
 from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.prior_conflict import with_wider_priors
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
@@ -96,7 +96,7 @@ def calibrate(
     at = fit.shared_errors(state, theta, _NEARLY if nearly else _CONVERGED)
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
-        noise = estimate_noise(state, at.system, fit.errors, theta, fit.prior_residuals)
+        noise = _noise_of_measurements(fit, state, at.system, theta)
         if "localization" in errors.unknown_noise:
             noise = noise_of_localization(state, fit.errors.with_noise(noise), theta)
         before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
@@ -153,6 +153,19 @@ def misfit_at_shared_errors(
     off = at.theta - errors.mean
     rays = misfit(at.state.map_T_camera, at.state.positions, at.state.measured, association)
     return rays + float(off @ np.linalg.solve(errors.prior, off)) if len(off) else rays
+
+
+def _noise_of_measurements(fit: _Fit, state: InnerSolve, system: LinearSystem, theta: Floats) -> NoiseFactors:
+    """Return the noise of rays, ranges and odometry. system: of the state, at the shared errors theta (P,).
+
+    If the noise of the localisation is unknown too, a graph without it shows theirs. In a graph with it, poses that err for
+    seconds would look like noise of the rays, and rays that seem noisy would hide how much the poses err.
+    """
+    errors, prior = fit.errors, fit.prior_residuals
+    if errors.unknown_noise > {"localization"}:
+        rest = without_localization(state)
+        return estimate_noise(rest, linearise(rest, errors, theta), errors, theta, prior)
+    return estimate_noise(state, system, errors, theta, prior)
 
 
 @dataclass(frozen=True)
