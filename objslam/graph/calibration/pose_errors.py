@@ -210,12 +210,12 @@ def most_likely(data: ComparedPoses) -> PoseErrors:
     # A search may end at too large a prediction error. So another search begins at the error by the odometry's noise.
     begun = {_begun(data, replace(usual, predicted=predicted), most) for predicted in (0.0, usual.predicted)}
     best, least = min((_searched(data, start, most, ()) for start in begun), key=lambda found: found[1])
-    lasting, cost = _searched(data, _begun_lasting(data, best), most, (_BOTH,))
+    lasting, cost = _lasting(data, best, most)
+    apart, cost_apart = _searched(data, lasting, most, tuple((one,) for one in _BOTH))
     if cost < least - _SIGNIFICANT:
         best, least = lasting, cost
-        apart, cost = _searched(data, lasting, most, tuple((one,) for one in _BOTH))
-        if cost < least - _SIGNIFICANT:
-            best, least = apart, cost
+    if cost_apart < least - _SIGNIFICANT:
+        best, least = apart, cost_apart
     return best if least < cost_usual - _SIGNIFICANT else usual
 
 
@@ -274,22 +274,36 @@ def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
     return min(tried, key=data.cost)
 
 
-def _begun_lasting(data: ComparedPoses, model: PoseErrors) -> PoseErrors:
-    """Return the best of a few models in which both errors last."""
-    tried = [_with_lasting(model, _BOTH, share, time) for share in (3, 6) for time in (1, 3, 5, 7)]
-    return min(tried, key=data.cost)
+def _lasting(data: ComparedPoses, model: PoseErrors, most: float) -> tuple[PoseErrors, float]:
+    """Return the model of the least cost in which both errors last, and this cost.
+
+    Searches begin at four times, at the sizes and the prediction error of `model`, and at those that the settings say. White
+    errors that fit a lasting one are far too small, because the prediction, which drifts, takes up most of it. A search that
+    begins there ends there. All searches take long steps, and the best one goes on with short ones.
+    """
+    begun = [
+        min((_with_lasting(first, _BOTH, share, time) for share in (3, 6, 8)), key=data.cost)
+        for first in dict.fromkeys((model, PoseErrors()))
+        for time in (1, 3, 5, 7)
+    ]
+    rough = [_searched(data, start, most, (_BOTH,), _STEPS[:1]) for start in begun]
+    return _searched(data, min(rough, key=lambda found: found[1])[0], most, (_BOTH,))
 
 
 def _searched(
-    data: ComparedPoses, start: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...]
+    data: ComparedPoses,
+    start: PoseErrors,
+    most: float,
+    lasting: tuple[tuple[str, ...], ...],
+    steps: tuple[float, ...] = _STEPS,
 ) -> tuple[PoseErrors, float]:
     """Return the model of the least cost, and this cost, by steps along the axes, then smaller ones.
 
     most: the largest logarithm of a factor on noise. lasting: groups of errors whose lasting part changes. A group has one
-    part.
+    part. steps: the steps of factors, as logarithms.
     """
     best, cost = start, data.cost(start)
-    for step in _STEPS:
+    for step in steps:
         moved = True
         while moved:
             moved = False
