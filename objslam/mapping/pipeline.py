@@ -65,10 +65,11 @@ def run(
     """Map the objects of a log. The ledger counts dropped data, and the summary of the result repeats these counts.
 
     With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
-    it has odometry too, or if the settings leave the noise of the localisation open. A log that has odometry, and localised
-    poses at which no object has a place, is solved once more, too. known: the map of another day. If the drive is found in
-    it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if its
-    stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
+    it has odometry too, or if the settings leave the noise of the localisation open. A log with odometry is solved once
+    more, too, if its localisation errs by more than the settings say (`check_pose_noise`). A log that has odometry, and
+    localised poses at which no object has a place, is solved once more, too. known: the map of another day. If the drive is
+    found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if
+    its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
     calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
@@ -181,7 +182,7 @@ def _run(
         if settings.checks.use:
             diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
-    lasting, late = None, None
+    lasting, late, noisy = None, None, None
     if diagnosis.jumps is not None:
         solution = with_jumps(solution, diagnosis.jumps)
     if settings.mode == "fixed":
@@ -268,6 +269,8 @@ def _run(
         views=with_given_stamps(solved_views(log, settings, path_after), given),
     )
     why = "the localisation errs for seconds" if late is not None else ""
+    if not why and noisy is not None and log.odometry is not None:
+        why = "the localisation errs by more than its settings say"
     if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
         why = "no object has a place at the localised poses"
     return result, why, None if late is None else lasting
