@@ -41,7 +41,7 @@ def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta:
     near = without_jumps(data, found)
     if len(near) < len(data.times):
         data = data.take(near)
-        found = most_likely(data)
+        found = most_likely(data, found)
     (heading, turned), (place, shifted) = averaged(data, found)
     return replace(
         errors.noise,

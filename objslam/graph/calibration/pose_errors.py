@@ -199,18 +199,22 @@ def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
     return near if len(near) >= (1 - _MOST_STRAYS) * n else np.arange(n)
 
 
-def most_likely(data: ComparedPoses) -> PoseErrors:
+def most_likely(data: ComparedPoses, near: PoseErrors | None = None) -> PoseErrors:
     """Return the simplest model that the data do not refute. The models, from the simplest on, are: the noise in the
     settings, more noise, one lasting share for headings and places, and a lasting share for each of the two.
 
     If places err for seconds, headings probably do too, because both come from one filter. A short log may not show it.
+    near: the model of nearly the same data, if it is known. It saves most of the search for errors that last.
     """
     most = _MOST_FACTOR if data.free else 0.0
     usual, cost_usual = _searched(data, _begun(data, PoseErrors(), 0.0), 0.0, ())
     # A search may end at too large a prediction error. So another search begins at the error by the odometry's noise.
     begun = {_begun(data, replace(usual, predicted=predicted), most) for predicted in (0.0, usual.predicted)}
     best, least = min((_searched(data, start, most, ()) for start in begun), key=lambda found: found[1])
-    lasting, cost = _lasting(data, best, most)
+    if near is not None and near.heading.share and near.place.share:
+        lasting, cost = _searched(data, near, most, (_BOTH,))
+    else:
+        lasting, cost = _lasting(data, best, most)
     apart, cost_apart = _searched(data, lasting, most, tuple((one,) for one in _BOTH))
     if cost < least - _SIGNIFICANT:
         best, least = lasting, cost
