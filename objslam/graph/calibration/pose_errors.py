@@ -214,7 +214,7 @@ def most_likely(data: ComparedPoses, near: PoseErrors | None = None) -> PoseErro
     if near is not None and near.heading.share and near.place.share:
         lasting, cost = _searched(data, near, most, (_BOTH,))
     else:
-        lasting, cost = _lasting(data, best, most)
+        lasting, cost = _lasting(data, most)
     apart, cost_apart = _searched(data, lasting, most, tuple((one,) for one in _BOTH))
     if cost < least - _SIGNIFICANT:
         best, least = lasting, cost
@@ -278,20 +278,16 @@ def _begun(data: ComparedPoses, model: PoseErrors, most: float) -> PoseErrors:
     return min(tried, key=data.cost)
 
 
-def _lasting(data: ComparedPoses, model: PoseErrors, most: float) -> tuple[PoseErrors, float]:
+def _lasting(data: ComparedPoses, most: float) -> tuple[PoseErrors, float]:
     """Return the model of the least cost in which both errors last, and this cost.
 
-    Searches begin at four times, at the sizes and the prediction error of `model`, and at those that the settings say. White
-    errors that fit a lasting one are far too small, because the prediction, which drifts, takes up most of it. A search that
-    begins there ends there. All searches take long steps, and the best one goes on with short ones.
+    Searches begin at four times, at the sizes that the settings say. White errors that fit a lasting one are far too small,
+    because the prediction, which drifts, takes up most of it. A search that begins there ends there. All searches take long
+    steps, and the best two go on with short ones.
     """
-    begun = [
-        min((_with_lasting(first, _BOTH, share, time) for share in (3, 6, 8)), key=data.cost)
-        for first in dict.fromkeys((model, PoseErrors()))
-        for time in (1, 3, 5, 7)
-    ]
-    rough = [_searched(data, start, most, (_BOTH,), _STEPS[:1]) for start in begun]
-    return _searched(data, min(rough, key=lambda found: found[1])[0], most, (_BOTH,))
+    begun = [_with_lasting(PoseErrors(), _BOTH, len(_SHARES) - 1, time) for time in (1, 3, 5, 7)]
+    rough = sorted((_searched(data, start, most, (_BOTH,), _STEPS[:1]) for start in begun), key=lambda found: found[1])
+    return min((_searched(data, start, most, (_BOTH,)) for start, _ in rough[:2]), key=lambda found: found[1])
 
 
 def _searched(
@@ -331,7 +327,14 @@ def _moves(model: PoseErrors, most: float, lasting: tuple[tuple[str, ...], ...],
             share = int(np.clip(kind.share + sign, 0, len(_SHARES) - 1))
             time = int(np.clip(kind.time + sign, 0, len(_TIMES) - 1))
             found.append(_with_lasting(model, names, share, kind.time))
-            found.append(_with_lasting(model, names, kind.share, time))
+            longer = _with_lasting(model, names, kind.share, time)
+            found.append(longer)
+            # An error twice as large that lasts four times as long looks the same from pose to pose.
+            larger = np.log(_TIMES[time] / _TIMES[kind.time]) / 2
+            for name in names:
+                one = getattr(longer, name)
+                longer = _with(longer, name, replace(one, factor=_stepped(one.factor, larger, _LEAST_FACTOR, most)))
+            found.append(longer)
     return [one for one in found if one != model]
 
 
