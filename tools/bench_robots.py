@@ -1,7 +1,7 @@
 """Measure whether maps are honest on robots whose errors come from hardware, not from the noise model of the package.
 
     python tools/bench_robots.py [--kinds wheels gyro vio slow] [--robots 8] [--first 0] [--unnamed]
-        [--classes 6]
+        [--classes 6] [--localised filter]
 
 Each robot drives to random points of a room, with stops. wheels: encoders with ticks, wrong radii, a wrong track width, slip
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
@@ -13,6 +13,10 @@ for each parameter of the calibration, the robots whose true value is within 1.9
 
 With --unnamed, all objects of a robot have one label, so the map must also find out which box is of which object. With
 --classes 6, they have six labels by chance, as a detector would give them.
+
+With --localised, each robot has a localisation too, that errs for seconds. All settings are the defaults, and maps are
+compared without an alignment. filter: AMCL by tf, which steps when it corrects the odometry. poses: the poses of AMCL at its
+corrections alone. slam: a scan matcher.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ import argparse
 import time
 from typing import Any
 
+import localisations
 import numpy as np
 from log_parts import with_classes, without_names
 
@@ -52,13 +57,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="the seed of the first robot")
     parser.add_argument("--unnamed", action="store_true", help="one label for all objects of a robot")
     parser.add_argument("--classes", type=int, default=0, help="this number of labels for all objects of a robot, by chance")
+    parser.add_argument("--localised", choices=localisations.KINDS, help="the localisation of the robots")
     options = parser.parse_args()
-    settings = load_settings(None, ("mode=joint", "output.recording=false"))
+    settings = load_settings(
+        None, ("output.recording=false",) if options.localised else ("mode=joint", "output.recording=false")
+    )
     for kind in options.kinds:
         rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
         errors: dict[str, list[float]] = {}
         for seed in range(options.first, options.first + options.robots):
-            (log, true), ranged, begin = robot(seed, kind), seed % 2 == 0, time.process_time()
+            (log, true), ranged, begin = robot(seed, kind, options.localised), seed % 2 == 0, time.process_time()
             log = without_names(log) if options.unnamed else log
             log = with_classes(log, options.classes, seed) if options.classes else log
             try:
@@ -69,7 +77,7 @@ def main() -> None:
             seconds = time.process_time() - begin
             assert log.truth is not None
             radius = UNNAMED_RADIUS if options.unnamed or options.classes else RADIUS
-            found = evaluate(result.map, log.truth, align="se2", radius=radius).to_dict()
+            found = evaluate(result.map, log.truth, align="none" if options.localised else "se2", radius=radius).to_dict()
             inside, squared = found["inside_95_3d"] * found["matched"], found["mahalanobis_median"]
             rows[ranged].append(
                 (found["matched"], len(log.truth.objects), found["false"], inside, found["position_rmse"], squared, seconds)
@@ -111,10 +119,11 @@ def deviations(found: Calibration | None, true: dict[str, float]) -> dict[str, f
     return {name: float((at[name][0] - value) / at[name][1]) for name, value in true.items() if name in at}
 
 
-def robot(seed: int, kind: str) -> tuple[Log, dict[str, float]]:
+def robot(seed: int, kind: str, localised: str | None = None) -> tuple[Log, dict[str, float]]:
     """Draw a robot of a kind, a room and a drive. The same seed and kind give the same log.
 
-    Also returns the true values of its calibration, by the names of the parameters.
+    localised: the kind of localisation, if the robot has one. Also returns the true values of its calibration, by the names
+    of the parameters.
     """
     rng = np.random.default_rng([seed, 1 + KINDS.index(kind)])
     room, speed, seconds = rng.uniform(5, 15, 2), rng.uniform(0.2, 1.0), rng.uniform(120, 500)
@@ -139,7 +148,12 @@ def robot(seed: int, kind: str) -> tuple[Log, dict[str, float]]:
         trajectory=Trajectory(fired - clock, map_T_base),
     )
     true |= {f"{camera.name}.clock": clock} | {f"{camera.name}.{axis}": turn for axis, turn in turns.items()}
-    return Log(f"{kind}{seed}", (CameraLog(camera, detections),), odometry=odometry, truth=truth), true
+    localization = None
+    if localised is not None:
+        rng = np.random.default_rng([seed, 77])
+        localization = localisations.localised(rng, localised, stamps, path, odometry)
+    camera_log = (CameraLog(camera, detections),)
+    return Log(f"{kind}{seed}", camera_log, localization=localization, odometry=odometry, truth=truth), true
 
 
 def drive(rng: np.random.Generator, room: Floats, speed: float, seconds: float) -> tuple[Floats, Floats, Floats, Floats]:

@@ -1,0 +1,44 @@
+"""Localise a simulated robot: poses that err for seconds, as a particle filter or a scan matcher gives them."""
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import inverse, lift_se2
+from objslam.core.types import Trajectory
+
+KINDS = ("filter", "poses", "slam")
+EVERY = 0.1  # s, between two poses of a scan matcher, and the steps at which the errors are drawn
+MOVED, TURNED = 0.2, 0.2  # m and rad, after which a particle filter corrects its pose, as AMCL does by default
+
+
+def localised(rng: np.random.Generator, kind: str, stamps: Floats, path: Floats, odometry: Trajectory) -> Trajectory:
+    """Return a localisation of a robot whose path is x, y, yaw (n, 3), m and rad, at stamps (n,), s.
+
+    filter: AMCL by tf. The odometry moves the pose between two corrections, and each correction is a step. poses: the poses
+    of AMCL at its corrections alone. slam: a scan matcher, ten times in a second. The errors are a first-order Gauss-Markov
+    process and a part that is new in each pose, with sizes and a time that are drawn once for a robot.
+    """
+    if kind == "slam":
+        place, yaw, seconds, new = rng.uniform(0.005, 0.03), np.radians(rng.uniform(0.1, 0.5)), rng.uniform(10, 40), 0.3
+    else:
+        place, yaw, seconds, new = rng.uniform(0.02, 0.08), np.radians(rng.uniform(0.3, 1.5)), rng.uniform(3, 20), 0.4
+    each = max(round(EVERY / float(np.median(np.diff(stamps)))), 1)
+    stamps, path = stamps[::each], path[::each]
+    kept, lasting = np.exp(-EVERY / seconds), rng.normal(size=(len(stamps), 3))
+    for i in range(1, len(lasting)):
+        lasting[i] = kept * lasting[i - 1] + np.sqrt(1 - kept**2) * lasting[i]
+    errors = np.sqrt(1 - new**2) * lasting + new * rng.normal(size=lasting.shape)
+    said = lift_se2(path + errors * [place, place, yaw])
+    if kind == "slam":
+        return Trajectory(stamps, said)
+    corrected = [0]
+    for i in range(1, len(path)):
+        x, y, turn = path[i] - path[corrected[-1]]
+        if np.hypot(x, y) > MOVED or abs(turn) > TURNED:
+            corrected.append(i)
+    if kind == "poses":
+        return Trajectory(stamps[corrected], said[corrected])
+    at = np.clip(np.searchsorted(odometry.stamps, stamps[corrected]), 0, len(odometry.stamps) - 1)
+    map_T_odom = said[corrected] @ inverse(odometry.poses[at])
+    last = np.maximum(np.searchsorted(stamps[corrected], odometry.stamps, side="right") - 1, 0)
+    return Trajectory(odometry.stamps, map_T_odom[last] @ odometry.poses)
