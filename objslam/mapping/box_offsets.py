@@ -16,15 +16,23 @@ from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
 from objslam.mapping.bodies.centre_bearings import as_centres
 from objslam.mapping.solution import Solution
-from objslam.triangulation.bodies.shared import ALIKE, SIDES, WITHIN
+from objslam.triangulation.bodies.shared import SIDES, WITHIN
 
 _SHARES = 81
-"""The number of values that `_share` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
+"""The number of values that `_variances` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 4.0
-"""The largest share that `_share` tries, in standard deviations of its prior. A larger value allows worse detectors."""
+"""The largest share that `_variances` tries, in standard deviations of its prior. A larger value allows worse detectors."""
 _LOOSE = 1.0
-"""The prior standard deviation (m) of the error of a solved position, in `_share`. With a larger value, the rays decide
+"""The prior standard deviation (m) of the error of a solved position, in `_variances`. With a larger value, the rays decide
 more."""
+ANGLES = tuple(np.radians([10.0, 20.0, 40.0, 80.0]).tolist())
+"""The angles (rad) between two views of an object at which the errors of its boxes may have the correlation 1/2. A detector
+had 5 to 20 degrees on three objects of YCB-Video. Boxes of a thing that is wider on one side, or is lit from there, change
+more slowly. Few sides do not show such errors, and with small angles alone the boxes would look exact. Larger angles make
+positions less sure."""
+_EXPECTED = 1 / np.array(ANGLES) / (1 / np.array(ANGLES)).sum()
+"""(A,) the prior probability of each of `ANGLES`. It falls with the angle, as the detector above says. Many objects together
+outweigh it."""
 _POOLED = 20.0
 """With this many rays, the scatter of an object's own rays weighs as much as the scatter of all rays. With a larger number,
 objects differ less."""
@@ -34,19 +42,23 @@ objects differ less."""
 class Sides:
     """C sides from which one object was seen.
 
-    alike: (C, C) the correlation between the errors of two sides. mean: (C, A) rad, the mean angle by which the rays of a
+    turned: (C, C) rad, the angle between the views from two sides. mean: (C, A) rad, the mean angle by which the rays of a
     side miss the object, along A axes (azimuth and elevation). white: (C,) rad, the standard deviation of this mean if the
     rays err independently. shift: (C, A, 3) rad per m, the derivative of the mean by the object's position. offset: (C, A,
     3) rad, the derivative of the mean by an offset of all boxes of the side. The offset is a share of the object's size.
     pull: (C, 3, 3) m, the derivative of the object's position by this offset.
     """
 
-    alike: Floats
+    turned: Floats
     mean: Floats
     white: Floats
     shift: Floats
     offset: Floats
     pull: Floats
+
+    def alike(self, angle: float) -> Floats:
+        """Return the correlations (C, C) between the errors of two sides, if they are 1/2 at this angle, rad."""
+        return np.asarray(WITHIN * 0.5 ** (self.turned / angle))
 
     def in_elevation(self) -> Self:
         """Return the same sides without the errors in azimuth."""
@@ -103,11 +115,12 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
         plain = settings.fixed.loss == "l1"
         told_by = sides_of(_sized_rays(centres, cameras, settings), centres.estimate.positions, plain=plain)
     shown = [one.in_elevation() if joint else one for j, one in told_by.items() if sized[j]]
-    share = _share(shown, prior) if learnt else prior
+    variances = _variances(shown, prior) if learnt else expected_variances(prior)
     covariance, bodies = estimate.covariance.copy(), list(solution.bodies or ())
     for j, sides in seen.items():
         unknown = np.full(2, settings.rays.unknown_size)
-        offset = offset_covariance(sides, sizes[j], share) if sized[j] else offset_covariance(sides, unknown, prior)
+        extent, of_share = (sizes[j], variances) if sized[j] else (unknown, expected_variances(prior))
+        offset = offset_covariance(sides, extent, of_share)
         covariance[j] += offset
         body = bodies[j] if bodies else None
         if body is not None and body.behind:  # Its centre comes from the edges that are visible, so from few of them.
@@ -115,16 +128,27 @@ def with_box_offsets(solution: Solution, cameras: tuple[Camera, ...], settings: 
             wider[:3, :3] += offset
             bodies[j] = replace(body, covariance=wider)
     solution = replace(solution, bodies=tuple(bodies)) if bodies else solution
-    return replace(solution, estimate=replace(estimate, covariance=covariance, box_offset=share if shown else None))
+    share = float(np.sqrt(variances.sum())) if shown else None
+    return replace(solution, estimate=replace(estimate, covariance=covariance, box_offset=share))
 
 
-def offset_covariance(sides: Sides, extent: Floats, share: float) -> Floats:
+def expected_variances(share: float) -> Floats:
+    """Return the variances (A,) of offsets, for each of `ANGLES`, before any box is seen.
+
+    share: the standard deviation of an offset, as a share of the size.
+    """
+    return np.asarray(share**2 * _EXPECTED)
+
+
+def offset_covariance(sides: Sides, extent: Floats, variances: Floats) -> Floats:
     """Return the covariance (3, 3) m^2 that the offsets of boxes add to the covariance of an object.
 
-    extent: (2,) m, width and height of the object. share: the standard deviation of an offset, as a share of the size.
+    extent: (2,) m, width and height of the object. variances: (A,) of the offsets, as a squared share of the size, for
+    each of `ANGLES`. Their sum is the variance of an offset.
     """
-    by_side = np.einsum("cik,cd,djk->ij", sides.pull, sides.alike, sides.pull)
-    return np.asarray(share**2 * ((by_side + by_side.T) / 2 + np.nan_to_num(extent.prod()) * np.eye(3)))
+    alike = sum(variance * sides.alike(angle) for angle, variance in zip(ANGLES, variances.tolist(), strict=True))
+    by_side = np.einsum("cik,cd,djk->ij", sides.pull, alike, sides.pull)
+    return np.asarray((by_side + by_side.T) / 2 + variances.sum() * np.nan_to_num(extent.prod()) * np.eye(3))
 
 
 def _sized_rays(solution: Solution, cameras: tuple[Camera, ...], settings: Settings) -> SizedRays:
@@ -185,9 +209,8 @@ def sides_of(rays: SizedRays, positions: Floats, *, plain: bool = False) -> dict
     seen = {}
     for j in np.unique(owner).tolist():
         mine = np.flatnonzero(owner == j)
-        turned = np.arccos(np.clip(towards[mine] @ towards[mine].T, -1, 1)) / ALIKE
         seen[j] = Sides(
-            alike=WITHIN * 0.5**turned,
+            turned=np.arccos(np.clip(towards[mine] @ towards[mine].T, -1, 1)),
             mean=mean[mine, :, 0],
             white=white[mine],
             shift=shift[mine],
@@ -205,29 +228,37 @@ def _summed(axes: Floats, cell: Ints, weight: Floats, values: Floats) -> Floats:
     return np.einsum("cia,cid->cad", axes, sums)
 
 
-def _share(seen: list[Sides], prior: float) -> float:
-    """Return by how much the boxes of one side are off, as a share of the object's size: the root mean square over the
-    posterior.
+def _variances(seen: list[Sides], prior: float) -> Floats:
+    """Return how far the boxes of one side are off: the variances (A,), for each of `ANGLES`, of their share of the size.
 
-    seen: the sides of each object. prior: the standard deviation of a half-normal prior (Gelman 2006). The positions have
-    errors too, so the likelihood is the restricted one (Patterson and Thompson 1971).
+    The mean over the posterior of the share and the angle. seen: the sides of each object. prior: the standard deviation of
+    a half-normal prior of the share (Gelman 2006).
     """
     shares = np.linspace(0.0, _WIDEST * prior, _SHARES)
-    likelihood = -0.5 * (shares / prior) ** 2
-    for sides in seen:
-        axes = sides.mean.shape[1]
-        white = np.repeat(sides.white, axes)
-        offset, shift = ((part.reshape(-1, 3) / white[:, None]) for part in (sides.offset, sides.shift))
-        size, vectors = np.linalg.eigh(np.kron(sides.alike, np.ones((axes, axes))) * (offset @ offset.T))
-        mean, shift = vectors.T @ (sides.mean.ravel() / white), vectors.T @ shift
-        variance = 1 + shares[:, None] ** 2 * np.maximum(size, 0.0)
-        matrix = np.einsum("ki,kj,sk->sij", shift, shift, 1 / variance) + np.eye(3) / _LOOSE**2
-        vector = np.einsum("ki,k,sk->si", shift, mean, 1 / variance)
-        explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
-        squares = (mean**2 / variance + np.log(variance)).sum(axis=1)
-        likelihood -= 0.5 * (squares + np.linalg.slogdet(matrix)[1] - explained)
+    likelihood = np.log(_EXPECTED)[:, None] - 0.5 * (shares / prior) ** 2
+    for told, angle in zip(likelihood, ANGLES, strict=True):
+        for one in seen:
+            told += _likelihood(one, shares, angle)
     weight = np.exp(likelihood - likelihood.max())
-    return float(np.sqrt((weight * shares**2).sum() / weight.sum()))
+    return np.asarray((weight * shares**2).sum(axis=1) / weight.sum())
+
+
+def _likelihood(sides: Sides, shares: Floats, angle: float) -> Floats:
+    """Return the logarithm (s,) of the likelihood of shares (s,), if errors have the correlation 1/2 at an angle, rad.
+
+    The position has an error too, so the likelihood is the restricted one (Patterson and Thompson 1971).
+    """
+    axes = sides.mean.shape[1]
+    white = np.repeat(sides.white, axes)
+    offset, shift = ((part.reshape(-1, 3) / white[:, None]) for part in (sides.offset, sides.shift))
+    size, vectors = np.linalg.eigh(np.kron(sides.alike(angle), np.ones((axes, axes))) * (offset @ offset.T))
+    mean, shift = vectors.T @ (sides.mean.ravel() / white), vectors.T @ shift
+    variance = 1 + shares[:, None] ** 2 * np.maximum(size, 0.0)
+    matrix = np.einsum("ki,kj,sk->sij", shift, shift, 1 / variance) + np.eye(3) / _LOOSE**2
+    vector = np.einsum("ki,k,sk->si", shift, mean, 1 / variance)
+    explained = (vector * np.linalg.solve(matrix, vector[..., None])[..., 0]).sum(axis=1)
+    squares = (mean**2 / variance + np.log(variance)).sum(axis=1)
+    return np.asarray(-0.5 * (squares + np.linalg.slogdet(matrix)[1] - explained))
 
 
 def _azimuth_elevation(directions: Floats) -> Floats:

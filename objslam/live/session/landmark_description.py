@@ -13,7 +13,7 @@ from objslam.graph.posterior.marginals import largest_sigma
 from objslam.live.calibration.collected import offline_rays
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
-from objslam.mapping.box_offsets import SizedRays, offset_covariance, sides_of
+from objslam.mapping.box_offsets import SizedRays, expected_variances, offset_covariance, sides_of
 
 _MOST = 200  # The most rays that describe an object. They are spread evenly over its rays. A larger number takes longer.
 _FEW = 60  # The most rays that give the parallax of an object, as the widest angle of all pairs. More rays take longer.
@@ -107,7 +107,7 @@ def _offsets(m: MapState, at: Ints, obs: Observations, position: Floats, extent:
     along = np.where(np.isfinite(obs.range), 1 / obs.range_sigma, 0.0)
     one = np.zeros(len(at), dtype=np.int64)
     rays = SizedRays(one, obs.origin, obs.direction, distance, obs.sigma, size, along)
-    return offset_covariance(sides_of(rays, position[None])[0], extent, share)
+    return offset_covariance(sides_of(rays, position[None])[0], extent, expected_variances(share))
 
 
 def _extent(m: MapState, at: Ints, position: Floats) -> tuple[float, float] | None:
