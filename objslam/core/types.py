@@ -147,9 +147,8 @@ class CameraLog:
 
 @dataclass(frozen=True)
 class TruthObject:
-    """One object of the ground truth. position: (3,) m in map. size: (3,) m, length, width and height, None if unknown. yaw:
-    rad, the direction of its length, None if unknown. tag_xyzw: (4,) the unit quaternion of map_R_tag of a fiducial, None if
-    unknown."""
+    """One object of the ground truth. position: (3,) m in map. size: (3,) m, length, width and height. yaw: rad, the
+    direction of its length. tag_xyzw: (4,) the unit quaternion of map_R_tag of a fiducial. None means unknown."""
 
     id: int
     label: str
@@ -171,9 +170,9 @@ class Truth:
 class Log:
     """The log of a robot, with odometry, localisation or both.
 
-    odometry: odom_T_base. localization: map_T_base. path: the file or folder that was read, absolute, None for a log from
-    memory. reading: the data dropped while the log was read, None if they were not counted. part: the begin and the end, s,
-    if the log is a part of a longer log. A stamp at the end is outside. None means no limit.
+    odometry: odom_T_base. localization: map_T_base. path: the file or folder that was read, absolute, None from memory.
+    reading: the data dropped while the log was read, None if they were not counted. part: the begin and the end (outside),
+    s, if the log is a part of a longer log. None means no limit.
     """
 
     name: str
@@ -195,21 +194,22 @@ class Log:
 class Keyframes:
     """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
-    stamps: (K,) s, non-decreasing. After a correction of the cameras' clocks, only the stamps of each camera are
-    non-decreasing. camera: (K,) index into log.cameras. frame: (K,) index into detections.frame_stamps of this camera.
-    base_T_camera: (K, 4, 4). map_T_base: (K, 4, 4) from the localisation, or from the odometry if there is no localisation.
-    localized_every: how many keyframes there are for each measured absolute pose, on average and at least 1. 0 if map_T_base
-    is odometry. localized: (K,) whether the localisation measured the pose, False if the odometry continued it. None if it
-    measured all. overlap: the share of the keyframes of one moment that can show the same thing: 1 for one camera, or for
-    cameras that look the same way, and a quarter for four cameras that look to four sides. pose_noise: the factors on
+    stamps: (K,) s, non-decreasing. After a correction of clocks, only those of each camera are. camera: (K,) index into
+    log.cameras. frame: (K,) index into detections.frame_stamps of this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4,
+    4) from the localisation, or from the odometry if there is no localisation. localized_every: how many keyframes there are
+    for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. localized_at: (K,) s, the stamp
+    of the measurement of the localisation that gave the pose, NaN if the odometry continued the localisation. None if each
+    pose was measured by itself. carried: (K, 2) rad^2 and m^2, what the odometry from this measurement to the keyframe adds
+    to the variance of heading and place, None if nothing. overlap: the share of the keyframes of one moment that can show
+    the same thing: 1 for one camera, a quarter for four that look to four sides. pose_noise: the factors on
     `localization.yaw` and `localization.xy` that the log shows, 1 if they are not estimated. lasting: the parts of the
-    errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the coordinate frame of the first
-    odometry pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error since its
-    start, in the frame of odom_T_base. stretch: (K,) the number of each keyframe's stretch of the odometry between two gaps,
-    None means one stretch for all. -1 marks a keyframe without odometry, whose odom_T_base and drift have no meaning. step:
-    (K,) the place of each keyframe among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from
-    `OdometryBridge.at` in `frontend`, and None if the odometry is exact between its poses. given_stamps: (K,) s, as the
-    frames have them in the log or came from the robot, None if they are `stamps`.
+    errors of headings and of places that last, in joint mode. odom_T_base: (K, 4, 4) in the frame of the first odometry
+    pose, None without odometry. drift: (K, 6, 6) covariance, rotation first, of the odometry's error since its start, in
+    this frame. stretch: (K,) the number of each keyframe's stretch of the odometry between two gaps, None means one stretch
+    for all. It is -1 without odometry, where odom_T_base and drift have no meaning. step: (K,) the place of each keyframe
+    among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from `OdometryBridge.at`, and None if
+    the odometry is exact between its poses. given_stamps: (K,) s, as the frames have them in the log or came from the robot,
+    None if they are `stamps`.
     """
 
     stamps: Floats
@@ -218,7 +218,8 @@ class Keyframes:
     base_T_camera: Floats
     map_T_base: Floats
     localized_every: float = 0.0
-    localized: Bools | None = None
+    localized_at: Floats | None = None
+    carried: Floats | None = None
     overlap: float = 1.0
     pose_noise: tuple[float, float] = (1.0, 1.0)
     lasting: tuple[Lasting, Lasting] = (WHITE, WHITE)
@@ -246,8 +247,7 @@ class Keyframes:
     def measured(self) -> Bools:
         """(K-1,) whether the odometry measured the motion between two consecutive keyframes.
 
-        A motion across a gap is not measured, because somebody may have moved the robot. Without a localisation, this motion
-        still counts as measured. Without odometry, no motion is measured.
+        A motion across a gap counts only without a localisation, because somebody may have moved the robot.
         """
         steps = max(len(self) - 1, 0)
         if self.odom_T_base is None:

@@ -1,20 +1,56 @@
-"""The rays of a log in map, corrected for many values of its shared errors at once.
+"""The keyframes and the rays of a log in map, corrected for many values of its shared errors at once.
 
 A derivative needs the rays at two values of each error. Most of these values change only the mounts and the lenses of the
 cameras. So one computation for all values takes far less time than one computation for each.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.rotation import rotation_from_vector
-from objslam.core.types import Rays
+from objslam.core.trajectory import poses_near
+from objslam.core.types import Keyframes, Log, Rays
 from objslam.frontend.corrected_log import AXES, LENS, refocused
+from objslam.frontend.localization.measured_poses import carried_by_odometry
 
 PLACE = ("x", "y", "z")
 """The moves of a camera on the robot, along the axes of base."""
+
+
+def corrected_poses(
+    log: Log,
+    keyframes: Keyframes,
+    errors: Sequence[Mapping[str, float]],
+    odometry_at: Callable[[Mapping[str, float], Floats], Floats],
+    max_gap: float,
+) -> tuple[Floats, Floats, Floats]:
+    """Return the poses of keyframes (K), corrected for clocks and odometry, for M values of the shared errors by name.
+
+    odometry_at: returns the poses of the corrected odometry at stamps. max_gap: s, of the paths. Returns the stamps (M, K),
+    s, at which the poses are taken, all within the time of the path, map_T_base (M, K, 4, 4), and base_T_camera
+    (M, K, 4, 4), not yet corrected for the errors of mounts.
+    """
+    path, localization = log.robot_path, log.localization
+    assert path is not None
+    clocks = np.array([[error.get(f"{one.camera.name}.clock", 0.0) for one in log.cameras] for error in errors])
+    known = np.clip(keyframes.stamps + clocks[:, keyframes.camera], path.stamps[0], path.stamps[-1])
+    base_T_camera = np.repeat(keyframes.base_T_camera[None], len(errors), axis=0)
+    for index, one in enumerate(log.cameras):
+        if one.mount is not None:
+            mine = keyframes.camera == index
+            at = poses_near(one.mount, known[:, mine].ravel(), max_gap)
+            base_T_camera[:, mine] = at.reshape(len(errors), -1, 4, 4)
+    if localization is None:
+        map_T_base = np.stack([odometry_at(error, stamps) for stamps, error in zip(known, errors, strict=True)])
+        return known, map_T_base, base_T_camera
+    map_T_base = poses_near(localization, known.ravel(), max_gap).reshape(*known.shape, 4, 4)
+    if (localized_at := keyframes.localized_at) is not None:
+        for at, stamps, error in zip(map_T_base, known, errors, strict=True):
+            at[:] = carried_by_odometry(at, stamps, localized_at, localization, partial(odometry_at, error), max_gap)
+    return known, map_T_base, base_T_camera
 
 
 def corrected_rays(

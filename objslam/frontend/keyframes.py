@@ -11,6 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import evenly_spread, interpolate, inverse
 from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError
+from objslam.frontend.localization.measured_poses import with_measurements
 from objslam.frontend.odometry_bridge import bridge_of
 from objslam.frontend.odometry_drift import gathered_drift
 
@@ -84,22 +85,12 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger, measured: Traj
             where=log.name,
             hint=hint,
         )
-    localized_every, at_measured = 0.0, None
-    if localized and log.localization is not None:
-        known, used = log.localization.stamps, stamps[valid]
-        if measured is not None and measured is not log.localization:
-            at_measured = interpolate(measured.stamps, measured.poses, stamps, max_gap)[1]
-            known, used = measured.stamps, stamps[valid & at_measured]
-        number = ((known >= used[0]) & (known <= used[-1])).sum() if len(used) else 0
-        localized_every = max(1.0, len(used) / max(float(number), 1.0))
-    return Keyframes(
+    keyframes = Keyframes(
         stamps=stamps,
         camera=camera,
         frame=frame,
         base_T_camera=base_T_camera,
         map_T_base=map_T_base,
-        localized_every=localized_every,
-        localized=at_measured,
         overlap=_overlap(log, camera[valid]),
         odom_T_base=odom_T_base,
         drift=drift,
@@ -107,6 +98,7 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger, measured: Traj
         step=step,
         wander=wander,
     ).take(valid)
+    return with_measurements(keyframes, log, measured or path, settings) if localized else keyframes
 
 
 def _overlap(log: Log, camera: Ints) -> float:

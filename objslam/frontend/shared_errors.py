@@ -1,6 +1,6 @@
 """The measurements of a log, corrected by its shared errors: the odometry's scale, clocks, and the cameras' rotations."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
@@ -23,7 +23,8 @@ from objslam.frontend.corrected_log import (
     refocused,
     take_out,
 )
-from objslam.frontend.corrected_rays import corrected_rays
+from objslam.frontend.corrected_rays import corrected_poses, corrected_rays
+from objslam.frontend.localization.measured_poses import carried_variance
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
 from objslam.frontend.surface_ranges import corrected_lengths, half_widths_of_rays, weights_of
@@ -182,6 +183,9 @@ class SharedErrors:
             # Different clocks may change the order of images, but drift never shrinks from one keyframe to the next.
             gathered = self._drift(error).gathered(np.maximum.accumulate(poses.known), settings.odometry)
             step, wander = self._correctable().bridge.at(poses.known)
+            if keyframes.localized_at is not None and poses.odom_T_base is not None:
+                measured = self._drift(error).gathered(keyframes.localized_at, settings.odometry)
+                keyframes = replace(keyframes, carried=carried_variance(poses.odom_T_base, gathered, measured))
         stamps, map_T_base, odom_T_base = poses.stamps, poses.map_T_base, poses.odom_T_base
         moved = replace(
             keyframes, stamps=stamps, map_T_base=map_T_base, odom_T_base=odom_T_base, base_T_camera=base_T_camera
@@ -204,7 +208,9 @@ class SharedErrors:
         keys = [self._poses_key(error) for error in errors]
         distinct = dict(zip(keys, errors, strict=True))
         which = [{key: number for number, key in enumerate(distinct)}[key] for key in keys]
-        _, map_T_base, base_T_camera = self._poses_at(list(distinct.values()))
+        max_gap = self.settings.poses.max_gap
+        at = corrected_poses(self.log, self.keyframes, list(distinct.values()), self._odometry_at, max_gap)
+        _, map_T_base, base_T_camera = at
         rays = self.noise.rays_with_noise(self.rays)
         return corrected_rays(map_T_base[which], base_T_camera[which], self.keyframes.camera, rays, self.cameras, errors)
 
@@ -266,34 +272,17 @@ class SharedErrors:
 
     def _computed_poses(self, error: Mapping[str, float]) -> "_Poses":
         keyframes, path = self.keyframes, self.log.robot_path
-        (known,), (map_T_base,), (base_T_camera,) = self._poses_at([error])
+        (known,), (map_T_base,), (base_T_camera,) = corrected_poses(
+            self.log, keyframes, [error], self._odometry_at, self.settings.poses.max_gap
+        )
         stamps, odom_T_base = keyframes.stamps.copy(), keyframes.odom_T_base
         for index, one in enumerate(self.log.cameras):
             mine = keyframes.camera == index
             stamps[mine] = later(stamps[mine], error.get(f"{one.camera.name}.clock", 0.0), path)
         if self.log.odometry is not None and odom_T_base is not None:
-            at = map_T_base if self.log.localization is None else self._odometry_at(known, error)
+            at = map_T_base if self.log.localization is None else self._odometry_at(error, known)
             odom_T_base = inverse(self.log.odometry.poses[0]) @ at
         return _Poses(stamps, known, base_T_camera, map_T_base, odom_T_base)
-
-    def _poses_at(self, errors: Sequence[Mapping[str, float]]) -> tuple[Floats, Floats, Floats]:
-        """The stamps (D, K) at which the poses are taken, all within the time of the path, map_T_base and base_T_camera
-        (D, K, 4, 4), for D values of the errors."""
-        keyframes, max_gap, path = self.keyframes, self.settings.poses.max_gap, self.log.robot_path
-        assert path is not None
-        clocks = np.array([[error.get(f"{name}.clock", 0.0) for name in self.cameras] for error in errors])
-        known = np.clip(keyframes.stamps + clocks[:, keyframes.camera], path.stamps[0], path.stamps[-1])
-        base_T_camera = np.repeat(keyframes.base_T_camera[None], len(errors), axis=0)
-        for index, one in enumerate(self.log.cameras):
-            if one.mount is not None:
-                mine = keyframes.camera == index
-                at = poses_near(one.mount, known[:, mine].ravel(), max_gap)
-                base_T_camera[:, mine] = at.reshape(len(errors), -1, 4, 4)
-        if self.log.localization is not None:
-            map_T_base = poses_near(self.log.localization, known.ravel(), max_gap).reshape(*known.shape, 4, 4)
-        else:
-            map_T_base = np.stack([self._odometry_at(stamps, error) for stamps, error in zip(known, errors, strict=True)])
-        return known, map_T_base, base_T_camera
 
     @cached_property
     def _kept_poses(self) -> RecentValues["_Poses"]:
@@ -303,7 +292,7 @@ class SharedErrors:
     def _kept_drift(self) -> RecentValues[DriftPath]:
         return RecentValues(1)
 
-    def _odometry_at(self, stamps: Floats, error: Mapping[str, float]) -> Floats:
+    def _odometry_at(self, error: Mapping[str, float], stamps: Floats) -> Floats:
         """Poses (Q, 4, 4) of the corrected odometry at stamps (Q,), s. Only the poses around the stamps are computed."""
         odometry = self._correctable().odometry
         after = np.clip(np.searchsorted(odometry.stamps, stamps), 1, max(len(odometry) - 1, 1))

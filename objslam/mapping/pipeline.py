@@ -17,9 +17,9 @@ from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import LogError, SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.boxes.robot_parts import without_robot_parts
-from objslam.frontend.continued_localization import continued_by_odometry, share_on_continuation
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import shared_errors, take_out_expected, take_out_known
+from objslam.frontend.localization.continued_localization import continued_by_odometry, share_on_continuation
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.boxes_in_front import with_hidden_parts

@@ -12,7 +12,7 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.bodies.body import PlacedBody
 from objslam.core.trace import Round
 from objslam.core.types import Association, Keyframes, Rays
-from objslam.frontend.localization_jumps import Jumps
+from objslam.frontend.localization.localization_jumps import Jumps
 from objslam.frontend.shared_errors import SharedErrors
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from objslam.config import load_settings
 from objslam.core.geometry import lift_se2
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import Log, Trajectory
-from objslam.frontend.localization_jumps import Jumps, find_jumps
+from objslam.frontend.localization.localization_jumps import Jumps, find_jumps
 
 SETTINGS = load_settings(None, ())
 

@@ -142,7 +142,7 @@ def test_the_cost_of_a_model_is_that_of_its_whole_covariance():
         for place, predicted in ((ErrorKind(0.5), 0.0), (ErrorKind(-0.2, 8, 4), 0.3)):
             model = PoseErrors(heading, place, predicted)
             whole = data.expected(model)
-            own = 3.0 * (2 * predicted + np.exp(-2 * predicted))
+            own = 3.0 * (2 * predicted + np.exp(-2 * predicted)) + sum(max(of.factor, 0.0) ** 2 for of in (heading, place))
             cost = data.off @ np.linalg.solve(whole, data.off) + np.linalg.slogdet(whole)[1] + own
             assert data.cost(model) == pytest.approx(cost, rel=1e-9)
     singular = replace(data, shared=-2 * of[1])

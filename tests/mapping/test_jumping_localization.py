@@ -12,7 +12,7 @@ from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.maps.shared_covariance import jacobian
 from objslam.core.types import Log
-from objslam.frontend.localization_jumps import find_jumps
+from objslam.frontend.localization.localization_jumps import find_jumps
 from objslam.mapping import pipeline
 from objslam.mapping.checks.jumps import wrong_jumps
 from objslam.mapping.fixed.lasting_errors import LASTING

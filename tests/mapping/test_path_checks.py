@@ -10,7 +10,7 @@ import pytest
 from objslam.config import load_settings
 from objslam.core.geometry import inverse, lift_se2
 from objslam.core.types import Log, Trajectory
-from objslam.frontend.localization_jumps import find_jumps
+from objslam.frontend.localization.localization_jumps import find_jumps
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.path import check_path
 from objslam.simulation import preset, simulate

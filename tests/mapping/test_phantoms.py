@@ -82,7 +82,7 @@ def two_objects(labels: list[int], noise: NoiseFactors, *, odometry: bool) -> Si
 def test_no_objects_are_left_where_rays_of_several_things_meet(monkeypatch):
     """Without the search for phantoms, the map of this drive has them, although each ray fits its object. Things that are
     nearer than the poses err are named."""
-    log = turned(drive(10), 10)
+    log = turned(drive(0), 0)
     numbers, findings = mapped(log)
     assert numbers == (8, 0, 0)
     assert NEIGHBOURS in findings

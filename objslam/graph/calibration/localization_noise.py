@@ -20,6 +20,7 @@ from objslam.core.types import Keyframes
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.pose_errors import ComparedPoses, averaged, most_likely, without_jumps
 from objslam.graph.calibration.shared_error_jacobian import linearise
+from objslam.graph.factors.localization import localized, sharing
 
 _LOOSE = 1e4
 """In the graph that predicts the localised poses, their noise is multiplied by this factor, so that they hardly count. With
@@ -79,7 +80,10 @@ def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> 
         told = np.linalg.inv(left.T @ left + np.linalg.inv(errors.prior))
         by_error = solved.T @ (system.jacobian.T @ system.sides)
         shared = by_error @ told @ by_error.T
-    stamps, every = keyframes.stamps, keyframes.localized_every
+    if keyframes.carried is not None:
+        heading, place = keyframes.carried[poses].T
+        shared = shared + np.diag(np.concatenate([heading, place, place]))
+    stamps, every = keyframes.stamps, sharing(keyframes)
     return ComparedPoses(
         off=off,
         covariance=(covariance + covariance.T) / 2,
@@ -110,7 +114,7 @@ def _without_places(settings: Settings) -> Settings:
 
 def _poses(keyframes: Keyframes) -> Ints:
     """Return the indices of the localised poses that are compared, in increasing order."""
-    every = np.arange(len(keyframes)) if keyframes.localized is None else np.flatnonzero(keyframes.localized)
+    every = localized(keyframes)
     if len(every) <= _FIRST * len(_LAGS):
         return every
     begin = np.linspace(0, len(every) - 1 - max(_LAGS), _FIRST).astype(np.int64)

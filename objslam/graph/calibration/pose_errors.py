@@ -24,9 +24,12 @@ _BOTH = ("heading", "place")
 """The errors of a pose."""
 _SIZES = (-1.5, 0.0, 1.0, 2.0, 3.0)
 """The factors on noise at which a search begins, as logarithms. More are slower."""
-_AROUND = (-0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8)
-"""The variance of a lasting error is averaged over these factors around the most likely one, as logarithms. More of them are
-larger, because the posterior of a variance from few samples falls slowly to larger values."""
+_AROUND = np.array([-1.2, -0.8, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8, 1.2])
+"""The variance of a lasting error is averaged over these factors around the most likely one, as logarithms. They reach far,
+because a short log may agree with two quite different sizes. More of them are more exact and slower."""
+_USUAL = 1.0
+"""The standard deviation of the logarithm of a factor on noise above 1, before the log is seen. In a short log, an error of
+usual size looks like one twice as large that lasts four times as long. A larger value makes the second one more likely."""
 _MOST_STRAYS = 0.1
 """At most this share of the poses are jumps. A larger share explains noise by jumps."""
 _LEAST_FACTOR, _MOST_FACTOR = np.log(0.05), np.log(MOST_POSE_NOISE)
@@ -75,10 +78,10 @@ class ComparedPoses:
     """n poses of the localisation against their prediction.
 
     off: (3 n,) headings (rad), x and y (m), prediction minus localisation. covariance: (3 n, 3 n) of the prediction by its
-    noise. shared: (3 n, 3 n) of the prediction by the shared errors. It follows from their priors, so it does not grow with
-    the noise. times: (n,) s. apart: s, the time between two poses that were measured independently, 0 if all poses were.
-    nominal: of headings, rad, and places, m. free: whether the size of the noise is unknown. prior: the weight of the noise
-    of the prediction, as a number of residuals.
+    noise. shared: (3 n, 3 n) of the prediction by the shared errors, and of the localisation by the odometry that carried it
+    to the poses. It does not grow with the noise. times: (n,) s. apart: s, the time between two poses that were measured
+    independently, 0 if all poses were. nominal: of headings, rad, and places, m. free: whether the size of the noise is
+    unknown. prior: the weight of the noise of the prediction, as a number of residuals.
     """
 
     off: Floats
@@ -138,7 +141,7 @@ class ComparedPoses:
         return {}
 
     def cost(self, model: PoseErrors) -> float:
-        """Return -2 ln of the likelihood, with the prior of the factor on the error of the prediction.
+        """Return -2 ln of the likelihood, with the priors of the factors on the noise.
 
         Values are kept, because the searches come back to the same models. This takes a quarter less time. The values of
         places alone (`_Placed`) are kept too, because a third of the models differ in headings only. This takes another
@@ -160,6 +163,7 @@ class ComparedPoses:
             return np.inf
         white, _ = dtrtrs(root, placed.off, lower=1)
         prior = self.prior * (2 * model.predicted + np.exp(-2 * model.predicted))
+        prior += sum(max(kind.factor / _USUAL, 0.0) ** 2 for kind in (model.heading, model.place))
         return float(placed.cost + white @ white + 2 * np.log(np.diagonal(root)).sum() + prior)
 
 
@@ -236,12 +240,12 @@ def averaged(data: ComparedPoses, model: PoseErrors) -> tuple[tuple[float, Lasti
         if not kind.share:
             found[name] = max(float(np.exp(kind.factor)), 1.0), WHITE
             continue
-        factors = np.minimum(kind.factor + np.array(_AROUND), _MOST_FACTOR if data.free else 0.0)
+        factors = np.clip(kind.factor + _AROUND, _LEAST_FACTOR, _MOST_FACTOR if data.free else 0.0)
         tried = [
             [data.cost(_with(model, name, replace(kind, factor=f, time=t))) for t in range(len(_TIMES))]
             for f in factors.tolist()
         ]
-        weight = np.exp(-(np.array(tried) - np.min(tried)) / 2)
+        weight = np.exp(-(np.array(tried) - np.min(tried)) / 2) * np.gradient(_AROUND)[:, None]
         weight /= weight.sum()
         variance = weight * np.exp(2 * factors)[:, None]
         of_mean = float((variance * _variance_of_mean(np.array(_TIMES), duration)).sum() / variance.sum())

@@ -7,7 +7,8 @@ last gives weak absolute poses, and precise motions from pose to pose. They beco
 further variables.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import gtsam
 import numpy as np
@@ -49,6 +50,10 @@ class LocalizedMotions:
     motion: Floats
     covariance: Floats
 
+    def joined(self, other: Self) -> Self:
+        """Return these motions and other ones."""
+        return replace(self, **{name: np.concatenate([mine, getattr(other, name)]) for name, mine in vars(self).items()})
+
     def factors(self) -> list[gtsam.NonlinearFactor]:
         """Return one between-factor for each motion, with Huber's loss, because a localisation may jump."""
         return [
@@ -85,11 +90,12 @@ def localization_covariance(keyframes: Keyframes, settings: Settings, on_plane: 
     """
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
     (yaw, _), (xy, _) = _chains(keyframes, settings)
-    if keyframes.localized is not None:
-        yaw, xy = (np.where(keyframes.localized, part, _CONTINUED) for part in (yaw, xy))
+    each = np.full((2, len(keyframes)), _CONTINUED)
+    each[:, localized(keyframes)] = yaw, xy
+    yaw, xy = each
     tilt, z = _of_ground(keyframes, settings)[0] if on_plane else (yaw, xy)
     parts = (tilt, tilt, yaw, xy, xy, z)
-    s = np.stack([np.broadcast_to(np.square(part), len(keyframes)) for part in parts], axis=1) * keyframes.localized_every
+    s = np.stack([np.broadcast_to(np.square(part), len(keyframes)) for part in parts], axis=1) * sharing(keyframes)
     return _in_camera(keyframes.base_T_camera, s)
 
 
@@ -102,25 +108,49 @@ def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool |
     if not keyframes.localized_every or len(keyframes) < 2:
         return None
     on_plane = is_planar(keyframes.map_T_base) if on_plane is None else on_plane
-    lasts = any(one.share for one in keyframes.lasting) or (on_plane and settings.planar.seconds > 0)
-    if not lasts:
+    lasts, ground = any(one.share for one in keyframes.lasting), on_plane and settings.planar.seconds > 0
+    if not lasts and not ground:
         return None
+    every, number = np.arange(len(keyframes)), localized(keyframes)
     (heading, yaw), (_, xy) = _chains(keyframes, settings)
-    way = np.linalg.norm(np.diff(keyframes.map_T_base[:, :3, 3], axis=0), axis=1)
-    xy, every = np.hypot(xy, way * heading[:-1]), keyframes.localized_every
-    tilt, z = _of_ground(keyframes, settings)[1] if on_plane else (yaw, xy)
-    if on_plane:  # A base that tilts moves up or down along its own axes.
-        z = np.hypot(z, way * noise_of_ground(settings)[0])
-    parts = (tilt, tilt, yaw, xy, xy, z)
-    s = np.stack([np.broadcast_to(np.square(part), len(way)) for part in parts], axis=1) / every
-    poses = keyframes.map_T_camera
-    before = np.arange(len(way))
-    return LocalizedMotions(
-        before,
-        before + 1,
-        inverse(poses[:-1]) @ poses[1:],
-        _in_camera(keyframes.base_T_camera[1:], np.minimum(s, _UNTOLD**2)),
-    )
+    xy = np.hypot(xy, _way(keyframes, number) * heading[:-1])
+    tilt, z = (_UNTOLD, _UNTOLD) if on_plane else (yaw, xy)
+    if not ground:
+        return _motions(keyframes, number, (tilt, tilt, yaw, xy, xy, z))
+    tilt, z = _of_ground(keyframes, settings)[1]
+    z = np.hypot(z, _way(keyframes, every) * noise_of_ground(settings)[0])  # A base that tilts moves along its own axes.
+    if len(number) == len(every):
+        return _motions(keyframes, every, (tilt, tilt, yaw, xy, xy, z))
+    by_localization = _motions(keyframes, number, (_UNTOLD, _UNTOLD, yaw, xy, xy, _UNTOLD))
+    return by_localization.joined(_motions(keyframes, every, (tilt, tilt, _UNTOLD, _UNTOLD, _UNTOLD, z)))
+
+
+def _way(keyframes: Keyframes, number: Ints) -> Floats:
+    """Return the distances (n-1,), m, between consecutive keyframes of `number` (n,)."""
+    return np.asarray(np.linalg.norm(np.diff(keyframes.map_T_base[number, :3, 3], axis=0), axis=1))
+
+
+def _motions(keyframes: Keyframes, number: Ints, parts: tuple[Parts, ...]) -> LocalizedMotions:
+    """Return the motions between consecutive keyframes of `number` (n,). parts: the six standard deviations."""
+    poses, before, after = keyframes.map_T_camera, number[:-1], number[1:]
+    s = np.stack([np.broadcast_to(np.square(part), len(before)) for part in parts], axis=1) / sharing(keyframes)
+    spread = _in_camera(keyframes.base_T_camera[after], np.minimum(s, _UNTOLD**2))
+    return LocalizedMotions(before, after, inverse(poses[before]) @ poses[after], spread)
+
+
+def localized(keyframes: Keyframes) -> Ints:
+    """Return the keyframes (n,) that count as localised, in increasing order: of the keyframes that one measurement gave a
+    pose, the nearest."""
+    if (at := keyframes.localized_at) is None:
+        return np.arange(len(keyframes))
+    order = np.lexsort((np.abs(keyframes.frame_stamps - at), at))
+    measured = at[order]
+    return np.sort(order[np.isfinite(measured) & (np.diff(measured, prepend=np.nan) != 0)])
+
+
+def sharing(keyframes: Keyframes) -> float:
+    """Return how many keyframes share the information of a measured absolute pose, 1 if `localized_at` tells them apart."""
+    return keyframes.localized_every if keyframes.localized_at is None else 1.0
 
 
 def _of_ground(keyframes: Keyframes, settings: Settings) -> tuple[tuple[Parts, Parts], tuple[Parts, Parts]]:
@@ -130,7 +160,7 @@ def _of_ground(keyframes: Keyframes, settings: Settings) -> tuple[tuple[Parts, P
     share a measurement share its information. The information of the ground is not shared, so the standard deviations undo
     the division by `localized_every`.
     """
-    of, root = settings.planar, np.sqrt(keyframes.localized_every)
+    of, root = settings.planar, np.sqrt(sharing(keyframes))
     if not of.seconds:
         return (of.tilt, of.z), (_UNTOLD, _UNTOLD)
     gaps = np.maximum(np.diff(keyframes.stamps), 0.0)
@@ -146,16 +176,16 @@ def _in_camera(base_T_camera: Floats, variances: Floats) -> Floats:
 
 
 def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floats]]:
-    """Return the standard deviations of headings (rad) and places (m): for each, (K,) of poses and (K-1,) of motions."""
-    gaps = np.maximum(np.diff(keyframes.stamps), 0.0) * max(keyframes.localized_every, 1.0)
-    if keyframes.localized is not None:  # An error lasts only from one measured pose to the next.
-        gaps[~(keyframes.localized[1:] & keyframes.localized[:-1])] = np.inf
+    """Return the standard deviations of headings (rad) and places (m) of the n keyframes that count as localised: for each,
+    (n,) of poses and (n-1,) of motions."""
+    gaps = np.maximum(np.diff(keyframes.stamps[localized(keyframes)]), 0.0) * max(sharing(keyframes), 1.0)
     of = settings.localization
-    columns = zip((of.yaw, of.xy), keyframes.pose_noise, keyframes.lasting, strict=True)
-    return [chain(gaps, nominal * factor, lasting) for nominal, factor, lasting in columns]
+    more = np.zeros((2, 1)) if keyframes.carried is None else keyframes.carried[localized(keyframes)].T
+    columns = zip((of.yaw, of.xy), keyframes.pose_noise, keyframes.lasting, more, strict=True)
+    return [chain(gaps, nominal * factor, lasting, added) for nominal, factor, lasting, added in columns]
 
 
-def chain(gaps: Floats, sigma: float, lasting: Lasting) -> tuple[Floats, Floats]:
+def chain(gaps: Floats, sigma: float, lasting: Lasting, more: Parts = 0.0) -> tuple[Floats, Floats]:
     """Return the standard deviations (K,) of errors, and (K-1,) of their differences, as independent terms.
 
     The terms are exact if the whole error lasts, or if nothing of it lasts. An error with both parts has no exact terms. Its
@@ -167,13 +197,16 @@ def chain(gaps: Floats, sigma: float, lasting: Lasting) -> tuple[Floats, Floats]
         gaps: (K-1,) s, the times between consecutive errors.
         sigma: the standard deviation of the whole error.
         lasting: its lasting part.
+        more: (K,) variances of further white errors, or one for all.
     """
+    more = np.broadcast_to(more, len(gaps) + 1)
     if not lasting.share:
-        return np.full(len(gaps) + 1, sigma), np.full(len(gaps), np.inf)
-    white, lasts = sigma**2 * (1 - lasting.share), sigma**2 * lasting.share
+        return np.sqrt(sigma**2 + more), np.full(len(gaps), np.inf)
+    white, lasts = sigma**2 * (1 - lasting.share) + more, sigma**2 * lasting.share
     stays = np.minimum(np.exp(-gaps / lasting.seconds), _LONGEST)
     before, after = np.append(0.0, stays), np.append(stays, 0.0)
     alone = white + lasts / (1 / (1 + before) + 1 / (1 + after) - 1)
+    white = (white[1:] + white[:-1]) / 2
     constant = 1 / (white + lasts * (1 + stays) / (1 - stays))
     changing = 1 / (white + lasts * (1 - stays) / (1 + stays))
     return np.sqrt(alone), 2 / np.sqrt(np.maximum(changing - constant, 1e-12))

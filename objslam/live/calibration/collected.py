@@ -12,6 +12,7 @@ from objslam.errors import ObjslamError
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.known_errors import shared_errors
+from objslam.frontend.localization.measured_poses import with_measurements
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import measured_ranges, range_factors
 from objslam.live.mapper.state import MapState
@@ -74,6 +75,8 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
     objects = owners[owners >= 0]
     association = Association(index - (len(owners) - len(objects)), label[objects])
     log = recorded_log(m, name, keyframes)
+    if log.localization is not None and k.localized.any():
+        keyframes = with_measurements(keyframes, log, log.localization, m.given)
     errors = _shared_errors(m, log, keyframes, rays)
     held = {n: value for n, value in m.errors.items() if errors is None or n not in errors.names}
     if held and len(rays):

@@ -11,7 +11,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.known_errors import coarse, estimates, possible
-from objslam.frontend.localization_jumps import Jumps
+from objslam.frontend.localization.localization_jumps import Jumps
 from objslam.mapping.checks.agreement import Agreement, Part, agreement, agreements, bounded_part, pose_noise
 from objslam.mapping.checks.boxes import check_boxes, refuse_shares
 from objslam.mapping.checks.finding import Finding

@@ -6,7 +6,7 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.types import Log
-from objslam.frontend.localization_jumps import Jumps, find_jumps
+from objslam.frontend.localization.localization_jumps import Jumps, find_jumps
 from objslam.mapping.checks.agreement import agreements, bounded_part
 from objslam.mapping.checks.finding import JUMPS, Finding
 

@@ -11,7 +11,15 @@ from objslam.core.geometry import interpolate, inverse, lengths
 from objslam.core.rotation import rotation_vector
 from objslam.core.trajectory import usual_seconds
 from objslam.core.types import Log, Trajectory
-from objslam.frontend.localization_jumps import ACCELERATION, FEWEST_STEPS, STILL, TIMES_ODD, oddness, steps_of, unlike
+from objslam.frontend.localization.localization_jumps import (
+    ACCELERATION,
+    FEWEST_STEPS,
+    STILL,
+    TIMES_ODD,
+    oddness,
+    steps_of,
+    unlike,
+)
 from objslam.frontend.odometry_restarts import counts_from_zero
 from objslam.mapping.checks.finding import JUMPS, Finding
 from objslam.mapping.checks.parts.moving_boxes import boxes_move

@@ -1,0 +1,121 @@
+"""Find which measurement of a localisation gave the pose of each keyframe.
+
+A localisation may be rarer than the images, as the poses of AMCL are. Or it follows the odometry between two corrections,
+as the transform of AMCL from map to odometry does. Then one measurement gives the poses of several keyframes, and they have
+one error, not one each. The odometry carries the measured pose to the keyframes.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from objslam.config import Settings
+from objslam.core.arrays import Bools, Floats
+from objslam.core.geometry import adjoint, interpolate, inverse
+from objslam.core.rotation import rotation_vector
+from objslam.core.trajectory import poses_near
+from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.frontend.odometry_drift import gathered_drift
+
+_STEP = 1e-3
+"""A localisation was corrected once it moved by this more than the odometry (m, or rad). A larger value misses small
+corrections. A smaller value takes the rounding of poses and stamps for corrections. AMCL's corrections are centimetres."""
+_FEWEST, _MOST = 10, 0.5
+"""A localisation follows the odometry between corrections if it has at least `_FEWEST` corrections, and if at most the share
+`_MOST` of its poses are corrections. With fewer corrections, it is as exact as the odometry, or was made from it. A larger
+`_FEWEST` wants longer logs. A larger `_MOST` takes more localisations for ones that follow the odometry."""
+_RARE = 1.2
+"""With more keyframes for each pose of the localisation, the odometry carries its poses to the keyframes. With fewer, poses
+are interpolated, which does not depend on the odometry. A larger number interpolates over longer times."""
+
+
+def with_measurements(keyframes: Keyframes, log: Log, measured: Trajectory, settings: Settings) -> Keyframes:
+    """Return keyframes at poses of the localisation of a log, with the measurements that gave these poses.
+
+    measured: the localisation before `continued_by_odometry`.
+    """
+    stamps, max_gap, localization = keyframes.stamps, settings.poses.max_gap, log.localization
+    assert localization is not None
+    on_path = np.ones(len(stamps), dtype=bool)
+    if measured is not localization:
+        on_path = interpolate(measured.stamps, measured.poses, stamps, max_gap)[1]
+    used = stamps[on_path]
+    number = ((measured.stamps >= used[0]) & (measured.stamps <= used[-1])).sum() if len(used) else 0
+    keyframes = replace(keyframes, localized_every=max(1.0, len(used) / max(float(number), 1.0)))
+    if log.odometry is None or keyframes.odom_T_base is None:
+        return keyframes
+    localized_at = _measured_at(measured, log.odometry, keyframes, max_gap)
+    if localized_at is None and on_path.all():
+        return keyframes
+    localized_at = np.where(on_path, stamps if localized_at is None else localized_at, np.nan)
+    on_odometry = partial(poses_near, log.odometry, max_gap=max_gap)
+    odom_T_base = inverse(log.odometry.poses[0]) @ on_odometry(stamps)
+    drift = (gathered_drift(log.odometry, at, settings.odometry) for at in (stamps, localized_at))
+    return replace(
+        keyframes,
+        map_T_base=carried_by_odometry(keyframes.map_T_base, stamps, localized_at, localization, on_odometry, max_gap),
+        localized_at=localized_at,
+        carried=carried_variance(odom_T_base, *drift),
+    )
+
+
+def _measured_at(localization: Trajectory, odometry: Trajectory, keyframes: Keyframes, max_gap: float) -> Floats | None:
+    """Return the stamps (K,), s, of the measurements that gave the poses of keyframes. None if each pose was measured by
+    itself. A pose to which no odometry leads from a measurement counts as measured at its own stamp."""
+    at, covered = interpolate(odometry.stamps, odometry.poses, localization.stamps, max_gap)
+    stamps, known = keyframes.stamps, localization.stamps[covered]
+    if len(known) < 2:
+        return None
+    corrected = known[_corrected(localization.poses[covered], at[covered])]
+    if _FEWEST <= len(corrected) <= _MOST * len(known):
+        known = corrected
+    elif keyframes.localized_every <= _RARE:
+        return None
+    after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
+    found = np.where(stamps - known[after - 1] < known[after] - stamps, known[after - 1], known[after])
+    gap_ends = odometry.stamps[1:][np.diff(odometry.stamps) > max_gap]
+    here, there = (np.searchsorted(gap_ends, of, side="right") for of in (stamps, found))
+    _, on_odometry = interpolate(odometry.stamps, odometry.poses, stamps, max_gap)
+    return np.where((here == there) & on_odometry, found, stamps)
+
+
+def _corrected(map_T_base: Floats, odom_T_base: Floats) -> Bools:
+    """Return which poses (n, 4, 4) of a localisation the odometry (n, 4, 4) does not explain by the pose before."""
+    moved, by_odometry = (inverse(poses[:-1]) @ poses[1:] for poses in (map_T_base, odom_T_base))
+    more = inverse(by_odometry) @ moved
+    size = np.linalg.norm(more[:, :3, 3], axis=1) + np.linalg.norm(rotation_vector(more[:, :3, :3]), axis=1)
+    return np.append(True, np.diff(np.floor(np.cumsum(size) / _STEP), prepend=0.0) > 0)
+
+
+def carried_by_odometry(
+    map_T_base: Floats,
+    stamps: Floats,
+    localized_at: Floats,
+    localization: Trajectory,
+    on_odometry: Callable[[Floats], Floats],
+    max_gap: float,
+) -> Floats:
+    """Return poses (K, 4, 4) at stamps (K,), s, which the odometry carried from measurements of a localisation.
+
+    map_T_base: (K, 4, 4) the poses of keyframes that no measurement gave. localized_at: (K,) s, of the measurements, NaN if
+    there is none. on_odometry: returns the poses of the odometry at stamps.
+    """
+    known, result = np.isfinite(localized_at), map_T_base.copy()
+    begin = localized_at[known]
+    at = on_odometry(np.concatenate([begin, stamps[known]]))
+    result[known] = poses_near(localization, begin, max_gap) @ inverse(at[: len(begin)]) @ at[len(begin) :]
+    return result
+
+
+def carried_variance(odom_T_base: Floats, drift: Floats, drift_at_measured: Floats) -> Floats:
+    """Return the variances (K, 2), rad^2 and m^2, of heading and place that the odometry adds on its way from a measurement
+    to each keyframe. It is 0 without a measurement.
+
+    odom_T_base: (K, 4, 4). drift, drift_at_measured: (K, 6, 6) of the odometry at keyframes and at measurements, NaN at
+    keyframes without one.
+    """
+    to_base = adjoint(inverse(odom_T_base))
+    added = np.einsum("kij,kjl,kil->ki", to_base, drift - drift_at_measured, to_base)
+    return np.nan_to_num(np.abs(np.column_stack([added[:, 2], added[:, 3:5].mean(axis=1)])))
