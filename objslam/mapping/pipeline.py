@@ -43,6 +43,7 @@ from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
+from objslam.mapping.moves.odometry_witness import odometry_contradicts
 from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.progress import Progress
 from objslam.mapping.refuted import with_known_labels, without_refuted
@@ -67,7 +68,8 @@ def run(
     With mode `auto`, a log whose localisation errs for seconds (`check_lasting_noise`) is solved once more in joint mode, if
     it has odometry too, or if the settings leave the noise of the localisation open. A log with odometry is solved once
     more, too, if its localisation errs by more than the settings say (`check_pose_noise`). A log that has odometry, and
-    localised poses at which no object has a place, is solved once more, too. known: the map of another day. If the drive is
+    localised poses at which no object has a place, is solved once more, too. So is a log whose map is not good, if the
+    odometry shows that the localisation errs for seconds (`odometry_contradicts`). known: the map of another day. If the drive is
     found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if
     its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
     calibration.file is wrong or does not fit the log.
@@ -273,6 +275,9 @@ def _run(
         why = "the localisation errs by more than its settings say"
     if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
         why = "no object has a place at the localised poses"
+    unclear = result.summary["assessment"]["level"] != "good"
+    if not why and open_mode and settings.mode == "fixed" and trusted and unclear and odometry_contradicts(given, settings):
+        why = "the odometry shows that the localisation errs for seconds"
     return result, why, None if late is None else lasting
 
 

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from lasting_localization import with_lasting
 from quick import HELD
 
 from objslam.config import Odometry, load_settings
@@ -62,3 +63,18 @@ def test_from_plain_odometry_the_truth_lies_in_the_ellipsoids_of_the_default_mod
 
     assert inside() >= 0.8
     assert inside("mode=fixed") < 0.5
+
+
+@pytest.mark.long
+def test_the_odometry_tells_that_a_localisation_errs_by_a_metre(monkeypatch):
+    """As satellite positioning between houses does. At its poses, each thing becomes several objects, which explain their
+    boxes, so the boxes do not tell."""
+    for check in ("check_lasting_noise", "check_pose_noise", "check_residuals"):
+        monkeypatch.setattr(pipeline, check, lambda *_, **__: None)
+    room = {"objects": 6, "classes": 6, "frames": 150, "odometry": Odometry(), "pixel_sigma": 2.0}
+    log = with_lasting(simulate(preset("demo", **room, localization=PoseNoise(xy=0.3, yaw=0.005)), 3), 40.0, 20.0, 3)
+    result = pipeline.run(log, load_settings(None, ("output.recording=false", "bodies.use=false")), Ledger())
+    assert result.summary["mode"] == "joint"
+    assert any("the odometry shows that the localisation errs" in said for said in result.summary["warnings"])
+    found = evaluate(result.map, log.truth, align="none", radius=4.0).to_dict()
+    assert (found["matched"], found["false"], found["inside_95_3d"]) == (6, 0, 1.0)

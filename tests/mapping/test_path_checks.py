@@ -158,3 +158,19 @@ def test_a_jump_of_odometry_that_is_not_used_spoils_nothing() -> None:
     assert joint[0].spoils
     slow = Log("log", (), localization=circle(0.5, 0.03), odometry=jumped(circle(0.5), 30.2, 0.6))
     assert check_path(slow, FIXED) == []
+
+
+def ring(scale: float = 1.0, noise: float = 0.0) -> Trajectory:
+    """Three minutes at 0.6 m/s along a circle with a radius of 8 m. noise: of places, m."""
+    stamps = np.arange(0.0, 180.0, 0.2)
+    angle = 0.6 / 8.0 * stamps
+    places = 8.0 * scale * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
+    places = places + np.random.default_rng(0).normal(0, noise, places.shape)
+    return Trajectory(stamps, lift_se2(np.column_stack([places, angle])))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+@pytest.mark.parametrize(("scale", "said"), [(1.0, []), (1.05, []), (1.3, ["scales differ"]), (0.5, ["scales differ"])])
+def test_noisy_places_have_no_other_scale(scale: float, said: list[str], noise: float) -> None:
+    """With noise of half a metre, as of satellite positioning, distances of a second are 30 % too long."""
+    assert [name for name in names(ring(scale, noise), ring()) if name == "scales differ"] == said

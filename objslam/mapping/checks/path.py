@@ -50,10 +50,13 @@ _LEAST_STEP = 0.01
 """The noise (m) of a position. The direction of a motion is judged if the motion is longer than three times this noise. A
 larger value suits noisy poses."""
 _PIECE = 1.0
-"""The time (s) over which distances are compared. A longer time suits noisy poses."""
+"""The time (s) between two stamps at which distances are compared. A longer time is faster and less exact."""
+_PIECES = (1, 4, 16)
+"""The numbers of `_PIECE` over which distances are compared. A wrong scale shows over all of them. Noise of the places, as
+of satellite positioning, makes only short distances longer. Larger numbers suit noisier places and longer logs."""
 _LEAST_PIECE = 0.3
-"""Two distances are compared if both are at least this share of the longest distance in a time of `_PIECE`. Shorter ones are
-noise. A larger share compares fewer distances."""
+"""Two distances are compared if both are at least this share of the longest distance in the same
+time. Shorter ones are noise. A larger share compares fewer distances."""
 _OTHER_SCALE = 0.1
 """A run warns if the logarithm of the ratio between the distances by localisation and odometry exceeds this. Real odometry
 errs by up to 8 %. A larger value warns less often."""
@@ -135,19 +138,30 @@ def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Fi
     if len(times) < FEWEST_STEPS:
         return
     places = [interpolate(path.stamps, path.poses, times, np.inf)[0][:, :3, 3] for path in (localization, odometry)]
-    by_map, by_wheels = (np.linalg.norm(np.diff(place, axis=0), axis=1) for place in places)
-    moved = np.minimum(by_map, by_wheels) > _LEAST_PIECE * np.maximum(by_map, by_wheels).max()
-    if moved.sum() < FEWEST_STEPS:
-        return
-    ratio = np.log(by_map[moved] / by_wheels[moved])
-    middle = float(np.median(ratio))
-    sigma = 1.5 * float(np.median(np.abs(ratio - middle))) / np.sqrt(moved.sum())
-    if abs(middle) > max(_OTHER_SCALE, 5 * sigma):
+    ratios = [_log_ratio(*places, pieces) for pieces in _PIECES]
+    found = [one for one in ratios if one is not None]
+    middle, limit = min(found, key=lambda one: abs(one[0]) - one[1], default=(0.0, np.inf))
+    if abs(middle) > limit:
         yield Finding(
             "scales differ",
             f"the localisation goes {np.exp(middle):.3g} times as far as the odometry: one of them is not in metres, or has "
             "a wrong scale",
         )
+
+
+def _log_ratio(by_map: Floats, by_wheels: Floats, pieces: int) -> tuple[float, float] | None:
+    """Return the logarithm of the ratio between the distances of places (n, 3) that are `pieces` apart, and the largest that
+    may be due to errors. None if there are too few distances."""
+    far = [np.linalg.norm(places[pieces:] - places[:-pieces], axis=1) for places in (by_map, by_wheels)]
+    if len(far[0]) < FEWEST_STEPS:
+        return None
+    moved = np.minimum(*far) > _LEAST_PIECE * np.maximum(*far).max()
+    if moved.sum() < FEWEST_STEPS:
+        return None
+    ratio = np.log(far[0][moved] / far[1][moved])
+    middle = float(np.median(ratio))
+    sigma = 1.5 * float(np.median(np.abs(ratio - middle))) * np.sqrt(pieces / moved.sum())  # Distances overlap.
+    return middle, max(_OTHER_SCALE, 5 * sigma)
 
 
 def _judge_speed(path: Trajectory, name: str) -> Iterator[Finding]:
