@@ -69,10 +69,10 @@ def run(
     it has odometry too, or if the settings leave the noise of the localisation open. A log with odometry is solved once
     more, too, if its localisation errs by more than the settings say (`check_pose_noise`). A log that has odometry, and
     localised poses at which no object has a place, is solved once more, too. So is a log whose map is not good, if the
-    odometry shows that the localisation errs for seconds (`odometry_contradicts`). known: the map of another day. If the drive is
-    found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen poses, if
-    its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray. ConfigError if
-    calibration.file is wrong or does not fit the log.
+    odometry shows that the localisation errs for seconds (`odometry_contradicts`). known: the map of another day. If the
+    drive is found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen
+    poses, if its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray.
+    ConfigError if calibration.file is wrong or does not fit the log.
     """
     before = ledger.copy()
     try:

@@ -137,8 +137,10 @@ def _compare_ways(localization: Trajectory, odometry: Trajectory) -> Iterator[Fi
     times = np.arange(begin, end, _PIECE)
     if len(times) < FEWEST_STEPS:
         return
-    places = [interpolate(path.stamps, path.poses, times, np.inf)[0][:, :3, 3] for path in (localization, odometry)]
-    ratios = [_log_ratio(*places, pieces) for pieces in _PIECES]
+    by_map, by_wheels = (
+        interpolate(path.stamps, path.poses, times, np.inf)[0][:, :3, 3] for path in (localization, odometry)
+    )
+    ratios = [_log_ratio(by_map, by_wheels, pieces) for pieces in _PIECES]
     found = [one for one in ratios if one is not None]
     middle, limit = min(found, key=lambda one: abs(one[0]) - one[1], default=(0.0, np.inf))
     if abs(middle) > limit:
