@@ -16,7 +16,7 @@ With --unnamed, all objects of a robot have one label, so the map must also find
 
 With --localised, each robot has a localisation too, that errs for seconds. All settings are the defaults, and maps are
 compared without an alignment. filter: AMCL by tf, which steps when it corrects the odometry. poses: the poses of AMCL at its
-corrections alone. slam: a scan matcher.
+corrections alone. slam: a scan matcher. satellites: positions that err by up to more than a metre.
 """
 
 from __future__ import annotations
@@ -46,8 +46,9 @@ STEP = 0.005  # s, of the simulated motion
 SIDES = 0.04  # the offset of a box from its object, as a share of the size of the object, for each of five terms
 SURFACES = 0.2  # the spread over things of the distance from surface to centre, as a share of half the width
 SLIPS = 90.0  # s between sudden slips, on average
-RADIUS, UNNAMED_RADIUS = 3.0, 0.5
-"""The radius of a match, m, with labels and without. Labels identify objects, so a large error is no missed object."""
+RADIUS, FAR_RADIUS, UNNAMED_RADIUS = 3.0, 6.0, 0.5
+"""The radius of a match, m: with labels, with labels at positions that err by metres, and without. Labels identify objects,
+so a large error is no missed object."""
 
 
 def main() -> None:
@@ -76,15 +77,15 @@ def main() -> None:
                 continue
             seconds = time.process_time() - begin
             assert log.truth is not None
-            radius = UNNAMED_RADIUS if options.unnamed or options.classes else RADIUS
+            radius = FAR_RADIUS if options.localised == "satellites" else RADIUS
+            radius = UNNAMED_RADIUS if options.unnamed or options.classes else radius
             found = evaluate(result.map, log.truth, align="none" if options.localised else "se2", radius=radius).to_dict()
-            inside, squared = found["inside_95_3d"] * found["matched"], found["mahalanobis_median"]
-            rows[ranged].append(
-                (found["matched"], len(log.truth.objects), found["false"], inside, found["position_rmse"], squared, seconds)
-            )
+            inside = (found["inside_95_3d"] or 0.0) * found["matched"]
+            rmse, squared = (found[name] if found["matched"] else np.nan for name in ("position_rmse", "mahalanobis_median"))
+            rows[ranged].append((found["matched"], len(log.truth.objects), found["false"], inside, rmse, squared, seconds))
             print(
                 f"{kind} {seed}, {'range' if ranged else 'bearings'}: {found['matched']} of {len(log.truth.objects)} "
-                f"objects, {found['false']} false, {inside:.0f} inside 95 %, RMSE {found['position_rmse']:.3f} m, "
+                f"objects, {found['false']} false, {inside:.0f} inside 95 %, RMSE {rmse:.3f} m, "
                 f"squared Mahalanobis median {squared:.2f}, {seconds:.1f} s of CPU",
                 flush=True,
             )
@@ -99,7 +100,7 @@ def main() -> None:
                     f"== {kind}, {'range' if ranged else 'bearings'}: {len(of)} robots, {matched.sum():.0f} of "
                     f"{objects.sum():.0f} objects, {false.sum():.0f} false, inside 95 %: "
                     f"{inside.sum() / matched.sum():.1%}, "
-                    f"RMSE median {np.median(rmse):.3f} m, largest {rmse.max():.3f} m, {np.median(seconds):.1f} s of CPU",
+                    f"RMSE median {np.nanmedian(rmse):.3f} m, largest {np.nanmax(rmse):.3f} m, {np.median(seconds):.1f} s of CPU",
                     flush=True,
                 )
         for name, of_name in errors.items():

@@ -276,7 +276,8 @@ def _run(
     if settings.mode == "fixed" and keyframes.localized_every and not diagnosis.findings and not objects.resolved():
         why = "no object has a place at the localised poses"
     unclear = result.summary["assessment"]["level"] != "good"
-    if not why and open_mode and settings.mode == "fixed" and trusted and unclear and odometry_contradicts(given, settings):
+    testable = open_mode and settings.mode == "fixed" and not diagnosis.certain  # A joint solve may refute what boxes show.
+    if not why and testable and unclear and odometry_contradicts(given, settings):
         why = "the odometry shows that the localisation errs for seconds"
     return result, why, None if late is None else lasting
 
