@@ -100,7 +100,8 @@ def main() -> None:
                     f"== {kind}, {'range' if ranged else 'bearings'}: {len(of)} robots, {matched.sum():.0f} of "
                     f"{objects.sum():.0f} objects, {false.sum():.0f} false, inside 95 %: "
                     f"{inside.sum() / matched.sum():.1%}, "
-                    f"RMSE median {np.nanmedian(rmse):.3f} m, largest {np.nanmax(rmse):.3f} m, {np.median(seconds):.1f} s of CPU",
+                    f"RMSE median {np.nanmedian(rmse):.3f} m, largest {np.nanmax(rmse):.3f} m, "
+                    f"{np.median(seconds):.1f} s of CPU",
                     flush=True,
                 )
         for name, of_name in errors.items():
