@@ -68,7 +68,8 @@ def localizations(
     """Return priors on the poses of the keyframes, which are X(first), X(first + 1) and so on.
 
     The priors have Huber's loss, because a localisation may jump. If one measurement gives the poses of several keyframes,
-    each gets an equal part of its information. on_plane: whether the path is planar. If it is None, the poses decide.
+    only the nearest one has its information (`localized`). Without odometry between them, each has an equal part. on_plane:
+    whether the path is planar. If it is None, the poses decide.
     """
     covariance = localization_covariance(keyframes, settings, on_plane)
     return [
