@@ -277,7 +277,7 @@ def _run(
         why = "no object has a place at the localised poses"
     unclear = result.summary["assessment"]["level"] != "good"
     testable = open_mode and settings.mode == "fixed" and not diagnosis.certain  # A joint solve may refute what boxes show.
-    if not why and testable and unclear and odometry_contradicts(given, settings):
+    if not why and settings.checks.use and testable and unclear and odometry_contradicts(given, settings):
         why = "the odometry shows that the localisation errs for seconds"
     return result, why, None if late is None else lasting
 

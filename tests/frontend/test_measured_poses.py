@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2, split_se2
+from objslam.core.statistics import Lasting
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
@@ -103,13 +104,13 @@ def test_the_odometry_adds_its_noise_on_the_way_from_the_measurement():
     """Against the settings: its variance grows with the way and the turn."""
     log, _, _ = drive(1.0, follows=True)
     frames, of = frames_of(log), SETTINGS.odometry
-    for k in range(0, len(frames), 17):
-        here, there = frames.stamps[k], frames.localized_at[k]
-        between = (min(here, there) <= T) & (min(here, there) < T) & (max(here, there) + 0.05 > T)
-        turned = np.abs(here - there) * TURN * (0.4 + 0.3 * np.sin(T[between])).mean() if between.any() else 0.0
-        way = 0.5 * np.abs(here - there)
-        expected = of.yaw_per_m**2 * way + of.yaw_per_rad**2 * turned
-        assert frames.carried[k, 0] == pytest.approx(expected, rel=0.15, abs=1e-9)
+    here, there = frames.stamps, frames.localized_at
+    heading = np.unwrap(split_se2(log.odometry.poses)[0][:, 2])
+    turned, way = np.abs(np.interp(here, T, heading) - np.interp(there, T, heading)), 0.5 * np.abs(here - there)
+    assert_allclose(frames.carried[:, 0], of.yaw_per_m**2 * way + of.yaw_per_rad**2 * turned, rtol=0.01, atol=1e-12)
+    aside = (of.x_per_m**2 + of.y_per_m**2) / 2 * way + of.xy_per_rad**2 * turned
+    assert (frames.carried[:, 1] >= 0.99 * aside).all()  # The heading that errs adds to it.
+    assert frames.carried[:, 1].max() < 1.5 * aside.max()
 
 
 @pytest.mark.parametrize("kind", ["every pose is new", "the odometry itself", "no odometry"])
@@ -133,3 +134,11 @@ def test_a_gap_of_the_odometry_ends_what_a_measurement_gives():
     frames = frames_of(replace(log, odometry=Trajectory(T[whole], log.odometry.poses[whole])))
     assert (frames.localized_at[frames.stamps < 8.0] < 8.0).all()
     assert (frames.localized_at[frames.stamps > 9.5] > 9.5).all()
+
+
+def test_keyframes_that_the_odometry_alone_gave_poses_have_no_localisation():
+    frames = frames_of(drive(0.4, follows=True)[0])
+    alone = replace(frames, localized_at=np.full(len(frames), np.nan), carried=np.zeros((len(frames), 2)))
+    alone = replace(alone, lasting=(Lasting(1.0, 5.0), Lasting(1.0, 5.0)))
+    assert np.sqrt(localization_covariance(alone, SETTINGS)[:, 5, 5]).min() > 100
+    assert len(localized_motions(alone, SETTINGS).before) == 0

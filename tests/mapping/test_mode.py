@@ -11,7 +11,7 @@ from quick import HELD
 from objslam.config import Odometry, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
-from objslam.core.types import Log
+from objslam.core.types import Log, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.simulation import PoseNoise, preset, simulate
@@ -65,16 +65,35 @@ def test_from_plain_odometry_the_truth_lies_in_the_ellipsoids_of_the_default_mod
     assert inside("mode=fixed") < 0.5
 
 
+def metres_off() -> Log:
+    """A drive at positions that err by 0.8 m for 20 s, as between houses."""
+    room = {"objects": 6, "classes": 6, "frames": 150, "odometry": Odometry(), "pixel_sigma": 2.0}
+    return with_lasting(simulate(preset("demo", **room, localization=PoseNoise(xy=0.3, yaw=0.005)), 3), 40.0, 20.0, 3)
+
+
+def without_boxes_that_tell(monkeypatch) -> None:
+    for check in ("check_lasting_noise", "check_pose_noise", "check_residuals"):
+        monkeypatch.setattr(pipeline, check, lambda *_, **__: None)
+
+
 @pytest.mark.long
 def test_the_odometry_tells_that_a_localisation_errs_by_a_metre(monkeypatch):
     """As satellite positioning between houses does. At its poses, each thing becomes several objects, which explain their
     boxes, so the boxes do not tell."""
-    for check in ("check_lasting_noise", "check_pose_noise", "check_residuals"):
-        monkeypatch.setattr(pipeline, check, lambda *_, **__: None)
-    room = {"objects": 6, "classes": 6, "frames": 150, "odometry": Odometry(), "pixel_sigma": 2.0}
-    log = with_lasting(simulate(preset("demo", **room, localization=PoseNoise(xy=0.3, yaw=0.005)), 3), 40.0, 20.0, 3)
+    without_boxes_that_tell(monkeypatch)
+    log = metres_off()
     result = pipeline.run(log, load_settings(None, ("output.recording=false", "bodies.use=false")), Ledger())
     assert result.summary["mode"] == "joint"
     assert any("the odometry shows that the localisation errs" in said for said in result.summary["warnings"])
     found = evaluate(result.map, log.truth, align="none", radius=4.0).to_dict()
     assert (found["matched"], found["false"], found["inside_95_3d"]) == (6, 0, 1.0)
+
+
+def test_odometry_of_another_time_costs_no_map(monkeypatch):
+    """It has no pose at any frame, so it cannot say whether the localisation errs."""
+    without_boxes_that_tell(monkeypatch)
+    log = metres_off()
+    log = replace(log, odometry=Trajectory(log.odometry.stamps + 1e4, log.odometry.poses))
+    result = pipeline.run(log, load_settings(None, ("output.recording=false", "bodies.use=false")), Ledger())
+    assert result.summary["mode"] == "fixed"
+    assert result.summary["assessment"]["level"] != "good"

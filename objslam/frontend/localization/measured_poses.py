@@ -100,7 +100,7 @@ def carried_by_odometry(
     """Return poses (K, 4, 4) at stamps (K,), s, which the odometry carried from measurements of a localisation.
 
     map_T_base: (K, 4, 4) the poses of keyframes that no measurement gave. localized_at: (K,) s, of the measurements, NaN if
-    there is none. on_odometry: returns the poses of the odometry at stamps.
+    there is none. on_odometry: returns the poses of the odometry at stamps. max_gap: s, the longest gap of the localisation.
     """
     known, result = np.isfinite(localized_at), map_T_base.copy()
     begin = localized_at[known]

@@ -179,9 +179,11 @@ def _in_camera(base_T_camera: Floats, variances: Floats) -> Floats:
 def _chains(keyframes: Keyframes, settings: Settings) -> list[tuple[Floats, Floats]]:
     """Return the standard deviations of headings (rad) and places (m) of the n keyframes that count as localised: for each,
     (n,) of poses and (n-1,) of motions."""
-    gaps = np.maximum(np.diff(keyframes.stamps[localized(keyframes)]), 0.0) * max(sharing(keyframes), 1.0)
-    of = settings.localization
-    more = np.zeros((2, 1)) if keyframes.carried is None else keyframes.carried[localized(keyframes)].T
+    number, of = localized(keyframes), settings.localization
+    if not len(number):
+        return [(np.zeros(0), np.zeros(0))] * 2
+    gaps = np.maximum(np.diff(keyframes.stamps[number]), 0.0) * max(sharing(keyframes), 1.0)
+    more = np.zeros((2, 1)) if keyframes.carried is None else keyframes.carried[number].T
     columns = zip((of.yaw, of.xy), keyframes.pose_noise, keyframes.lasting, more, strict=True)
     return [chain(gaps, nominal * factor, lasting, added) for nominal, factor, lasting, added in columns]
 

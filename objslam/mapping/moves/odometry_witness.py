@@ -7,6 +7,7 @@ from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.noise import NoiseFactors
 from objslam.core.types import Log
+from objslam.errors import LogError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors
@@ -23,12 +24,15 @@ def odometry_contradicts(log: Log, settings: Settings) -> bool:
     `localization`.
 
     Both paths are compared at the clocks that the turns of the robot show. A localisation that agrees with its settings, and
-    a log without odometry, give False.
+    a log without odometry at its frames, give False.
     """
     if log.odometry is None or log.localization is None:
         return False
     joint = settings.model_copy(update={"mode": "joint"})
-    frames = build_keyframes(log, joint, Ledger())
+    try:
+        frames = build_keyframes(log, joint, Ledger())
+    except LogError:  # The odometry has no pose at any frame, so it says nothing. The map at the localisation is there.
+        return False
     rays = build_rays(log, frames, joint, Ledger())
     return max(lasting_by_odometry(shared_errors(log, frames, rays, joint))) >= 1
 
