@@ -14,7 +14,8 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.errors import ConfigError
-from objslam.frontend.corrected_log import AXES, LENS, ODOMETRY, take_out
+from objslam.frontend.corrected_log import AXES, LENS, take_out
+from objslam.frontend.corrected_odometry import ODOMETRY
 from objslam.frontend.recent_values import ValuesOfObjects
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import half_widths_of_rays, with_known_surfaces

@@ -14,15 +14,8 @@ from objslam.core.geometry import inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.trajectory import poses_near
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
-from objslam.frontend.corrected_log import (
-    ODOMETRY,
-    CorrectablePath,
-    corrected_mount,
-    later,
-    lens_errors,
-    refocused,
-    take_out,
-)
+from objslam.frontend.corrected_log import corrected_mount, later, lens_errors, refocused, take_out
+from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath
 from objslam.frontend.corrected_rays import corrected_poses, corrected_rays
 from objslam.frontend.localization.measured_poses import carried_variance
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise

@@ -16,7 +16,7 @@ from objslam.core.rotation import rotation_from_vector
 from objslam.core.trajectory import correct_path
 from objslam.core.types import CameraLog, Detections, Log, Trajectory
 from objslam.errors import LogError
-from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, corrected_odometry
+from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath, corrected_odometry
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.odometry_drift import add_step, gathered_drift, step_drift
 from objslam.graph.fixed_pose_triangulation import noise_of_poses

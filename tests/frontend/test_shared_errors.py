@@ -17,7 +17,8 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Images, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.corrected_log import ODOMETRY, CorrectablePath, refocused, take_out
+from objslam.frontend.corrected_log import refocused, take_out
+from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors, take_out_known
 from objslam.frontend.odometry_drift import gathered_drift

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from objslam.core.geometry import lift_se2
 from objslam.core.trajectory import travel
 from objslam.core.types import Log, Trajectory
-from objslam.frontend.corrected_log import OdometryCorrection, corrected_odometry
+from objslam.frontend.corrected_odometry import OdometryCorrection, corrected_odometry
 
 SLIP = {"odometry.turn_slip": 0.08}
 

@@ -16,7 +16,7 @@ from objslam.core.geometry import lift_se2, make_pose
 from objslam.core.noise import NOMINAL
 from objslam.core.rotation import rotation_from_vector, rotation_vector
 from objslam.core.types import Log, Trajectory
-from objslam.frontend.corrected_log import OdometryCorrection
+from objslam.frontend.corrected_odometry import OdometryCorrection
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.live.adapters.replay import events

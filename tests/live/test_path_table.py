@@ -8,7 +8,7 @@ from test_session import make_log
 from objslam.config import Odometry, load_settings
 from objslam.core.geometry import exp_se3, interpolate, lift_se2
 from objslam.core.types import Trajectory
-from objslam.frontend.corrected_log import corrected_odometry
+from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.live.mapper.tables import PathTable
 from objslam.live.session.finalize import finish

@@ -19,7 +19,7 @@ from objslam.core.types import Log, Trajectory
 from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
-from objslam.frontend.corrected_log import CorrectablePath
+from objslam.frontend.corrected_odometry import CorrectablePath
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors
 from objslam.io.calibration_yaml import dump_calibration

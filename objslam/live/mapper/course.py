@@ -13,7 +13,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Floats
 from objslam.core.geometry import adjoint, interpolate, inverse
 from objslam.core.types import Trajectory
-from objslam.frontend.corrected_log import OdometryCorrection
+from objslam.frontend.corrected_odometry import OdometryCorrection
 from objslam.frontend.odometry_drift import gathered_drift
 from objslam.graph.factors.odometry import UNKNOWN_TURN, UNKNOWN_WAY
 from objslam.live.mapper.tables import KeyframeTable, PathTable

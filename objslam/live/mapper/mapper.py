@@ -14,7 +14,7 @@ from objslam.core.arrays import Floats
 from objslam.core.camera import spoken_name
 from objslam.frontend.boxes.part_finder import RobotPartFinder
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
-from objslam.frontend.corrected_log import OdometryCorrection
+from objslam.frontend.corrected_odometry import OdometryCorrection
 from objslam.frontend.known_errors import known_errors
 from objslam.frontend.odometry_drift import scaled_noise
 from objslam.graph.isam2 import IncrementalGraph
