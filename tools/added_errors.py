@@ -13,9 +13,9 @@ from objslam.core.types import Log, Trajectory
 def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
     """Return the log as it would be with shared errors of these values, named as in `core.calibration.Calibration`.
 
-    Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, odometry.turn_slip, range_scale, range_offset, and
-    for each CAMERA the names CAMERA.clock, CAMERA.roll, CAMERA.tilt, CAMERA.yaw, CAMERA.focal, CAMERA.cx, CAMERA.cy,
-    CAMERA.x, CAMERA.y and CAMERA.z. The odometry must be planar.
+    Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, odometry.turn_slip, odometry.lateral_scale,
+    range_scale, range_offset, and for each CAMERA the names CAMERA.clock, CAMERA.roll, CAMERA.tilt, CAMERA.yaw,
+    CAMERA.focal, CAMERA.cx, CAMERA.cy, CAMERA.x, CAMERA.y and CAMERA.z. The odometry must be planar.
     """
     odometry = None if log.odometry is None else _wrong_odometry(log.odometry, errors)
     cameras = []
@@ -42,8 +42,8 @@ def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
 def _wrong_odometry(odometry: Trajectory, errors: Mapping[str, float]) -> Trajectory:
     """Return the odometry with wrong distances, turns and turn rates. A correction by the same values restores the true
     odometry."""
-    names = ("scale", "turn_scale", "turn_bias", "turn_slip")
-    scale, turn_scale, turn_bias, turn_slip = (errors.get(f"odometry.{name}", 0.0) for name in names)
+    names = ("scale", "turn_scale", "turn_bias", "turn_slip", "lateral_scale")
+    scale, turn_scale, turn_bias, turn_slip, lateral = (errors.get(f"odometry.{name}", 0.0) for name in names)
     plane, remainder = split_se2(odometry.poses)
     yaw, place = np.unwrap(plane[:, 2]), plane[:, :2]
     turns = (np.diff(yaw) - turn_bias * np.diff(odometry.stamps)) / (1 + turn_scale)
@@ -53,6 +53,7 @@ def _wrong_odometry(odometry: Trajectory, errors: Mapping[str, float]) -> Trajec
     chord /= 1 + scale
     moves = np.abs(chord) > 0  # A robot that turns on the spot does not slip.
     chord[moves] *= 1 + turn_slip * np.abs(turns[moves]) / np.abs(chord[moves])
+    chord.imag /= 1 + lateral
     ways = chord * np.exp(0.5j * (said[1:] + said[:-1]))
     path = place[0] @ [1, 1j] + np.append(0, np.cumsum(ways))
     return Trajectory(odometry.stamps, lift_se2(np.stack([path.real, path.imag, said], axis=1)) @ remainder)

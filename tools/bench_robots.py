@@ -1,11 +1,12 @@
 """Measure whether maps are honest on robots whose errors come from hardware, not from the noise model of the package.
 
-    python tools/bench_robots.py [--kinds wheels gyro vio slow] [--robots 8] [--first 0] [--unnamed]
+    python tools/bench_robots.py [--kinds wheels gyro vio slow mecanum] [--robots 8] [--first 0] [--unnamed]
         [--classes 6] [--localised filter]
 
 Each robot drives to random points of a room, with stops. wheels: encoders with ticks, wrong radii, a wrong track width, slip
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
-wheels, but only one or two odometry poses in a second. The camera has a wrong clock, yaw, tilt and roll. Boxes are rounded
+wheels, but only one or two odometry poses in a second. mecanum: wheels with rollers, on which the robot drives in all
+directions, and slips sideways. The camera has a wrong clock, yaw, tilt and roll. Boxes are rounded
 to pixels, sit beside the object by a share of its size that depends on the side, and 1 % have a wrong name. Robots with an
 even number measure depths too, of surfaces that are before the centres by 0 to 1 times half the width. All settings are the
 defaults of joint mode. A line for each robot, then for each kind. Then,
@@ -26,6 +27,7 @@ import time
 from typing import Any
 
 import localisations
+import mecanum
 import numpy as np
 from log_parts import with_classes, without_names
 
@@ -41,7 +43,7 @@ from objslam.errors import ObjslamError
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 
-KINDS = ("wheels", "gyro", "vio", "slow")
+KINDS = ("wheels", "gyro", "vio", "slow", "mecanum")
 STEP = 0.005  # s, of the simulated motion
 SIDES = 0.04  # the offset of a box from its object, as a share of the size of the object, for each of five terms
 SURFACES = 0.2  # the spread over things of the distance from surface to centre, as a share of half the width
@@ -129,10 +131,14 @@ def robot(seed: int, kind: str, localised: str | None = None) -> tuple[Log, dict
     """
     rng = np.random.default_rng([seed, 1 + KINDS.index(kind)])
     room, speed, seconds = rng.uniform(5, 15, 2), rng.uniform(0.2, 1.0), rng.uniform(120, 500)
-    stamps, path, forward, turning = drive(rng, room, speed, seconds)
+    if kind == "mecanum":
+        stamps, path, speeds = mecanum.drive(rng, room, speed, seconds, STEP)
+        odometry, true = mecanum.odometry(rng, stamps, speeds, float(rng.choice([10, 20, 50])))
+    else:
+        stamps, path, forward, turning = drive(rng, room, speed, seconds)
     if kind == "vio":
         odometry, true = vio(rng, stamps, path, float(rng.choice([10, 20, 30])))
-    else:
+    elif kind != "mecanum":
         rate = float(rng.choice([1, 2]) if kind == "slow" else rng.choice([10, 20, 50]))
         odometry, true = wheels(rng, stamps, forward, turning, kind == "gyro", rate)
     camera, base_T_camera, turns = mounted(rng)

@@ -18,6 +18,9 @@ class CalibrationSettings(Section):
     error of the file that is not estimated keeps its value from the file."""
     scale: NotNegative = 0.03
     """share by which all distances of the odometry are too long or too short."""
+    lateral_scale: NotNegative = 0.1
+    """share by which the sideways distances of the odometry are too long or too short, beside `scale`. Mecanum and omni
+    wheels slip as they go sideways. It is estimated only if the robot drives sideways."""
     turn_scale: NotNegative = 0.05
     """share by which all turns of the odometry are too large or too small."""
     turn_bias: NotNegative = 0.003

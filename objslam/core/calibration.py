@@ -18,7 +18,7 @@ TRADED_OFF = 0.9
 """Two parameters trade off if their absolute correlation is above this value: the log hardly tells them apart. With a larger
 value, fewer pairs trade off."""
 
-SCALES = ("scale", "turn_scale", "range_scale", "tag_scale", "focal")
+SCALES = ("scale", "lateral_scale", "turn_scale", "range_scale", "tag_scale", "focal")
 """The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
 OF_PLACES = ("tag_scale", "surface")
 """The parameters of a place, not of a robot. The calibration of a robot has none of them."""

@@ -1,4 +1,4 @@
-"""Correct known errors of the odometry: its scale, and the scale, the bias and the slip of its turns."""
+"""Correct known errors of the odometry: its scales ahead and sideways, and the scale, the bias and the slip of its turns."""
 
 import math
 from collections import deque
@@ -8,14 +8,14 @@ from functools import cached_property
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.geometry import motion_between
+from objslam.core.geometry import lengths, motion_between
 from objslam.core.rotation import rotation_vector
 from objslam.core.types import Trajectory
 from objslam.frontend.odometry_bridge import OdometryBridge, bridge_of
 from objslam.frontend.odometry_drift import DriftPath, PlanarSteps
 from objslam.frontend.recent_values import RecentValues
 
-ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias", "odometry.turn_slip")
+ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias", "odometry.turn_slip", "odometry.lateral_scale")
 """The errors of odometry."""
 _LEVEL = 1e-6
 """The largest tilt (rad) and change of height (m) of a path whose drift is computed in the plane. The drift of any other
@@ -26,9 +26,19 @@ time, the jitter of the headings of fast odometry looks like curves."""
 _STANDS = 1e-6
 """A shorter way (m) within `_CURVE` counts as this: the robot stands or turns on the spot. It only avoids a division by
 zero."""
-_KEPT = 4
-"""For how many turn scales, biases and slips the corrected path is kept. A round of derivatives needs four: the present
-path, and one for each of these errors. A larger number takes more memory."""
+_STROKE = 0.5
+"""The time (s) over which moves are summed before a robot is said to drive sideways. Over a longer time, the jitter of poses
+counts less, but a robot that drives to and fro seems to stand."""
+_SHARP = 0.3
+"""Steps with a larger turn (rad) do not show whether a robot drives sideways. If the turn is in one half of the step, the
+step seems to go sideways by a quarter of the turn. With a larger turn, coarse odometry looks like driving sideways."""
+_SIDEWAYS = 0.05
+"""A robot drives sideways if the moves in one direction are more than this share of its way. If this way is 20 % too long,
+the path is 1 % too long, which is within the prior of the other scale. With a larger share, robots that seldom drive
+sideways have no lateral scale."""
+_KEPT = 5
+"""For how many turn scales, biases, slips and lateral scales the corrected path is kept. A round of derivatives needs five:
+the present path, and one for each of these errors. A larger number takes more memory."""
 
 
 def corrected_odometry(odometry: Trajectory, error: Mapping[str, float]) -> Trajectory:
@@ -71,6 +81,43 @@ class CorrectablePath:
         return np.asarray(np.abs(turned) / np.maximum(driven, _STANDS))
 
     @cached_property
+    def sideways(self) -> Floats:
+        """(N-1,) m, how far each step goes to the left.
+
+        A robot that cannot drive sideways moves along the mean of the headings at both ends of a step.
+        """
+        x, y, _ = self._ways
+        left_x, left_y = self._left
+        return np.asarray(left_x * x + left_y * y)
+
+    @cached_property
+    def drives_sideways(self) -> bool:
+        """Whether the robot drives in all directions, as with mecanum wheels, omni wheels or legs. For a planar path.
+
+        The moves of base are summed over the time `_STROKE`, so the jitter of poses counts little. A base beside the axis of
+        the wheels moves sideways in turns. So the part of the moves that follows the turns does not count. The axes of base
+        may not point along the wheels, so the direction with the least moves counts. In a step with a sharp turn, the
+        heading of the moves is not known.
+        """
+        left_x, left_y = self._left
+        x, y, _ = self._ways
+        steps = np.column_stack([left_y * x - left_x * y, self.sideways, np.diff(self._turned)])
+        steps[np.abs(steps[:, 2]) > _SHARP] = 0.0
+        stroke = np.floor(self._seconds[1:] / _STROKE)
+        moves = np.add.reduceat(steps, np.flatnonzero(np.diff(stroke, prepend=-1.0)), axis=0)
+        moves, turns = moves[:, :2], moves[:, 2]
+        rest = moves - np.outer(turns, turns @ moves / max(float(turns @ turns), _STANDS))
+        _, axes = np.linalg.eigh(rest.T @ rest)
+        return bool(np.abs(rest @ axes[:, 0]).sum() > _SIDEWAYS * lengths(moves).sum())
+
+    @cached_property
+    def _left(self) -> Floats:
+        """(2, N-1) the unit vectors to the left, halfway through each step."""
+        ahead, turn = self.odometry.poses[:-1, :2, 0], np.diff(self._turned)
+        middle = np.arctan2(ahead[:, 1], ahead[:, 0]) + np.arctan2(np.sin(turn), np.cos(turn)) / 2
+        return np.stack([-np.sin(middle), np.cos(middle)])
+
+    @cached_property
     def bridge(self) -> OdometryBridge:
         """How far the path may be from the interpolated path. The errors hardly change this."""
         return bridge_of(self.odometry)
@@ -79,20 +126,20 @@ class CorrectablePath:
         """Return the corrected path, as `corrected_odometry` does."""
         travel = self.odometry.travel
         if travel is not None:
-            scale, turn_scale, turn_bias, slip = (error.get(name, 0.0) for name in ODOMETRY)
+            scale, turn_scale, turn_bias, slip, lateral = (error.get(name, 0.0) for name in ODOMETRY)
             bias = turn_bias * np.diff(self._seconds, prepend=0.0)
             turn = (1 + turn_scale) * travel[:, 2] + bias
-            longer = (1 + scale) * np.append(1.0, gripping(slip, self._curvature))
+            longer = (1 + scale) * np.append(1.0, gripping(slip, self._curvature) * self._longer_by(lateral))
             travel = np.stack([longer * travel[:, 0], np.abs(1 + turn_scale) * travel[:, 1], turn], axis=1)
         return Trajectory(self.odometry.stamps, self.poses(error), travel)
 
     def poses(self, error: Mapping[str, float], which: Ints | None = None) -> Floats:
         """Return the corrected poses (n, 4, 4) with the indices `which`, or all poses, as `corrected_odometry` does."""
-        scale, turn_scale, turn_bias, slip = (error.get(name, 0.0) for name in ODOMETRY)
+        scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
         poses = self.odometry.poses if which is None else self.odometry.poses[which]
-        if scale == turn_scale == turn_bias == slip == 0:
+        if scale == 0 and not any(others):
             return poses
-        more, places = self._headings_and_places(turn_scale, turn_bias, slip)
+        more, places = self._headings_and_places(*others)
         places = places if which is None else places[:, which]
         places = self.odometry.poses[0, :3, 3, None] + (1 + scale) * places
         more = more if which is None else more[which]
@@ -105,16 +152,23 @@ class CorrectablePath:
 
     def drift(self, error: Mapping[str, float]) -> DriftPath:
         """Return the steps of the corrected path, from which its drift is computed."""
-        scale, turn_scale, turn_bias, slip = (error.get(name, 0.0) for name in ODOMETRY)
+        scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
         if self._heading is None or self.odometry.travel is not None:
             return DriftPath.of(self.path(error))
-        more, (x, y, _) = self._headings_and_places(turn_scale, turn_bias, slip)
+        more, (x, y, _) = self._headings_and_places(*others)
         heading, (begin, *_) = self._heading + more - self._heading[0], self._heading
         c, s = (1 + scale) * np.cos(begin), (1 + scale) * np.sin(begin)
         steps = PlanarSteps.between(np.cos(heading), np.sin(heading), c * x + s * y, c * y - s * x)
         return DriftPath(None, self.odometry.stamps, steps.sums())
 
-    def _headings_and_places(self, turn_scale: float, turn_bias: float, slip: float) -> tuple[Floats, Floats]:
+    def _longer_by(self, lateral: float) -> Floats:
+        """Return the factors (N-1,) by which a lateral scale makes the steps longer."""
+        share = self.sideways**2 / np.maximum((self._ways[:2] ** 2).sum(axis=0), _STANDS**2)
+        return np.sqrt(1 + (lateral**2 + 2 * lateral) * share)
+
+    def _headings_and_places(
+        self, turn_scale: float, turn_bias: float, slip: float, lateral: float
+    ) -> tuple[Floats, Floats]:
         """Return by how much (N,), rad, the errors turn each pose, and the places (3, N), m, seen from the first pose.
 
         The scale is not in the places, because it only multiplies them.
@@ -124,12 +178,20 @@ class CorrectablePath:
             more = turn_scale * self._turned + turn_bias * self._seconds
             middle = (more[1:] + more[:-1]) / 2  # The chord of an arc points along the mean of the two headings at its ends.
             cos, sin = np.cos(middle), np.sin(middle)
-            x, y, z = self._ways if slip == 0 else self._ways * gripping(slip, self._curvature)
+            x, y, z = self._ways if lateral == 0 else self._ways_with(lateral)
+            if slip != 0:
+                x, y, z = np.stack([x, y, z]) * gripping(slip, self._curvature)
             places = np.zeros((3, len(more)))
             places[0, 1:], places[1, 1:], places[2, 1:] = cos * x - sin * y, sin * x + cos * y, z
             return more, np.cumsum(places, axis=1, out=places)
 
-        return self._moved.get((turn_scale, turn_bias, slip), compute)
+        return self._moved.get((turn_scale, turn_bias, slip, lateral), compute)
+
+    def _ways_with(self, lateral: float) -> Floats:
+        """Return the steps (3, N-1), m, with a lateral scale."""
+        ways = self._ways.copy()
+        ways[:2] += lateral * self.sideways * self._left
+        return ways
 
 
 def gripping(slip: float, curvature: Floats) -> Floats:
@@ -155,7 +217,9 @@ class OdometryCorrection:
 
         said, corrected: the path so far, as the robot sent it and after the correction. None at the start of a path.
         """
-        self._scale, self._turn_scale, self._turn_bias, self._slip = (error.get(name, 0.0) for name in ODOMETRY)
+        self._scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
+        self._turn_scale, self._turn_bias, self._slip, self._lateral = others
+        self._none = self._scale == 0 and not any(others)
         self._recent: deque[tuple[float, float, float]] = deque([(-math.inf, 0.0, 0.0)])
         self._stamp: float | None = None
         self._before = np.eye(4)
@@ -169,7 +233,7 @@ class OdometryCorrection:
 
     def correct(self, stamp: float, pose: Floats) -> Floats:
         """Return the next pose (4, 4), corrected. stamp: s."""
-        if self._scale == self._turn_scale == self._turn_bias == self._slip == 0:
+        if self._none:
             return pose
         if self._stamp is None:
             self._stamp, self._before, self._place = stamp, pose, _place_of(pose)
@@ -181,6 +245,11 @@ class OdometryCorrection:
             turn = float(rotation_vector(pose[:3, :3] @ self._before[:3, :3].T)[2])
         more = self._turn_scale * turn + self._turn_bias * (stamp - self._stamp)
         middle = self._turned + more / 2  # as in `CorrectablePath`
+        if self._lateral:
+            heading = math.atan2(float(self._before[1, 0]), float(self._before[0, 0])) + turn / 2
+            left_x, left_y = -math.sin(heading), math.cos(heading)
+            longer_left = self._lateral * (left_x * x + left_y * y)
+            x, y = x + longer_left * left_x, y + longer_left * left_y
         longer = (1 + self._scale) * self._grip(stamp, turn, math.hypot(x, y))
         c, s, (px, py, pz) = longer * math.cos(middle), longer * math.sin(middle), self._place
         self._place = px, py, pz = px + c * x - s * y, py + s * x + c * y, pz + longer * z

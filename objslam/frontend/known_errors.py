@@ -15,7 +15,7 @@ from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.errors import ConfigError
 from objslam.frontend.corrected_log import AXES, LENS, take_out
-from objslam.frontend.corrected_odometry import ODOMETRY
+from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath
 from objslam.frontend.recent_values import ValuesOfObjects
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import half_widths_of_rays, with_known_surfaces
@@ -39,7 +39,9 @@ its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
 OF_LENGTHS = ("range_scale", "range_offset", "surface", "tag_scale")
 """The errors of measured lengths."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
-_in_plane = ValuesOfObjects[Trajectory, bool](lambda path: is_planar(path.poses))  # A run asks for one odometry many times.
+# A run asks for one odometry many times.
+_in_plane = ValuesOfObjects[Trajectory, bool](lambda path: is_planar(path.poses))
+_sideways = ValuesOfObjects[Trajectory, bool](lambda path: CorrectablePath(path).drives_sideways)
 
 
 def error_names(log: Log) -> tuple[str, ...]:
@@ -99,14 +101,16 @@ def possible(log: Log, settings: Settings) -> list[str]:
 
     A camera whose base_T_camera is the identity is the base itself, as in a log of a camera's own poses. Its rotation and
     position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
-    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves. Odometry in space comes
-    from a camera or a scanner, not from wheels. With a localisation, odometry only leads from one pose to the next. Such
-    short ways hardly show a slip, and a free slip would let wrong associations fit.
+    from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves, or has another scale
+    sideways. Odometry in space comes from a camera or a scanner, not from wheels. With a localisation, odometry only leads
+    from one pose to the next. Such short ways hardly show a slip, and a free slip would let wrong associations fit.
     """
     asked, place = settings.calibration.use is True, usual_place(log, settings)
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
     mounted = (*AXES, *LENS, "x", "y", "z")
     names = [n for n in error_names(log) if prior_sigma(n, settings, place) > 0]
+    if log.odometry is not None and not (_in_plane(log.odometry) and _sideways(log.odometry)):
+        names = [n for n in names if n != "odometry.lateral_scale"]
     if log.localization is not None or (log.odometry is not None and not _in_plane(log.odometry)):
         names = [n for n in names if n != "odometry.turn_slip"]
     return [n for n in names if not ((parts := n.rpartition("."))[0] in base and parts[2] in mounted)]

@@ -72,8 +72,9 @@ def test_odometry_is_corrected_pose_by_pose_as_a_whole(turn, tilt):
     tilts = make_pose(rotation_from_vector(rng.normal(0, tilt, (400, 3))), np.zeros((400, 3)))
     said = Trajectory(np.cumsum(rng.uniform(0.02, 0.08, 400)), lift_se2(steps) @ tilts)
     wrong = {"odometry.scale": -0.04, "odometry.turn_scale": 0.07, "odometry.turn_bias": 0.003}
+    wrong |= {"odometry.lateral_scale": -0.2}
     names, values = tuple(wrong), np.array(list(wrong.values()))
-    whole = SharedErrors(Log("log", (), said), None, None, settings_of(), names, values, np.eye(3)).corrected_log(values)
+    whole = SharedErrors(Log("log", (), said), None, None, settings_of(), names, values, np.eye(4)).corrected_log(values)
     first, second = OdometryCorrection(wrong), None
     for i in range(250):
         at = first.correct(float(said.stamps[i]), said.poses[i])

@@ -14,7 +14,7 @@ from objslam.core.arrays import Floats
 from objslam.core.geometry import adjoint, inverse
 from objslam.graph.calibration.linearised_graph import Linearised
 
-ODOMETRY_SCALES = ("odometry.scale", "odometry.turn_scale")
+ODOMETRY_SCALES = ("odometry.scale", "odometry.lateral_scale", "odometry.turn_scale")
 """Each derivative by one of these parameters consists of measured motions, and so contains the odometry's noise."""
 _ALIKE = 3.0
 """The largest ratio between the variances that neighbours predict and the variances of the motion itself, in both

@@ -11,7 +11,7 @@ from objslam.graph.calibration.instruments import from_neighbours
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 
-_AXES_OF = {"odometry.scale": (3, 4), "odometry.turn_scale": (2,)}
+_AXES_OF = {"odometry.scale": (3, 4), "odometry.lateral_scale": (4,), "odometry.turn_scale": (2,)}
 """The components of a twist that each scale parameter multiplies."""
 _PROBES = 4
 """The number of random probes. More probes are more exact and slower. With 4, the error of a product is a small part of the

@@ -21,6 +21,7 @@ largest growth. Larger values warn less often, and name fewer errors."""
 _CAUSES = {
     "clock": "do the stamps of the camera and of the poses use the same clock?",
     "scale": "is the odometry in metres?",
+    "lateral_scale": "do the wheels slip as the robot drives sideways?",
     "turn_scale": "does the robot skid as it turns (tracks, four driven wheels), and is its wheel base right?",
     "turn_slip": "does the robot slip in curves, or does its odometry say what was commanded?",
     "turn_bias": "does the odometry turn while the robot stands?",

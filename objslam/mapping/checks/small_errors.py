@@ -120,7 +120,11 @@ def shared(
 ) -> SharedErrors:
     """Return the examined errors, as parameters of the measurements. priors: standard deviations (s, rad, share, m)."""
     fixed = dict.fromkeys(
-        ("scale", "turn_scale", "turn_bias", "turn_slip", "range_scale", "range_offset", "tag_scale", "centre"), 0.0
+        (
+            *("scale", "lateral_scale", "turn_scale", "turn_bias", "turn_slip"),
+            *("range_scale", "range_offset", "tag_scale", "centre"),
+        ),
+        0.0,
     )
     of = settings.calibration.model_copy(update={**fixed, **priors, "use": True, "file": None})
     wide = settings.model_copy(update={"calibration": of, "mode": "joint"})
