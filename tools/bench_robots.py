@@ -1,7 +1,7 @@
 """Measure whether maps are honest on robots whose errors come from hardware, not from the noise model of the package.
 
     python tools/bench_robots.py [--kinds wheels gyro vio slow mecanum] [--robots 8] [--first 0] [--unnamed]
-        [--classes 6] [--localised filter]
+        [--classes 6] [--cameras 3] [--localised filter]
 
 Each robot drives to random points of a room, with stops. wheels: encoders with ticks, wrong radii, a wrong track width, slip
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
@@ -47,6 +47,7 @@ KINDS = ("wheels", "gyro", "vio", "slow", "mecanum")
 STEP = 0.005  # s, of the simulated motion
 SIDES = 0.04  # the offset of a box from its object, as a share of the size of the object, for each of five terms
 SURFACES = 0.2  # the spread over things of the distance from surface to centre, as a share of half the width
+CLOCKS = 0.05  # s, the spread of the clocks of the cameras of one robot
 SLIPS = 90.0  # s between sudden slips, on average
 RADIUS, FAR_RADIUS, UNNAMED_RADIUS = 3.0, 6.0, 0.5
 """The radius of a match, m: with labels, with labels at positions that err by metres, and without. Labels identify objects,
@@ -60,6 +61,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="the seed of the first robot")
     parser.add_argument("--unnamed", action="store_true", help="one label for all objects of a robot")
     parser.add_argument("--classes", type=int, default=0, help="this number of labels for all objects of a robot, by chance")
+    parser.add_argument("--cameras", type=int, default=1, help="cameras that look around, each with a clock of its own")
     parser.add_argument("--localised", choices=localisations.KINDS, help="the localisation of the robots")
     options = parser.parse_args()
     settings = load_settings(
@@ -69,7 +71,8 @@ def main() -> None:
         rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
         errors: dict[str, list[float]] = {}
         for seed in range(options.first, options.first + options.robots):
-            (log, true), ranged, begin = robot(seed, kind, options.localised), seed % 2 == 0, time.process_time()
+            log, true = robot(seed, kind, options.localised, options.cameras)
+            ranged, begin = seed % 2 == 0, time.process_time()
             log = without_names(log) if options.unnamed else log
             log = with_classes(log, options.classes, seed) if options.classes else log
             try:
@@ -123,10 +126,11 @@ def deviations(found: Calibration | None, true: dict[str, float]) -> dict[str, f
     return {name: float((at[name][0] - value) / at[name][1]) for name, value in true.items() if name in at}
 
 
-def robot(seed: int, kind: str, localised: str | None = None) -> tuple[Log, dict[str, float]]:
+def robot(seed: int, kind: str, localised: str | None = None, cameras: int = 1) -> tuple[Log, dict[str, float]]:
     """Draw a robot of a kind, a room and a drive. The same seed and kind give the same log.
 
-    localised: the kind of localisation, if the robot has one. Also returns the true values of its calibration, by the names
+    localised: the kind of localisation, if the robot has one. cameras: how many there are. They take their images at nearly
+    the same times, but their clocks differ. Also returns the true values of its calibration, by the names
     of the parameters.
     """
     rng = np.random.default_rng([seed, 1 + KINDS.index(kind)])
@@ -160,8 +164,15 @@ def robot(seed: int, kind: str, localised: str | None = None) -> tuple[Log, dict
     if localised is not None:
         rng = np.random.default_rng([seed, 77])
         localization = localisations.localised(rng, localised, stamps, path, odometry)
-    camera_log = (CameraLog(camera, detections),)
-    return Log(f"{kind}{seed}", camera_log, localization=localization, odometry=odometry, truth=truth), true
+    found = [CameraLog(camera, detections)]
+    for i in range(1, cameras):
+        rng = np.random.default_rng([seed, 55, i])
+        camera, base_T_camera, turns = mounted(rng, f"camera{i}", 2 * np.pi * i / cameras)
+        other = clock + rng.normal(0, CLOCKS)
+        detections = boxes_of(rng, camera, map_T_base @ base_T_camera, places, fired - other, names, ranged=seed % 2 == 0)
+        found.append(CameraLog(camera, detections))
+        true |= {f"{camera.name}.clock": other} | {f"{camera.name}.{axis}": turn for axis, turn in turns.items()}
+    return Log(f"{kind}{seed}", tuple(found), localization=localization, odometry=odometry, truth=truth), true
 
 
 def drive(rng: np.random.Generator, room: Floats, speed: float, seconds: float) -> tuple[Floats, Floats, Floats, Floats]:
@@ -237,15 +248,16 @@ def vio(rng: np.random.Generator, stamps: Floats, path: Floats, rate: float) -> 
     return Trajectory(stamps[::every], np.array(found)), true
 
 
-def mounted(rng: np.random.Generator) -> tuple[Camera, Floats, dict[str, float]]:
-    """A camera that looks ahead, as its calibration says, where it really is (4, 4) on the robot, and its turns, rad."""
+def mounted(rng: np.random.Generator, name: str = "front", side: float = 0.0) -> tuple[Camera, Floats, dict[str, float]]:
+    """A camera that looks ahead, or to a side (rad), as its calibration says, where it really is (4, 4) on the robot, and
+    its turns, rad."""
     focal, height = rng.uniform(350, 700), rng.uniform(0.2, 1.2)
     roll, tilt, yaw = rng.normal(0, [0.01, 0.015, 0.02])
-    ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    ahead = rotation_from_vector(np.array([0, 0, side])) @ [[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     turns = rotation_from_vector(np.array([[0, 0, yaw], [0, tilt, 0], [roll, 0, 0]]))
     place = np.array([0.15, 0.0, height])
     matrix = np.array([[focal, 0, 320], [0, focal, 240], [0, 0, 1]])
-    camera = Camera("front", 640, 480, matrix, base_T_camera=make_pose(ahead, place))
+    camera = Camera(name, 640, 480, matrix, base_T_camera=make_pose(ahead, place))
     true = {"roll": float(roll), "tilt": float(tilt), "yaw": float(yaw)}
     return camera, make_pose(turns[0] @ turns[1] @ turns[2] @ ahead, place), true
 

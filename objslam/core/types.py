@@ -194,7 +194,7 @@ class Log:
 class Keyframes:
     """Frames of all cameras, in the order of time, with the robot poses before the estimation.
 
-    stamps: (K,) s, non-decreasing. After a correction of clocks, only those of each camera are. camera: (K,) index into
+    stamps: (K,) s, non-decreasing for each camera. The clocks of several cameras may differ. camera: (K,) index into
     log.cameras. frame: (K,) index into detections.frame_stamps of this camera. base_T_camera: (K, 4, 4). map_T_base: (K, 4,
     4) from the localisation, or from the odometry if there is no localisation. localized_every: how many keyframes there are
     for each measured absolute pose, on average and at least 1. 0 if map_T_base is odometry. localized_at: (K,) s, the stamp
@@ -257,7 +257,7 @@ class Keyframes:
         return (self.stretch[1:] == self.stretch[:-1]) & (self.stretch[1:] >= 0)
 
     def take(self, keyframes: Bools | Ints) -> Self:
-        """Select keyframes by a mask or increasing indices."""
+        """Select keyframes by a mask or by indices."""
         return replace(self, **_rows(self, keyframes))
 
 
@@ -310,7 +310,7 @@ class Rays:
         return origins, np.einsum("rij,rj->ri", rotations, self.direction)
 
     def take(self, rays: Bools | Ints) -> Self:
-        """Select rays by a mask or increasing indices."""
+        """Select rays by a mask or by indices."""
         return replace(self, **_rows(self, rays))
 
 

@@ -1,11 +1,14 @@
-"""Find the clocks of cameras before any map: at the right clock offset, bearings turn opposite to the robot."""
+"""Find the clocks of cameras, and the order of their frames, before any map: at the right clock offset, bearings turn
+opposite to the robot."""
+
+from dataclasses import replace
 
 import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.calibration import kind
 from objslam.core.geometry import angles_off
-from objslam.core.types import Trajectory
+from objslam.core.types import Keyframes, Rays, Trajectory
 from objslam.frontend.shared_errors import SharedErrors
 
 _STEP = 0.02
@@ -47,6 +50,25 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
         if cost[best] < cost[-1] - _SURE:
             theta[k] = offsets[best]
     return theta
+
+
+def in_order_of_clocks(frames: Keyframes, rays: Rays, errors: SharedErrors | None) -> tuple[Keyframes, Rays]:
+    """Return frames, and rays with indices into them, in the order in which the images were taken.
+
+    Frames are in the order of their stamps. If the clocks of two cameras differ by more than the time between two frames,
+    images that were taken one after the other change places. The path of a graph would then go to and fro, and each way
+    would count as a measurement of its own. errors: of these frames, None if no clock is estimated.
+    """
+    cameras = () if errors is None else errors.cameras
+    if errors is None or len(cameras) < 2:
+        return frames, rays
+    found = dict(zip(errors.names, clocks_of_turns(errors).tolist(), strict=True))
+    offset = np.array([found.get(f"{name}.clock", 0.0) for name in cameras])
+    order = np.lexsort((frames.camera, frames.stamps + offset[frames.camera]))
+    place = np.argsort(order)
+    by_frame = np.argsort(place[rays.keyframe], kind="stable")
+    sorted_rays = rays.take(by_frame)
+    return frames.take(order), replace(sorted_rays, keyframe=place[sorted_rays.keyframe])
 
 
 def _pairs(errors: SharedErrors, camera: int) -> tuple[Floats, Floats, float]:

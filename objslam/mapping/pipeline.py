@@ -20,6 +20,7 @@ from objslam.frontend.boxes.robot_parts import without_robot_parts
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import shared_errors, take_out_expected, take_out_known
 from objslam.frontend.localization.continued_localization import continued_by_odometry, share_on_continuation
+from objslam.frontend.turning_clocks import in_order_of_clocks
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
@@ -148,6 +149,8 @@ def _run(
         if sideways := lies_on_its_side(frames):
             ledger.warn(sideways)
         rays = build_rays(log, frames, settings, ledger)
+        if settings.mode == "joint" and len(rays):
+            frames, rays = in_order_of_clocks(frames, rays, shared_errors(log, frames, rays, settings))
     if len(rays) == 0:
         say(diagnosis, ledger)
         raise SolveError(

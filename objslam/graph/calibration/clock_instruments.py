@@ -11,6 +11,10 @@ from objslam.core.geometry import adjoint, inverse, log_se3
 from objslam.graph.calibration.instruments import Motions
 from objslam.graph.calibration.linearised_graph import Linearised
 
+_SPAN = 0.05
+"""The least time (s) from a pose to the poses before and after it that show its velocity. The frames of several cameras may
+be milliseconds apart, and the noise of two poses is no velocity. Over a longer time, short turns are lost."""
+
 
 @dataclass(frozen=True)
 class ClockInstruments:
@@ -49,10 +53,9 @@ class ClockInstruments:
         """Return the instruments of a graph with these motions."""
         keyframes, graph = of.measured.keyframes, of.graph
         path = of.map_T_camera @ inverse(keyframes.base_T_camera)
-        apart = np.where(keyframes.measured, np.maximum(np.diff(keyframes.stamps), 0.0), 0.0)
-        index, there = np.arange(len(path)), (apart > 0).astype(np.int64)
-        before, after = index - np.append(0, there), index + np.append(there, 0)
-        seconds = np.append(0.0, apart) + np.append(apart, 0.0)
+        stamps = np.maximum.accumulate(keyframes.stamps)
+        before, after = _around(stamps, keyframes.measured)
+        seconds = stamps[after] - stamps[before]
         moves = inverse(path[before]) @ path[after]
         _, roots, _ = graph.absolute_roots(of.map_T_camera)
         local = len(roots) == len(path)  # With a localisation. Otherwise, the only absolute pose is the first.
@@ -110,3 +113,17 @@ class ClockInstruments:
         moved = self.to_base @ poses
         change = moved[self.after] - self.along @ moved[self.before]
         return np.asarray(np.where(self.seconds > 0, 1 / np.maximum(self.seconds, 1e-9), 0.0)[:, None, None] * change)
+
+
+def _around(stamps: Floats, measured: Bools) -> tuple[Ints, Ints]:
+    """Return the poses (K,), (K,) before and after each pose, at least `_SPAN` away, or the ends of a path without a gap.
+
+    stamps: (K,) s. measured: (K-1,) whether the motion to the next pose is measured.
+    """
+    index = np.arange(len(stamps))
+    breaks = np.flatnonzero(~measured)
+    path = np.searchsorted(breaks, index)
+    first, last = np.append(0, breaks + 1)[path], np.append(breaks, len(stamps) - 1)[path]
+    before = np.minimum(np.searchsorted(stamps, stamps - _SPAN, side="right") - 1, index - 1)
+    after = np.maximum(np.searchsorted(stamps, stamps + _SPAN), index + 1)
+    return np.maximum(before, first), np.minimum(after, last)

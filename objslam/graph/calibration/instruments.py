@@ -10,7 +10,7 @@ from typing import Self
 
 import numpy as np
 
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import adjoint, inverse
 from objslam.graph.calibration.linearised_graph import Linearised
 
@@ -21,6 +21,9 @@ _ALIKE = 3.0
 directions. With a larger ratio, motions that differ from their neighbours make the parameters less certain: with 10, the
 clock of a robot that often stands had a standard deviation five times as large. With a smaller ratio, the noise of a motion
 changes its weight."""
+_LEAST_USUAL = 0.05
+"""The least usual duration (s) of a motion. Shorter motions are between the frames of several cameras. A larger value takes
+the neighbours of fast cameras from a longer time."""
 
 
 @dataclass(frozen=True)
@@ -112,15 +115,32 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
 
 
 def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
-    """Predict each of the motions (n, D) from its own duration and the rate of four motions near it: two before, two after.
+    """Predict each of the motions (n, D) from its own duration and the rate of motions near it: two before, two after.
 
-    The motions directly beside it do not count: they may share a step of the odometry with it, and so its noise. seconds:
-    (n,) the durations.
+    The motions directly beside it do not count: they may share a step of the odometry with it, and so its noise. The frames
+    of several cameras may be milliseconds apart. Then each side has more motions: those of half the usual duration do not
+    count, and as many count as last one and a half times as long as usual. seconds: (n,) the durations.
     """
+    count = len(motions)
+    ends = np.append(0.0, np.cumsum(seconds))
+    usual = max(float(np.median(seconds)), _LEAST_USUAL) if count else _LEAST_USUAL
+    total = np.vstack([np.zeros((1, motions.shape[1])), np.cumsum(motions, axis=0)])
+    near, time = np.zeros_like(motions), np.zeros((count, 1))
+    forward = _after(ends, usual)
+    back = tuple(count - one[::-1] for one in _after(ends[-1] - ends[::-1], usual))[::-1]
+    for first, last in (forward, back):
+        near += total[last] - total[first]
+        time += (ends[last] - ends[first])[:, None]
+    return np.asarray(np.where(time > 0, near / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
 
-    def near(values: Floats) -> Floats:
-        padded = np.pad(values, ((3, 3), (0, 0)))
-        return np.asarray(sum(padded[i : i + len(values)] for i in (0, 1, 5, 6)))
 
-    time = near(seconds[:, None])
-    return np.asarray(np.where(time > 0, near(motions) / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
+def _after(ends: Floats, usual: float) -> tuple[Ints, Ints]:
+    """Return for each of n motions the first of the motions that follow it and count, and the one after the last of them.
+
+    ends: (n+1,) s, the begin of the first motion, and the ends of all. usual: s, the usual duration of a motion.
+    """
+    count = len(ends) - 1
+    first = np.maximum(np.arange(count) + 2, np.searchsorted(ends[:-1], ends[1:] + usual / 2))
+    first = np.minimum(first, count)
+    last = np.maximum(first + 2, np.searchsorted(ends, ends[first] + 1.5 * usual))
+    return first, np.minimum(last, count)

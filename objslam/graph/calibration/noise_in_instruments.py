@@ -47,7 +47,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}
     motions, stamps, (before, after) = system.motions, of.measured.keyframes.stamps, of.graph.moves
     if motions is None or not (scales or clocks):
-        return np.zeros(len(names))
+        return np.zeros((len(names), len(names)))
     sigma = motions.by_odometry * np.sqrt(np.einsum("kii->ki", motions.covariance))
     sigma /= np.sqrt(np.maximum(motions.seconds, 1e-9))[:, None]
     walks = _random_walks(errors.odometry_stamps)
@@ -62,7 +62,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     assert odometry is not None
     said = log_se3(inverse(odometry[before]) @ odometry[after]) / sigma
     residual = system.left(system.residual[:, None])[motions.rows]
-    products = np.zeros(len(names))
+    products, between = np.zeros(len(names)), np.zeros((len(clocks), len(clocks)))
     for axis in (2, 3, 4):
 
         def rows(steps: Floats, axis: int = axis) -> Floats:
@@ -86,13 +86,25 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
                 noise[:, axis] = sigma[:, axis, None] * walk
                 told = motions.weighted(motions.predicted(noise))
                 products[k] += size * float((told * left[:, :_PROBES]).sum()) / _PROBES
-        for i, k in enumerate(rates):
-            part = slice(_PROBES * (i + 1), _PROBES * (i + 2))
-            products[k] += size * float((probes[motions.rows, part] * left[:, part]).sum()) / _PROBES
-    information = (system.left(system.sides) ** 2).sum(axis=0)
-    shares = products / np.maximum(information, 1e-300)
-    shares[list(clocks)] = np.clip(shares[list(clocks)], motions.tied, 1.0)
-    return np.asarray(shares)
+        of_clocks = (one[:, _PROBES:].reshape(len(left), len(rates), _PROBES) for one in (probes[motions.rows], left))
+        between += size * np.einsum("mip,mjp->ij", *of_clocks) / _PROBES
+    sides = system.left(system.sides)
+    shares = np.diag(products / np.maximum((sides**2).sum(axis=0), 1e-300))
+    own = sides[:, list(rates)]
+    shares[np.ix_(list(rates), list(rates))] = _shares(between, own.T @ own, motions.tied)
+    return shares
+
+
+def _shares(noise: Floats, information: Floats, least: float) -> Floats:
+    """Return the shares (C, C) of noise in the information about C clocks, between `least` and 1 in each direction.
+
+    noise, information: (C, C). The noise is information @ shares. The frames of several cameras have the same odometry, so
+    their clocks share its noise: it hardly disturbs the difference of two clocks, but it does disturb their mean.
+    """
+    root = np.linalg.cholesky(information + 1e-300 * np.eye(len(information)))
+    back = np.linalg.inv(root)
+    size, axes = np.linalg.eigh(back @ noise @ back.T)
+    return np.asarray(back.T @ (axes * np.clip(size, least, 1.0)) @ axes.T @ root.T)
 
 
 def _random_walks(stamps: Floats) -> Callable[[Floats], Floats]:

@@ -43,9 +43,9 @@ class LinearSystem:
     instruments: (M, P). At the optimum, the residuals do not correlate with the instruments. The instruments equal the
     sides, except for clocks and the scales of the odometry: these sides contain the noise of the odometry, and so do the
     residuals. motions: None if neither the odometry nor a clock is a parameter. clocks: None without a clock. by_path: (M,
-    C) instruments of the C clocks by the solved path. noise: (P,) the shares of noise in the information, from
-    `noise_shares`. longer: (P,) the ratio of the odometry's noise in the residuals to that in the side of a scale, 0 for
-    other parameters.
+    C) instruments of the C clocks by the solved path. noise: (P, P) from `noise_shares`, the shares of noise in the
+    information. longer: (P,) the ratio of the odometry's noise in the residuals to that in the side of a scale, 0 for other
+    parameters.
     """
 
     jacobian: sparse.csr_matrix
@@ -63,10 +63,10 @@ class LinearSystem:
     longer: Floats
 
     def with_noise(self, noise: Floats) -> Self:
-        """Return the system for these shares (P,) of noise in its sides. They change the instruments of clocks."""
+        """Return the system for these shares (P, P) of noise in its sides. They change the instruments of clocks."""
         instruments, columns = self.instruments.copy(), [] if self.clocks is None else list(self.clocks.moved)
         sides = self.sides[:, columns]
-        instruments[:, columns] = sides + noise[columns] * (self.by_path - sides)
+        instruments[:, columns] = sides + (self.by_path - sides) @ noise[np.ix_(columns, columns)]
         return replace(self, instruments=instruments, noise=noise)
 
     def left(self, columns: Floats) -> Floats:
@@ -83,23 +83,23 @@ class LinearSystem:
         sides, residual, instruments = left[:, :count], left[:, count], left[:, :count].copy()
         instruments[:, own] = left[:, count + 1 :]
         information, variance, slope = sides.T @ sides, instruments.T @ instruments, instruments.T @ sides
-        noise = self.noise * np.diagonal(information)
-        gradient = -instruments.T @ residual + noise * self.longer
+        noise = np.diag(np.diagonal(self.noise) * np.diagonal(information))
+        gradient = -instruments.T @ residual + np.diagonal(noise) * self.longer
         if self.clocks is not None:
-            others = np.setdiff1d(np.arange(count), list(self.clocks.moved))
+            moved = np.array(list(self.clocks.moved))
+            others, block = np.setdiff1d(np.arange(count), moved), np.ix_(moved, moved)
+            shares = self.noise[block]
             poses = len(self.clocks.seconds)
             velocity = self.clocks.changes(changes[-6 * poses :, :count].reshape(poses, 6, count))
-            for k in self.clocks.moved:
-                share = self.noise[k]
-                # The side of a clock can be mostly noise. In products with other instruments, its instrument replaces it.
-                slope[others, k] = variance[others, k]
-                # The path, and with it the instrument, depends on the parameters too. Without this part, the noise that the
-                # path and the side have in common would be in the slope.
-                slope[k] += share * self.clocks.products(residual, k, velocity)
-                noise[k] *= 1 - share
+            # The side of a clock can be mostly noise. In products with other instruments, its instrument replaces it.
+            slope[others[:, None], moved] = variance[others[:, None], moved]
+            # The path, and with it the instrument, depends on the parameters too. Without this part, the noise that the path
+            # and the side have in common would be in the slope.
+            slope[moved] += shares.T @ [self.clocks.products(residual, k, velocity) for k in moved]
+            noise[block] = (np.eye(len(moved)) - shares).T @ information[block] @ shares
         return ReducedSystem(
             information=information,
-            slope=slope - np.diag(noise),
+            slope=slope - noise,
             variance=variance,
             gradient=gradient,
             descent=-sides.T @ residual,
@@ -148,7 +148,7 @@ class ReducedSystem:
 def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats, noise: Floats | None = None) -> LinearSystem:
     """Return the linear system of a graph at its values and at the shared errors theta (P,).
 
-    noise: (P,) from `noise_shares`. None means that the sides have no noise. SolveError if the system is singular.
+    noise: (P, P) from `noise_shares`. None means that the sides have no noise. SolveError if the system is singular.
     """
     graph, rows = of.graph, of.rows
     sides, moved = _parameter_columns(of, errors, theta)
@@ -171,7 +171,7 @@ def linearise(of: Linearised, errors: CalibratedMeasurements, theta: Floats, noi
         motions=motions,
         clocks=clocks,
         by_path=by_path,
-        noise=np.zeros(len(theta)),
+        noise=np.zeros((len(theta), len(theta))),
         longer=np.where([name in ODOMETRY_SCALES for name in errors.names], 1 + theta, 0.0),
     )
     return found if noise is None else found.with_noise(noise)
