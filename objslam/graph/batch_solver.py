@@ -156,9 +156,9 @@ def solve_joint(
         errors = None if errors is None else errors.take(errors.keyframes, tags.rays(errors.rays))
         rays, association = tags.rays(rays), tags.association
 
+    multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes)
     theta = errors.mean if theta is None and errors is not None else theta
     given = (keyframes, rays, settings) if errors is None or theta is None else errors.at(theta)
-    multiframes = Multiframes.of(keyframes if errors is None else errors.keyframes, given[0].stamps)
     ties = find_ties(multiframes.keyframes(given[0]), given[2])
 
     def measure(keyframes: Keyframes, rays: Rays, settings: Settings) -> Measurements:

@@ -17,10 +17,6 @@ TOGETHER = 0.01
 """The longest time (s) between the logged stamps of the first image and any other image of a multiframe. Within this time,
 the odometry is assumed exact: at 1 m/s it errs by less than a millimetre. A longer time joins more images and has larger
 errors. This time is well above the jitter of cameras with a common trigger."""
-_APART = 0.03
-"""The longest time (s) between the corrected stamps of the images of a multiframe. In a longer time, the odometry between
-them errs by more, and clocks follow its noise. If this time is short, clocks that are known roughly separate images that
-were taken together, and each image has a pose of its own."""
 
 
 @dataclass(frozen=True)
@@ -34,22 +30,20 @@ class Multiframes:
     first: Ints
 
     @classmethod
-    def of(cls, keyframes: Keyframes, corrected: Floats | None = None) -> Self:
+    def of(cls, keyframes: Keyframes) -> Self:
         """Join keyframes of different cameras whose stamps, as logged, agree within `TOGETHER`.
 
-        A motion that the odometry did not measure separates two multiframes. corrected: (K,) s, the stamps without what is
-        known of the errors of clocks. They must agree within `_APART`.
+        A motion that the odometry did not measure separates two multiframes.
         """
-        taken = keyframes.stamps if corrected is None else corrected
         apart = ~keyframes.measured if keyframes.odom_T_base is not None else np.zeros(max(len(keyframes) - 1, 0), bool)
         first: list[int] = []
         cameras: set[int] = set()
-        begin, since, number = -np.inf, -np.inf, np.zeros(len(keyframes), dtype=np.int64)
-        columns = (keyframes.stamps.tolist(), taken.tolist(), keyframes.camera.tolist(), [True, *apart.tolist()])
-        for k, (stamp, at, camera, alone) in enumerate(zip(*columns, strict=True)):
-            if alone or camera in cameras or not 0 <= stamp - begin <= TOGETHER or not abs(at - since) <= _APART:
+        begin, number = -np.inf, np.zeros(len(keyframes), dtype=np.int64)
+        columns = (keyframes.stamps.tolist(), keyframes.camera.tolist(), [True, *apart.tolist()])
+        for k, (stamp, camera, alone) in enumerate(zip(*columns, strict=True)):
+            if alone or camera in cameras or not 0 <= stamp - begin <= TOGETHER:
                 first.append(k)
-                cameras, begin, since = set(), stamp, at
+                cameras, begin = set(), stamp
             cameras.add(camera)
             number[k] = len(first) - 1
         return cls(number, np.array(first, dtype=np.int64))

@@ -151,7 +151,7 @@ def _solve(
             keyframes, rays, settings = errors.with_noise(noise).at(estimate.calibration.values)
             rays = replace(rays, direction=solution.rays.direction)  # They may point to centres of bodies.
         rays = share_bias(rays, solution.association)
-        measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images, keyframes.stamps))
+        measured = Measurements.of(keyframes, rays, settings, Multiframes.of(images))
     resolved = np.array(there, dtype=np.int64)
     return solve_in_map(solution.estimate, solution.association, resolved, matched, found.b_T_a, measured)
 

@@ -39,7 +39,7 @@ def test_one_clock_has_the_ratio_of_noise_and_information():
 
 def test_neighbours_of_equal_durations_are_two_on_each_side():
     motions = np.random.default_rng(0).normal(size=(30, 2))
-    found = from_neighbours(motions, np.full(30, 0.2))
+    found = from_neighbours(motions, np.full(30, 0.2), 0.0)
     for i in range(3, 27):
         assert_allclose(found[i], motions[[i - 3, i - 2, i + 2, i + 3]].mean(axis=0))
 
@@ -50,25 +50,25 @@ def test_neighbours_of_the_frames_of_a_rig_are_of_other_moments(cameras):
     rng = np.random.default_rng(1)
     seconds = np.tile(np.append(np.full(cameras - 1, 0.003), 0.2), 50)
     motions = (0.5 * seconds + 0.001 * rng.normal(size=len(seconds)))[:, None]
-    found = from_neighbours(motions, seconds)[:, 0] / seconds
+    found = from_neighbours(motions, seconds, 0.025)[:, 0] / seconds
     assert np.abs(found - 0.5).max() < 0.05
     beside = np.flatnonzero(seconds > 0.1)[5]  # The motion beside it, over the same step of the odometry, does not count.
     bumped = motions.copy()
     bumped[beside + 1 : beside + cameras] += 1.0
-    assert_allclose(from_neighbours(bumped, seconds)[beside], from_neighbours(motions, seconds)[beside])
+    assert_allclose(from_neighbours(bumped, seconds, 0.025)[beside], from_neighbours(motions, seconds, 0.025)[beside])
 
 
 def test_no_motions_have_no_neighbours():
-    assert from_neighbours(np.zeros((0, 3)), np.zeros(0)).shape == (0, 3)
-    assert_allclose(from_neighbours(np.ones((1, 3)), np.ones(1)), 0)
+    assert from_neighbours(np.zeros((0, 3)), np.zeros(0), 0.0).shape == (0, 3)
+    assert_allclose(from_neighbours(np.ones((1, 3)), np.ones(1), 0.0), 0)
 
 
 def test_the_velocity_of_a_pose_is_over_a_while():
     stamps = np.array([0.0, 0.002, 0.004, 0.2, 0.202, 0.204, 0.4, 0.402])
-    before, after = _around(stamps, np.ones(7, dtype=bool))
+    before, after = _around(stamps, np.ones(7, dtype=bool), 0.05)
     assert before.tolist() == [0, 0, 0, 2, 2, 2, 5, 5]
     assert after.tolist() == [3, 3, 3, 6, 6, 6, 7, 7]
-    before, after = _around(stamps, np.array([True, True, True, False, True, True, True]))
+    before, after = _around(stamps, np.array([True, True, True, False, True, True, True]), 0.05)
     assert before.tolist() == [0, 0, 0, 2, 4, 4, 5, 5]
     assert after.tolist() == [3, 3, 3, 3, 6, 6, 7, 7]
 

@@ -106,16 +106,24 @@ def test_labels_that_others_see_on_both_sides_are_checked():
 def test_noisy_boxes_and_noisy_odometry_together_doubt_labels_that_check_one_another():
     """If several labels have two things each, each is seen on both sides of a moment, and checks the others in vain."""
     beside = [(name, 4.2 + 0.2 * i, 1.0 + 0.5 * i, 0.7) for i, name in enumerate(ALL_NAMED)]
-    rays, keyframes = measured(turning_drive((FIRST, *beside)))
+    rays, keyframes = measured(turning_drive((FIRST, *beside), turn_error=0.0))
     association = associate_by_label(rays)
+    at = {name: place for name, *place in (FIRST, *beside)}
+    places = np.array([at[rays.label_names[i]] for i in association.label])
 
-    def doubted(**noise):
-        estimate = SimpleNamespace(noise=NoiseFactors(**noise), weight=np.ones(len(rays)))
-        return doubted_labels(rays, association, keyframes, estimate).tolist()
+    def doubted(missed, **noise):
+        """missed: m, how far the objects are from their places."""
+        factors = NoiseFactors(**noise)
+        found = {"noise": factors, "weight": np.ones(len(rays)), "map_T_base": keyframes.map_T_base}
+        estimate = SimpleNamespace(**found, positions=places + np.array([0.0, 0.0, missed]))
+        return doubted_labels(factors.rays_with_noise(rays), association, keyframes, estimate).tolist()
 
-    assert 0 not in doubted(turning=4.0)
-    assert doubted(rays=4.0) == []
-    assert doubted(turning=4.0, rays=4.0) == [0, 1, 2, 3, 4]
+    assert 0 not in doubted(0.0, turning=4.0)
+    assert doubted(0.5, rays=4.0) == []
+    assert doubted(0.5, turning=4.0, rays=4.0) == [0, 1, 2, 3, 4]
+    assert doubted(0.5, turning=4.0) == [0, 1, 2, 3, 4]
+    # Boxes of one thing that err alike for seconds make the rays look noisy, but single boxes miss little.
+    assert doubted(0.0, turning=4.0, rays=4.0) == doubted(0.0, turning=4.0)
 
 
 def test_a_comparison_that_fails_keeps_the_map_by_labels_and_says_so(monkeypatch):

@@ -8,12 +8,8 @@ import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse, log_se3
-from objslam.graph.calibration.instruments import Motions
+from objslam.graph.calibration.instruments import Motions, moment_of
 from objslam.graph.calibration.linearised_graph import Linearised
-
-_SPAN = 0.05
-"""The least time (s) from a pose to the poses before and after it that show its velocity. The frames of several cameras may
-be milliseconds apart, and the noise of two poses is no velocity. Over a longer time, short turns are lost."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +50,7 @@ class ClockInstruments:
         keyframes, graph = of.measured.keyframes, of.graph
         path = of.map_T_camera @ inverse(keyframes.base_T_camera)
         stamps = np.maximum.accumulate(keyframes.stamps)
-        before, after = _around(stamps, keyframes.measured)
+        before, after = _around(stamps, keyframes.measured, 2 * moment_of(keyframes))
         seconds = stamps[after] - stamps[before]
         moves = inverse(path[before]) @ path[after]
         _, roots, _ = graph.absolute_roots(of.map_T_camera)
@@ -115,15 +111,15 @@ class ClockInstruments:
         return np.asarray(np.where(self.seconds > 0, 1 / np.maximum(self.seconds, 1e-9), 0.0)[:, None, None] * change)
 
 
-def _around(stamps: Floats, measured: Bools) -> tuple[Ints, Ints]:
-    """Return the poses (K,), (K,) before and after each pose, at least `_SPAN` away, or the ends of a path without a gap.
+def _around(stamps: Floats, measured: Bools, apart: float) -> tuple[Ints, Ints]:
+    """Return the poses (K,), (K,) before and after each pose, at least `apart` away, or the ends of a path without a gap.
 
-    stamps: (K,) s. measured: (K-1,) whether the motion to the next pose is measured.
+    stamps: (K,) s. measured: (K-1,) whether the motion to the next pose is measured. apart: s.
     """
     index = np.arange(len(stamps))
     breaks = np.flatnonzero(~measured)
     path = np.searchsorted(breaks, index)
     first, last = np.append(0, breaks + 1)[path], np.append(breaks, len(stamps) - 1)[path]
-    before = np.minimum(np.searchsorted(stamps, stamps - _SPAN, side="right") - 1, index - 1)
-    after = np.maximum(np.searchsorted(stamps, stamps + _SPAN), index + 1)
+    before = np.minimum(np.searchsorted(stamps, stamps - apart, side="right") - 1, index - 1)
+    after = np.maximum(np.searchsorted(stamps, stamps + apart), index + 1)
     return np.maximum(before, first), np.minimum(after, last)

@@ -12,6 +12,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import adjoint, inverse
+from objslam.core.types import Keyframes
 from objslam.graph.calibration.linearised_graph import Linearised
 
 ODOMETRY_SCALES = ("odometry.scale", "odometry.lateral_scale", "odometry.turn_scale")
@@ -21,9 +22,9 @@ _ALIKE = 3.0
 directions. With a larger ratio, motions that differ from their neighbours make the parameters less certain: with 10, the
 clock of a robot that often stands had a standard deviation five times as large. With a smaller ratio, the noise of a motion
 changes its weight."""
-_LEAST_USUAL = 0.05
-"""The least usual duration (s) of a motion. Shorter motions are between the frames of several cameras. A larger value takes
-the neighbours of fast cameras from a longer time."""
+_MOMENT = 0.025
+"""Frames of several cameras within this time (s) are of one moment: they are too near each other to show how fast the robot
+moves. A larger value takes velocities and the neighbours of motions from a longer time, and so loses short turns."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Motions:
     to_twist: (s, 6, 6) from the whitened rows of a motion to its twist. to_rows: (s, 6, 6) back. weight: (s,) robust.
     covariance: (s, 6, 6) of the twists, as the neighbours of each motion predict it. by_odometry: (s, 6) the share of the
     odometry in their standard deviations. The rest comes from the interpolated path. seconds: (s,) durations. rows: of the
-    motions in the linear system. tied: as in `OdometryMotions`.
+    motions in the linear system. tied: as in `OdometryMotions`. moment: s, as in `from_neighbours`.
     """
 
     to_twist: Floats
@@ -44,6 +45,7 @@ class Motions:
     seconds: Floats
     rows: slice
     tied: float
+    moment: float
 
     @classmethod
     def of(cls, of: Linearised) -> Self:
@@ -54,7 +56,8 @@ class Motions:
         to_base = adjoint(keyframes.base_T_camera[after])
         seconds = np.maximum(keyframes.stamps[after] - keyframes.stamps[before], 0.0)
         covariance = to_base @ odometry.covariance @ np.swapaxes(to_base, 1, 2)
-        near = from_neighbours(covariance.reshape(-1, 36), seconds).reshape(-1, 6, 6)
+        moment = moment_of(keyframes)
+        near = from_neighbours(covariance.reshape(-1, 36), seconds, moment).reshape(-1, 6, 6)
         near = np.where((np.einsum("kii->k", near) > 0)[:, None, None], near, covariance)
         roots = robust[:, None, None] * of.graph.motion_roots
         to_rows = roots @ adjoint(inverse(keyframes.base_T_camera[after]))
@@ -63,7 +66,7 @@ class Motions:
         first = of.graph.first_motion
         rows = slice(first, first + 6 * len(after))
         to_twist, like = to_base @ np.linalg.inv(roots), _alike(near, covariance)
-        return cls(to_twist, to_rows, robust, like, by_odometry, seconds, rows, odometry.tied)
+        return cls(to_twist, to_rows, robust, like, by_odometry, seconds, rows, odometry.tied, moment)
 
     def twists(self, columns: Floats) -> Floats:
         """Return the twists (s, 6, n) of columns (M, n) of the linear system."""
@@ -75,7 +78,7 @@ class Motions:
 
     def predicted(self, twists: Floats) -> Floats:
         """Return the twists (s, 6, n) that neighbours predict for twists (s, 6, n)."""
-        return from_neighbours(twists.reshape(len(twists), -1), self.seconds).reshape(twists.shape)
+        return from_neighbours(twists.reshape(len(twists), -1), self.seconds, self.moment).reshape(twists.shape)
 
     def weighted(self, twists: Floats) -> Floats:
         """Return the rows (6 s, n) whose product with the residuals weighs twists (s, 6, n) by the covariance."""
@@ -114,33 +117,38 @@ def _alike(near: Floats, covariance: Floats) -> Floats:
     return (axes * np.clip(size, 1 / _ALIKE, _ALIKE)[:, None]) @ np.swapaxes(axes, 1, 2)
 
 
-def from_neighbours(motions: Floats, seconds: Floats) -> Floats:
+def moment_of(keyframes: Keyframes) -> float:
+    """Return the time, s, over which keyframes are of one moment: `_MOMENT` with several cameras, else 0."""
+    return _MOMENT if len(keyframes) and np.ptp(keyframes.camera) > 0 else 0.0
+
+
+def from_neighbours(motions: Floats, seconds: Floats, moment: float) -> Floats:
     """Predict each of the motions (n, D) from its own duration and the rate of motions near it: two before, two after.
 
     The motions directly beside it do not count: they may share a step of the odometry with it, and so its noise. The frames
-    of several cameras may be milliseconds apart. Then each side has more motions: those of half the usual duration do not
-    count, and as many count as last one and a half times as long as usual. seconds: (n,) the durations.
+    of several cameras may be milliseconds apart. Then more motions do not count, and more count. seconds: (n,) the
+    durations. moment: s. Motions over this time beside a motion are of the same moment. On each side, the neighbours last
+    three times as long at least.
     """
     count = len(motions)
     ends = np.append(0.0, np.cumsum(seconds))
-    usual = max(float(np.median(seconds)), _LEAST_USUAL) if count else _LEAST_USUAL
     total = np.vstack([np.zeros((1, motions.shape[1])), np.cumsum(motions, axis=0)])
     near, time = np.zeros_like(motions), np.zeros((count, 1))
-    forward = _after(ends, usual)
-    back = tuple(count - one[::-1] for one in _after(ends[-1] - ends[::-1], usual))[::-1]
+    forward = _after(ends, moment)
+    back = tuple(count - one[::-1] for one in _after(ends[-1] - ends[::-1], moment))[::-1]
     for first, last in (forward, back):
         near += total[last] - total[first]
         time += (ends[last] - ends[first])[:, None]
     return np.asarray(np.where(time > 0, near / np.maximum(time, 1e-9), 0.0) * seconds[:, None])
 
 
-def _after(ends: Floats, usual: float) -> tuple[Ints, Ints]:
+def _after(ends: Floats, moment: float) -> tuple[Ints, Ints]:
     """Return for each of n motions the first of the motions that follow it and count, and the one after the last of them.
 
-    ends: (n+1,) s, the begin of the first motion, and the ends of all. usual: s, the usual duration of a motion.
+    ends: (n+1,) s, the begin of the first motion, and the ends of all. moment: s, as in `from_neighbours`.
     """
     count = len(ends) - 1
-    first = np.maximum(np.arange(count) + 2, np.searchsorted(ends[:-1], ends[1:] + usual / 2))
+    first = np.maximum(np.arange(count) + 2, np.searchsorted(ends[:-1], ends[1:] + moment))
     first = np.minimum(first, count)
-    last = np.maximum(first + 2, np.searchsorted(ends, ends[first] + 1.5 * usual))
+    last = np.maximum(first + 2, np.searchsorted(ends, ends[first] + 3 * moment))
     return first, np.minimum(last, count)

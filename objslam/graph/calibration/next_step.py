@@ -37,8 +37,8 @@ class NextStep:
     @classmethod
     def of(cls, errors: CalibratedMeasurements, association: Association, estimate: Estimate, theta: Floats) -> Self:
         """Linearise a solution. SolveError if its linear system is singular."""
+        multiframes = Multiframes.of(errors.keyframes)
         keyframes, rays, settings = errors.at(theta)
-        multiframes = Multiframes.of(errors.keyframes, keyframes.stamps)
         ties = find_ties(multiframes.keyframes(keyframes), settings)
         rays = share_bias(rays, association)
         measured = Measurements.of(keyframes, rays, settings, multiframes, None, ties)

@@ -7,7 +7,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import inverse, log_se3
-from objslam.graph.calibration.instruments import from_neighbours
+from objslam.graph.calibration.instruments import Motions, from_neighbours
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 
@@ -78,7 +78,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
         fits = _energy(np.repeat(motions.by_odometry[:, axis], 6)[:, None] * along * residual) / max(
             _energy(along * left[:, :_PROBES]), 1e-12
         )
-        rough = _roughness(said[:, [axis]], motions.seconds) / max(_roughness(walk, motions.seconds), 1e-12)
+        rough = _roughness(said[:, [axis]], motions) / max(_roughness(walk, motions), 1e-12)
         size = min(rough**2, fits)
         for k, axes in scales.items():
             if axis in axes:
@@ -115,9 +115,9 @@ def _random_walks(stamps: Floats) -> Callable[[Floats], Floats]:
     return lambda at: np.column_stack([np.interp(at, stamps, walk) for walk in walks.T])
 
 
-def _roughness(motions: Floats, seconds: Floats) -> float:
-    """Return the median difference between motions (n, D) and their prediction by neighbours."""
-    return float(np.median(np.abs(motions - from_neighbours(motions, seconds))))
+def _roughness(values: Floats, motions: Motions) -> float:
+    """Return the median difference between values (n, D) of the motions and their prediction by neighbours."""
+    return float(np.median(np.abs(values - from_neighbours(values, motions.seconds, motions.moment))))
 
 
 def _energy(rows: Floats) -> float:

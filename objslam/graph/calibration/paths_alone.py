@@ -18,7 +18,7 @@ def noise_of_paths(errors: CalibratedMeasurements, theta: np.ndarray) -> NoiseFa
     theta: (P,) the shared errors. If the odometry does not determine the path, the noise stays as it is.
     """
     keyframes, rays, settings = errors.at(theta)
-    measured = Measurements.of(keyframes, rays, settings, Multiframes.of(errors.keyframes, keyframes.stamps))
+    measured = Measurements.of(keyframes, rays, settings, Multiframes.of(errors.keyframes))
     nothing = Association(np.full(len(rays), -1), np.zeros(0, dtype=np.int64))
     used = np.zeros(len(rays), dtype=bool)
     paths = Linearised(measured, nothing, measured.keyframes.map_T_camera, np.zeros((0, 3)), used)

@@ -4,7 +4,7 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.geometry import inverse
-from objslam.graph.calibration.instruments import from_neighbours
+from objslam.graph.calibration.instruments import from_neighbours, moment_of
 from objslam.graph.calibration.linearised_graph import Linearised
 
 _LEAST_TOLD = 0.3
@@ -34,7 +34,8 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
     )
     turn = keyframes.base_T_camera[after, :3, :3]
     variance = turn @ odometry.covariance[:, 3:, 3:] @ np.swapaxes(turn, 1, 2)
-    told = from_neighbours(said, np.maximum(keyframes.stamps[after] - keyframes.stamps[before], 0.0))
+    seconds = np.maximum(keyframes.stamps[after] - keyframes.stamps[before], 0.0)
+    told = from_neighbours(said, seconds, moment_of(keyframes))
 
     def product(one: Floats, two: Floats) -> float:
         return float((one * np.linalg.solve(variance, two[..., None])[..., 0]).sum())
