@@ -21,6 +21,10 @@ _MOST = 3000
 _SURE = 5.0
 """The least log odds of a found offset against the expected offset. With a smaller value, robots that hardly turn begin at
 an offset that fits by chance. With a larger value, short drives begin at a wrong clock."""
+_TRIGGER, _TRIGGERED = 0.01, 0.9
+"""Cameras have a common trigger if the stamps of at least `_TRIGGERED` of their images are within `_TRIGGER` (s) of the
+image before. Their images stay together, because found clocks err by more. A larger time, or a smaller share, takes more
+cameras for cameras with a trigger, whose frames stay in the order of their stamps."""
 
 
 def clocks_of_turns(errors: SharedErrors) -> Floats:
@@ -57,10 +61,13 @@ def in_order_of_clocks(frames: Keyframes, rays: Rays, errors: SharedErrors | Non
 
     Frames are in the order of their stamps. If the clocks of two cameras differ by more than the time between two frames,
     images that were taken one after the other change places. The path of a graph would then go to and fro, and each way
-    would count as a measurement of its own. errors: of these frames, None if no clock is estimated.
+    would count as a measurement of its own. errors: of these frames, None if no
+    clock is estimated. Images of cameras with a common trigger stay in the order of their stamps.
     """
     cameras = () if errors is None else errors.cameras
     if errors is None or len(cameras) < 2:
+        return frames, rays
+    if (np.diff(frames.stamps) <= _TRIGGER).sum() >= _TRIGGERED * (1 - 1 / len(cameras)) * len(frames):
         return frames, rays
     found = dict(zip(errors.names, clocks_of_turns(errors).tolist(), strict=True))
     offset = np.array([found.get(f"{name}.clock", 0.0) for name in cameras])

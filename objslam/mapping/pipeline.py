@@ -149,7 +149,7 @@ def _run(
         if sideways := lies_on_its_side(frames):
             ledger.warn(sideways)
         rays = build_rays(log, frames, settings, ledger)
-        if settings.mode == "joint" and len(rays):
+        if settings.mode == "joint" and len(log.cameras) > 1 and len(rays):
             frames, rays = in_order_of_clocks(frames, rays, shared_errors(log, frames, rays, settings))
     if len(rays) == 0:
         say(diagnosis, ledger)

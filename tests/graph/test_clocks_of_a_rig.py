@@ -1,5 +1,7 @@
 """Several cameras whose clocks differ: the noise of the odometry that they share, and what a run finds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from bench_robots import robot
@@ -7,7 +9,9 @@ from numpy.testing import assert_allclose
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.errors import SolveError
 from objslam.evaluation.evaluate import evaluate
+from objslam.frontend import turning_clocks
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors
@@ -35,6 +39,17 @@ def test_the_shares_of_noise_belong_to_directions():
 
 def test_one_clock_has_the_ratio_of_noise_and_information():
     assert_allclose(_shares(np.array([[3.0]]), np.array([[4.0]]), 0.0), [[0.75]])
+
+
+def test_clocks_without_information_or_that_cannot_be_told_apart_are_no_crash():
+    shares = _shares(np.diag([3.0, 0.0]), np.diag([4.0, 0.0]), 0.0)
+    assert_allclose(shares, np.diag([0.75, 0.0]), atol=1e-6)
+    alike = np.ones((2, 2))
+    found = _shares(0.5 * alike, 1e6 * alike, 0.0)
+    assert np.isfinite(found).all()
+    assert_allclose(1e6 * alike @ found, 0.5 * alike, rtol=1e-3, atol=1e-3)
+    with pytest.raises(SolveError, match="not finite"):
+        _shares(np.full((2, 2), np.nan), alike, 0.0)
 
 
 def test_neighbours_of_equal_durations_are_two_on_each_side():
@@ -95,6 +110,17 @@ def test_frames_are_in_the_order_in_which_they_were_taken():
         for one, of in ((frames, rays), (found, moved))
     )
     assert now == was
+
+
+def test_images_of_cameras_with_a_common_trigger_stay_together(monkeypatch):
+    """A clock that is found 0.3 s off would tear them apart."""
+    log = robot(1, "gyro", None, 3)[0]
+    stamps = log.cameras[0].detections.frame_stamps
+    cameras = (replace(one, detections=replace(one.detections, frame_stamps=stamps)) for one in log.cameras)
+    frames, rays, errors = measured(replace(log, cameras=tuple(cameras)))
+    theta = np.where([name == "camera1.clock" for name in errors.names], 0.3, 0.0)
+    monkeypatch.setattr(turning_clocks, "clocks_of_turns", lambda errors: theta)
+    assert in_order_of_clocks(frames, rays, errors) == (frames, rays)
 
 
 def test_one_camera_keeps_its_order():

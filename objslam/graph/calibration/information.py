@@ -11,9 +11,9 @@ from objslam.graph.calibration.inner_solve import InnerSolve
 from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
 from objslam.graph.calibration.shrinkage import shrinking_force
 
-_RIDGE = 1e-9
-"""The share of the variance of a gradient that is added to its diagonal. It prevents a division by zero if a log cannot tell
-two parameters apart. A larger share mixes such parameters more."""
+RIDGE = 1e-9
+"""The share of the variance of a gradient, or of the information, that is added to its diagonal. It prevents a division by
+zero if a log cannot tell two parameters apart. A larger share mixes such parameters more."""
 _LEAST_GROWTH = 0.5
 """The common scale is projected out only if the linearised map grows by more than this share when all unknown scales grow by
 1. An exact map would grow by 1. With a larger value, the projection is used more rarely."""
@@ -34,7 +34,7 @@ def likelihood(system: ReducedSystem) -> tuple[Floats, Floats]:
     if not (np.isfinite(variance).all() and np.isfinite(slope).all()):
         raise SolveError("the information about the shared errors is not finite")
     size = np.sqrt(np.maximum(np.diagonal(variance), 1e-300))
-    scaled = variance / np.outer(size, size) + _RIDGE * np.eye(len(size))
+    scaled = variance / np.outer(size, size) + RIDGE * np.eye(len(size))
     weights = np.linalg.solve(scaled, slope / size[:, None]).T / size
     information = weights @ slope
     return np.asarray(weights), np.asarray((information + information.T) / 2)

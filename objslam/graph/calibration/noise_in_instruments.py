@@ -7,6 +7,8 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import inverse, log_se3
+from objslam.errors import SolveError
+from objslam.graph.calibration.information import RIDGE
 from objslam.graph.calibration.instruments import Motions, from_neighbours
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
@@ -99,12 +101,18 @@ def _shares(noise: Floats, information: Floats, least: float) -> Floats:
     """Return the shares (C, C) of noise in the information about C clocks, between `least` and 1 in each direction.
 
     noise, information: (C, C). The noise is information @ shares. The frames of several cameras have the same odometry, so
-    their clocks share its noise: it hardly disturbs the difference of two clocks, but it does disturb their mean.
+    their clocks share its noise: it hardly disturbs the difference of two clocks, but it does disturb their mean. SolveError
+    if a number is not finite.
     """
-    root = np.linalg.cholesky(information + 1e-300 * np.eye(len(information)))
+    size = np.sqrt(np.maximum(np.diagonal(information), 1e-300))
+    told, told_noise = information / np.outer(size, size), noise / np.outer(size, size)
+    if not (np.isfinite(told).all() and np.isfinite(told_noise).all()):
+        raise SolveError("the information about the clocks is not finite")
+    root = np.linalg.cholesky(told + RIDGE * np.eye(len(told)))
     back = np.linalg.inv(root)
-    size, axes = np.linalg.eigh(back @ noise @ back.T)
-    return np.asarray(back.T @ (axes * np.clip(size, least, 1.0)) @ axes.T @ root.T)
+    found, axes = np.linalg.eigh(back @ told_noise @ back.T)
+    shares = back.T @ (axes * np.clip(found, least, 1.0)) @ axes.T @ root.T
+    return np.asarray(shares * size / size[:, None])
 
 
 def _random_walks(stamps: Floats) -> Callable[[Floats], Floats]:
