@@ -235,15 +235,16 @@ class Live(Section):
     """Free space in MB at which the journal stops, so that the robot's disk does not fill up. The mapping goes on. On a disk
     of less than 50 times this size, the limit is 2 % of the disk."""
     reassociate: Annotated[int, Field(ge=0)] = 6000
-    """Maximum number of boxes with which a session repeats the offline association at its end. This takes a few seconds."""
+    """Maximum number of boxes with which a session repeats the offline association at its end. This takes a few seconds, and
+    as long as an offline run if the map of the session is unclear."""
     calibrate_from: Annotated[int, Field(ge=0)] = 60
     """Number of keyframes at which the session first estimates the shared errors and the noise of the localisation. It
     estimates them again whenever the number of keyframes has grown by half. 0 estimates them only at the end of the
     session."""
     search_from: Annotated[int, Field(ge=0)] = 75
-    """Number of keyframes at which the session first searches its unexplained boxes for objects, by the offline association
-    in a process beside it. It searches again whenever the number of keyframes has grown by half, up to `reassociate` boxes.
-    0 searches only at the end of the session."""
+    """Number of keyframes at which the session first associates its whole drive again, by the offline association in a process
+    beside it, if some label may have several objects. It does so again whenever the number of keyframes has grown by 30 %, up
+    to `reassociate` boxes. 0 does so only at the end of the session."""
     forget: Positive = 5.0
     """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""

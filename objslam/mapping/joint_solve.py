@@ -39,7 +39,7 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     """Return the state after association and solve of a log. It has an association and an estimate.
 
     If the map shows a gross error that was held, the log is solved once more, and the state has this error among its shared
-    errors. start: a known start. With it, the log is not explored, and labels are not trusted.
+    errors. start: a known start. With it, labels are not trusted.
     """
     state = _begun(begin)
     if start is not None or not _may_be_names(state):
@@ -137,9 +137,9 @@ def _with_several_a_label(state: JointState, named: JointState) -> JointState:
 
 
 def _associated(state: JointState, start: InitialEstimate | None, named: JointState | None = None) -> JointState:
-    """Return the state after association and solve from a known start, or from an exploration of the log. named: as in
-    `from_several_starts`."""
-    if start is not None or state.keyframes.localized_every:
+    """Return the state after association and solve. start: a known start. Without a localisation, other starts are tried if
+    its map is unclear. named: as in `from_several_starts`."""
+    if state.keyframes.localized_every:
         doubtful = begins_with_lasting_errors(state)
         found = improved(from_start(state, start), relocalized)
         state = _or_as_in_fixed_mode(state, found) if start is None else found
@@ -148,7 +148,7 @@ def _associated(state: JointState, start: InitialEstimate | None, named: JointSt
             if state.keyframes.odom_T_base is not None:  # It tells the motions of the path through a map without phantoms.
                 state = without_phantoms(state)
     else:
-        state = from_several_starts(state, named)
+        state = from_several_starts(state, start, named)
         state = improved(state, JointState.split)
     return _settled(state)
 

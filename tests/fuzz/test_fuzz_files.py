@@ -24,7 +24,7 @@ from objslam.io.images import decode_colour, decode_depth
 from objslam.io.objects_json import read_objects, read_truth_objects
 from objslam.io.tum_trajectory import read_trajectory
 from objslam.simulation import make_camera
-from objslam.sources.journal.corrections import BodiesMessage, CalibrationMessage, NamesMessage, ObjectsMessage
+from objslam.sources.journal.corrections import AssociationMessage, BodiesMessage, CalibrationMessage, NamesMessage
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.log import read_journal
 from objslam.sources.journal.reader import messages
@@ -59,7 +59,9 @@ MESSAGES = [
     replace(FRAMES, whole=True, stamp=3.0),
     CalibrationMessage(3, CALIBRATION),
     BodiesMessage(3, np.array([4]), np.array([2]), np.ones((1, 3)), np.zeros(1), np.eye(4)[None]),
-    ObjectsMessage(3, (np.array([1, 5]), np.array([2, 3, 4])), np.array([7])),
+    AssociationMessage(
+        3, (np.array([1, 5]), np.array([4])), np.ones((2, 3)), np.array([7]), np.arange(2), np.array([np.eye(4)] * 2)
+    ),
     NamesMessage(3, np.array([0, 2]), np.array([1]), np.array([4, 3])),
 ]
 

@@ -22,7 +22,7 @@ from objslam.errors import LogError, OutputError
 from objslam.simulation import make_camera
 from objslam.sources import read
 from objslam.sources.journal.aside import restore_after_kill
-from objslam.sources.journal.corrections import BodiesMessage, CalibrationMessage, NamesMessage, ObjectsMessage
+from objslam.sources.journal.corrections import AssociationMessage, BodiesMessage, CalibrationMessage, NamesMessage
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.log import read_journal
 from objslam.sources.journal.reader import messages
@@ -82,12 +82,16 @@ def bodies(count):
     return st.builds(BodiesMessage, st.integers(0, 10**9), ids, shapes, sides, yaws, spread)
 
 
-def objects(count):
-    """Of up to 9 rays each, no ray of two objects."""
-    numbers = st.lists(st.integers(0, 10**9), min_size=count, max_size=9 * count, unique=True)
-    parts = numbers.map(lambda found: tuple(np.array(sorted(found[i::count]), dtype=np.int64) for i in range(count)))
-    gone = npst.arrays(np.int64, count, elements=st.integers(0, 99))
-    return st.builds(ObjectsMessage, st.integers(0, 10**9), parts, gone)
+@st.composite
+def associations(draw):
+    """Of objects with up to 9 rays each. No ray is of two objects."""
+    count = draw(st.integers(0, 4))
+    numbers = draw(st.lists(st.integers(0, 10**9), min_size=count + 1, max_size=9 * count + 9, unique=True))
+    *rays, free = (np.array(sorted(numbers[i :: count + 1]), dtype=np.int64) for i in range(count + 1))
+    keyframes = np.array(sorted(draw(st.sets(st.integers(0, 10**9), max_size=4))), dtype=np.int64)
+    poses = np.array([draw(POSES) for _ in keyframes]).reshape(-1, 4, 4)
+    places = draw(npst.arrays(np.float64, (count, 3), elements=FINITE))
+    return AssociationMessage(draw(st.integers(0, 10**9)), tuple(rays), places, free, keyframes, poses)
 
 
 def label_kinds(count):
@@ -114,7 +118,7 @@ MESSAGES = st.one_of(
     st.builds(NoteMessage, FINITE, POSES),
     st.builds(CalibrationMessage, st.integers(0, 10**9), st.integers(0, 4).flatmap(calibrations), NOISES),
     st.integers(0, 4).flatmap(bodies),
-    st.integers(1, 4).flatmap(objects),
+    associations(),
     st.integers(0, 4).flatmap(label_kinds),
     st.just(CameraMessage(make_camera("links", yaw=0.3))),
     st.just(CameraMessage(replace(make_camera("bearings"), sees_size=False))),

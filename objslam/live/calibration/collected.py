@@ -23,14 +23,16 @@ from objslam.mapping.solution import seen_something
 class Collected:
     """The data of a session in the form of offline mapping.
 
-    keyframes, rays: as measured, the keyframes in time order. numbers: (R,) the session's numbers of the rays. association:
-    the object of each ray. ids: (N,) the session's ids of the objects. map_T_camera, positions: (K, 4, 4), (N, 3) the
-    session's estimate. log: the paths and cameras. errors: gives the keyframes and rays for any values of the shared errors.
-    None if neither errors nor noise are estimated. theta: (P,) the present values of the errors, None without `errors`. An
-    error that the session knows and does not estimate is already corrected in keyframes, rays and log.
+    keyframes, rays: as measured, the keyframes in time order. keyframe_ids, numbers: (K,), (R,) the session's ids of the
+    keyframes and numbers of the rays. association: the object of each ray. ids: (N,) the session's ids of the objects.
+    map_T_camera, positions: (K, 4, 4), (N, 3) the session's estimate. log: the paths and cameras. errors: gives the
+    keyframes and rays for any values of the shared errors. None if neither errors nor noise are estimated. theta: (P,) the
+    present values of the errors, None without `errors`. An error that the session knows and does not estimate is already
+    corrected in keyframes, rays and log.
     """
 
     keyframes: Keyframes
+    keyframe_ids: Ints
     rays: Rays
     numbers: Ints
     association: Association
@@ -86,8 +88,8 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
         log = known.corrected_log(values)
         errors = None if errors is None else replace(errors, log=log, keyframes=keyframes, rays=rays)
     theta = None if errors is None else corrections(m, errors)
-    estimate = poses[kept], place[objects]
-    return Collected(keyframes, rays, r.number[rows], association, objects, *estimate, log, errors, theta)
+    numbers, estimate = r.number[rows], (poses[kept], place[objects])
+    return Collected(keyframes, k.id[order[kept]], rays, numbers, association, objects, *estimate, log, errors, theta)
 
 
 def _of_robot_parts(m: MapState, rows: Ints) -> Bools:

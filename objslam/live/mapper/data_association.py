@@ -26,7 +26,7 @@ def associate(
 
     rays: of the keyframe. map_T_camera: (4, 4) predicted camera pose, with its `uncertainty`. predicted: the result of
     `predict_landmarks`, or None to compute it here. Rays that match nothing begin tracks. Second boxes of
-    a thing (`_first_boxes`) and boxes of things that move are only kept for the end of the session.
+    a thing (`first_boxes`) and boxes of things that move are only kept for the end of the session.
     """
     landmarks, settings, k, count = m.landmarks, m.settings.association, int(m.keyframes.id[-1]), len(rays.label)
     one = may_be_one(rays.box, rays.label)
@@ -57,7 +57,7 @@ def associate(
         free += best[(row[best] < 0) & ~lost].tolist()
         waiting = {track.label: track for track in m.tracks if track.by_label}
     if classed.any():
-        first = _first_boxes(rays.score, one)
+        first = first_boxes(rays.score, one)
         first = first[classed[first]]
         known = settings.gate, m.landmark_of_track, m.novelty
         row[first] = match(rays.take(first), map_T_camera, predicted, uncertainty, len(m.labels), *known)
@@ -102,7 +102,7 @@ def _shown_twice(label: Ints, one: Bools) -> list[int]:
     return sorted(set(label[first].tolist()))
 
 
-def _first_boxes(score: Floats, one: Bools) -> Ints:
+def first_boxes(score: Floats, one: Bools) -> Ints:
     """Return the boxes that may match something or begin a track: the surest of the boxes that may show one thing.
 
     A second box of a thing would become a second landmark, or pull the first one aside. A thing that stands behind another

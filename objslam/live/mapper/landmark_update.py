@@ -5,9 +5,9 @@ from itertools import combinations
 
 import numpy as np
 
-from objslam.association.observations import SIZED_BY, UsualSizes
+from objslam.association.observations import SIZED_BY, Observations, UsualSizes
 from objslam.association.refinement import information, normalised_residuals
-from objslam.core.arrays import Ints
+from objslam.core.arrays import Floats, Ints
 from objslam.core.statistics import CLIPPED_RAY
 from objslam.live.mapper.frame_association import FrameRays, in_map
 from objslam.live.mapper.landmark_table import in_view
@@ -76,6 +76,17 @@ def update_landmarks(m: MapState, update: LandmarkUpdate) -> None:
         for (first, label), (second, other) in combinations(shown, 2):
             if label == other:
                 m.pairs.together[first, second] += 1
+
+
+def observed(obs: Observations, position: Floats) -> dict[str, Floats | float]:
+    """Return the columns of a landmark at a position (3,) that follow from its rays. obs: the rays in map, all inliers."""
+    return {
+        "position": position,
+        "information": information(obs, position).sum(axis=0),
+        "seen": float(len(obs.origin)),
+        "far": float(np.linalg.norm(position - obs.origin, axis=1).max()),
+        "squared": float((normalised_residuals(obs, position) ** 2).clip(max=CLIPPED_RAY**2).sum()),
+    }
 
 
 def measure_sizes(m: MapState, rows: Ints) -> None:

@@ -7,13 +7,11 @@ from itertools import count
 import numpy as np
 
 from objslam.association.observations import Observations
-from objslam.association.refinement import information, normalised_residuals
 from objslam.association.single_object_fit import PointFit, fit_point
 from objslam.config import Settings
 from objslam.core.arrays import Floats, Ints
-from objslam.core.statistics import CLIPPED_RAY
 from objslam.graph.isam2 import IncrementalGraph
-from objslam.live.mapper.landmark_update import measure_sizes
+from objslam.live.mapper.landmark_update import measure_sizes, observed
 from objslam.live.mapper.state import MapState
 from objslam.live.mapper.tracks import Track
 
@@ -53,20 +51,15 @@ def add_landmark(m: MapState, at: Ints, fit: PointFit, obs: Observations, seen: 
     m.next_id.landmark += 1
     m.rays.owner[at] = j
     m.rays.used[at] = fit.inlier
-    inner = obs.take(fit.inlier)
+    columns = observed(obs.take(fit.inlier), fit.position)
     m.landmarks.add(
         id=[j],
-        position=fit.position[None],
-        information=information(inner, fit.position).sum(axis=0)[None],
         label=[int(m.rays.label[at[0]])],
         drift=drift[None],
         first=[seen[0]],
         last=[seen[1]],
-        seen=[int(fit.inlier.sum())],
         expected=[len(at)],
-        far=[float(np.linalg.norm(fit.position - inner.origin, axis=1).max())],
-        squared=[float((normalised_residuals(inner, fit.position) ** 2).clip(max=CLIPPED_RAY**2).sum())],
-        rejected=[0],
+        **{name: np.asarray(one)[None] for name, one in columns.items()},
     )
     measure_sizes(m, np.array([len(m.landmarks) - 1]))
     m.rays.to_centre[at] = m.rays.centre_sigma[at] = 0.0  # They may have belonged to a landmark with a body.

@@ -23,8 +23,8 @@ from objslam.live.calibration.calibrator import Calibrator
 from objslam.live.counters import Counters
 from objslam.live.mapper.mapper import Mapper
 from objslam.live.names.name_judge import NameJudge
+from objslam.live.reassociation.reassociator import Reassociator
 from objslam.live.rounds import Rounds
-from objslam.live.search.object_search import ObjectSearch
 from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import FrameQueue
 from objslam.live.session.intake import Intake
@@ -73,7 +73,7 @@ class Session(Intake):
         self._rounds: tuple[Rounds[Any, Any], ...] = (
             Calibrator(*of_session, name, patient),
             NameJudge(*of_session, name, patient),
-            ObjectSearch(*of_session, name, patient),
+            Reassociator(*of_session, name, patient),
             BodyCentring(*of_session, patient),
         )
         self._known, self._locator = known, MapLocator(known, self._mapper, self.counters)

@@ -11,9 +11,9 @@ from objslam.core.bodies.body import SHAPES
 from objslam.core.calibration import Calibration
 from objslam.core.noise import MOST_POSE_NOISE, NOMINAL, NoiseFactors
 from objslam.core.validity import MAX_POSITION, covariance_fault
-from objslam.sources.journal.fields import as_array, as_count, as_name
+from objslam.sources.journal.fields import as_array, as_count, as_name, as_pose
 
-_CALIBRATION_KIND, _BODIES_KIND, _OBJECTS_KIND, _NAMES_KIND = b"S", b"B", b"A", b"K"
+_CALIBRATION_KIND, _BODIES_KIND, _ASSOCIATION_KIND, _NAMES_KIND = b"S", b"B", b"R", b"K"
 _OF_LOCALIZATION = ("heading", "heading_share", "heading_seconds", "place", "place_share", "place_seconds")
 """The fields of `NoiseFactors` that a calibration message has."""
 
@@ -48,16 +48,21 @@ class BodiesMessage:
 
 
 @dataclass(frozen=True)
-class ObjectsMessage:
-    """Objects that a session found in boxes of its past, which belonged to no object, and landmarks that are no objects.
+class AssociationMessage:
+    """Which rays of a session are of which object, and its path, as an association of the whole drive found them.
 
-    keyframe: the number of keyframes in the map before the correction. rays: for each object, the numbers (n,) of its rays,
-    in order. No ray has two objects. gone: (n,) the ids of the landmarks that are no objects.
+    keyframe: the number of keyframes in the map before the correction. rays: for each of N objects, the numbers (n,) of its
+    rays, in order. positions: (N, 3) m, of the objects. free: (n,) the numbers of the rays that are of no object, in order.
+    No ray is in two of these arrays. keyframes: (K,) the ids of the keyframes. map_T_camera: (K, 4, 4) their poses, in a map
+    that may be another than the session's.
     """
 
     keyframe: int
     rays: tuple[Ints, ...]
-    gone: Ints
+    positions: Floats
+    free: Ints
+    keyframes: Ints
+    map_T_camera: Floats
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class NamesMessage:
     moving: Ints
 
 
-Correction = CalibrationMessage | BodiesMessage | ObjectsMessage | NamesMessage
+Correction = CalibrationMessage | BodiesMessage | AssociationMessage | NamesMessage
 """What a session found itself, and then corrected in its map."""
 
 
@@ -92,7 +97,8 @@ def encode_correction(message: Correction) -> bytes:
         kinds = [labels.tolist() for labels in (message.names, message.several, message.moving)]
         return _NAMES_KIND + json.dumps([message.keyframe, *kinds]).encode()
     objects = [rays.tolist() for rays in message.rays]
-    return _OBJECTS_KIND + json.dumps([message.keyframe, objects, message.gone.tolist()]).encode()
+    rest = [one.tolist() for one in (message.positions, message.free, message.keyframes, message.map_T_camera)]
+    return _ASSOCIATION_KIND + json.dumps([message.keyframe, objects, *rest]).encode()
 
 
 def _read_calibration(data: bytes) -> CalibrationMessage:
@@ -129,22 +135,30 @@ def _read_bodies(data: bytes) -> BodiesMessage:
     fault = covariance_fault(spread)
     if fault is not None:
         raise ValueError(f"the covariance of a body {fault}")
-    numbers = np.array([as_count(one) for one in ids], dtype=np.int64)
-    return BodiesMessage(as_count(keyframe), numbers, shapes, sides, as_array(yaw, (n,)), spread)
+    return BodiesMessage(as_count(keyframe), _counts(ids), shapes, sides, as_array(yaw, (n,)), spread)
 
 
-def _read_objects(data: bytes) -> ObjectsMessage:
-    keyframe, objects, gone = json.loads(data[1:])
-    rays = tuple(np.array([as_count(one) for one in numbers], dtype=np.int64) for numbers in objects)
-    every = np.concatenate([*rays, np.zeros(0, dtype=np.int64)])
-    if len(np.unique(every)) < len(every) or any(not len(one) or (np.diff(one) < 0).any() for one in rays):
-        raise ValueError("rays of objects that repeat, or are not in order")
-    return ObjectsMessage(as_count(keyframe), rays, np.array([as_count(one) for one in gone], dtype=np.int64))
+def _read_association(data: bytes) -> AssociationMessage:
+    keyframe, objects, positions, free, keyframes, poses = json.loads(data[1:])
+    rays, others, ids = tuple(map(_counts, objects)), _counts(free), _counts(keyframes)
+    every = np.concatenate([*rays, others])
+    in_order = all((np.diff(one) > 0).all() for one in (*rays, others, ids))
+    if len(np.unique(every)) < len(every) or not all(len(one) for one in rays) or not in_order:
+        raise ValueError("rays or keyframes of an association that repeat, or are not in order")
+    places = as_array(positions, (len(rays), 3))
+    if (np.abs(places) >= MAX_POSITION).any():
+        raise ValueError("an object that is too far away")
+    at = np.array([as_pose(pose) for pose in poses]).reshape(len(ids), 4, 4)
+    return AssociationMessage(as_count(keyframe), rays, places, others, ids, at)
+
+
+def _counts(values: list[int]) -> Ints:
+    return np.array([as_count(one) for one in values], dtype=np.int64)
 
 
 def _read_names(data: bytes) -> NamesMessage:
     keyframe, *kinds = json.loads(data[1:])
-    names, several, moving = (np.array([as_count(one) for one in labels], dtype=np.int64) for labels in kinds)
+    names, several, moving = map(_counts, kinds)
     every = np.concatenate([names, several, moving])
     if len(np.unique(every)) < len(every):
         raise ValueError("a label that is of two kinds")
@@ -154,7 +168,7 @@ def _read_names(data: bytes) -> NamesMessage:
 CORRECTION_READERS: dict[bytes, Callable[[bytes], Correction]] = {
     _CALIBRATION_KIND: _read_calibration,
     _BODIES_KIND: _read_bodies,
-    _OBJECTS_KIND: _read_objects,
+    _ASSOCIATION_KIND: _read_association,
     _NAMES_KIND: _read_names,
 }
 """The reader of each kind of correction, by the first byte of its record."""
