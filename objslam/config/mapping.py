@@ -242,9 +242,9 @@ class Live(Section):
     estimates them again whenever the number of keyframes has grown by half. 0 estimates them only at the end of the
     session."""
     search_from: Annotated[int, Field(ge=0)] = 75
-    """Number of keyframes at which the session first associates its whole drive again, if some label may have several objects.
-    The offline association runs in a process beside the session. It runs again whenever the number of keyframes has grown by
-    30 %, up to `reassociate` boxes. 0 does so only at the end of the session."""
+    """Number of keyframes at which the session first associates its whole drive again, if a label may have several objects.
+    The offline association runs in a process beside the session. It runs again whenever the number of keyframes has grown
+    by 30 %, up to `reassociate` boxes. 0 does so only at the end of the session."""
     forget: Positive = 5.0
     """Time in s without observation after which a track with fewer than min_rays boxes is dropped. Its boxes stay
     unexplained."""
