@@ -1,7 +1,7 @@
 """Measure whether maps are honest on robots whose errors come from hardware, not from the noise model of the package.
 
     python tools/bench_robots.py [--kinds wheels gyro vio slow mecanum] [--robots 8] [--first 0] [--unnamed]
-        [--classes 6] [--cameras 3] [--localised filter]
+        [--classes 6] [--cameras 3] [--localised filter] [--live]
 
 Each robot drives to random points of a room, with stops. wheels: encoders with ticks, wrong radii, a wrong track width, slip
 and sudden slips. gyro: the same wheels, and the heading of a gyroscope with a bias. vio: a 6-DoF path that drifts. slow:
@@ -18,25 +18,32 @@ With --unnamed, all objects of a robot have one label, so the map must also find
 With --localised, each robot has a localisation too, that errs for seconds. All settings are the defaults, and maps are
 compared without an alignment. filter: AMCL by tf, which steps when it corrects the odometry. poses: the poses of AMCL at its
 corrections alone. slam: a scan matcher. satellites: positions that err by up to more than a metre.
+
+With --live, a session maps each robot while it drives. The map of its last snapshot has lines of its own. The CPU time is
+that of the session and of the processes beside it.
 """
 
 from __future__ import annotations
 
 import argparse
+import resource
 import time
 from typing import Any
 
 import localisations
 import mecanum
 import numpy as np
+from live_parts.common import replayed
 from log_parts import with_classes, without_names
 
-from objslam.config import load_settings
+from objslam.config import Settings, load_settings
 from objslam.core.arrays import Floats
 from objslam.core.calibration import Calibration
 from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import inverse, lift_se2, make_pose
+from objslam.core.object_map import ObjectMap
+from objslam.core.result import RunResult
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.errors import ObjslamError
@@ -62,53 +69,52 @@ def main() -> None:
     parser.add_argument("--unnamed", action="store_true", help="one label for all objects of a robot")
     parser.add_argument("--classes", type=int, default=0, help="this number of labels for all objects of a robot, by chance")
     parser.add_argument("--cameras", type=int, default=1, help="cameras that look around, each with a clock of its own")
+    parser.add_argument("--live", action="store_true", help="a session maps each robot while it drives")
     parser.add_argument("--localised", choices=localisations.KINDS, help="the localisation of the robots")
     options = parser.parse_args()
     settings = load_settings(
         None, ("output.recording=false",) if options.localised else ("mode=joint", "output.recording=false")
     )
     for kind in options.kinds:
-        rows: dict[bool, list[tuple[float, ...]]] = {True: [], False: []}
+        rows: dict[tuple[str, bool], list[tuple[float, ...]]] = {}
         errors: dict[str, list[float]] = {}
         for seed in range(options.first, options.first + options.robots):
             log, true = robot(seed, kind, options.localised, options.cameras)
-            ranged, begin = seed % 2 == 0, time.process_time()
+            ranged, begin = seed % 2 == 0, cpu_seconds()
             log = without_names(log) if options.unnamed else log
             log = with_classes(log, options.classes, seed) if options.classes else log
             try:
-                result = pipeline.run(log, settings, Ledger())
+                result, last = mapped(log, settings, options.live)
             except ObjslamError as error:
                 print(f"{kind} {seed}: {error}")
                 continue
-            seconds = time.process_time() - begin
-            assert log.truth is not None
-            radius = FAR_RADIUS if options.localised == "satellites" else RADIUS
-            radius = UNNAMED_RADIUS if options.unnamed or options.classes else radius
-            found = evaluate(result.map, log.truth, align="none" if options.localised else "se2", radius=radius).to_dict()
-            inside = (found["inside_95_3d"] or 0.0) * found["matched"]
-            rmse, squared = (found[name] if found["matched"] else np.nan for name in ("position_rmse", "mahalanobis_median"))
-            rows[ranged].append((found["matched"], len(log.truth.objects), found["false"], inside, rmse, squared, seconds))
-            print(
-                f"{kind} {seed}, {'range' if ranged else 'bearings'}: {found['matched']} of {len(log.truth.objects)} "
-                f"objects, {found['false']} false, {inside:.0f} inside 95 %, RMSE {rmse:.3f} m, "
-                f"squared Mahalanobis median {squared:.2f}, {seconds:.1f} s of CPU",
-                flush=True,
-            )
-            off = deviations(result.calibration, true)
-            for name, error in off.items():
-                errors.setdefault(name, []).append(error)
-            print("    " + ", ".join(f"{name} {error:+.1f} sigma" for name, error in off.items()), flush=True)
-        for ranged, of in rows.items():
-            if of:
-                matched, objects, false, inside, rmse, squared, seconds = np.array(of).T
+            seconds = cpu_seconds() - begin
+            for what, found in (("the last snapshot", last), ("", result.map)):
+                if found is None:
+                    continue
+                of = (*scores(found, log, options), seconds)
+                rows.setdefault((what, ranged), []).append(of)
+                matched, objects, false, inside, rmse, squared, _ = of
                 print(
-                    f"== {kind}, {'range' if ranged else 'bearings'}: {len(of)} robots, {matched.sum():.0f} of "
-                    f"{objects.sum():.0f} objects, {false.sum():.0f} false, inside 95 %: "
-                    f"{inside.sum() / matched.sum():.1%}, "
-                    f"RMSE median {np.nanmedian(rmse):.3f} m, largest {np.nanmax(rmse):.3f} m, "
-                    f"{np.median(seconds):.1f} s of CPU",
+                    f"{kind} {seed}, {'range' if ranged else 'bearings'}{what and ', ' + what}: {matched:.0f} of "
+                    f"{objects:.0f} objects, {false:.0f} false, {inside:.0f} inside 95 %, RMSE {rmse:.3f} m, "
+                    f"squared Mahalanobis median {squared:.2f}, {seconds:.1f} s of CPU",
                     flush=True,
                 )
+            off = deviations(result.calibration, true)
+            for name, by in off.items():
+                errors.setdefault(name, []).append(by)
+            print("    " + ", ".join(f"{name} {by:+.1f} sigma" for name, by in off.items()), flush=True)
+        for (what, ranged), of_kind in sorted(rows.items(), reverse=True):
+            matched, objects, false, inside, rmse, squared, seconds = np.array(of_kind).T
+            print(
+                f"== {kind}, {'range' if ranged else 'bearings'}{what and ', ' + what}: {len(of_kind)} robots, "
+                f"{matched.sum():.0f} of {objects.sum():.0f} objects, {false.sum():.0f} false, inside 95 %: "
+                f"{inside.sum() / matched.sum():.1%}, "
+                f"RMSE median {np.nanmedian(rmse):.3f} m, largest {np.nanmax(rmse):.3f} m, "
+                f"{np.median(seconds):.1f} s of CPU",
+                flush=True,
+            )
         for name, of_name in errors.items():
             size = np.abs(of_name)
             print(
@@ -116,6 +122,34 @@ def main() -> None:
                 f"{(size <= 3).sum()} within 3, root mean square {np.sqrt((size**2).mean()):.2f}, largest {size.max():.1f}",
                 flush=True,
             )
+
+
+def mapped(log: Log, settings: Settings, live: bool) -> tuple[RunResult, ObjectMap | None]:
+    """Return the result of a log, and the map of the last snapshot if a session maps it."""
+    if not live:
+        return pipeline.run(log, settings, Ledger()), None
+    session = replayed(log, settings)
+    last = session.snapshot().map
+    return session.stop(), last
+
+
+def scores(found: ObjectMap, log: Log, options: argparse.Namespace) -> tuple[float, ...]:
+    """Return the numbers of matched, true and false objects, and of those inside their 95 % ellipsoids. Also the RMSE,
+    m, and the median of the squared Mahalanobis distances."""
+    assert log.truth is not None
+    radius = FAR_RADIUS if options.localised == "satellites" else RADIUS
+    radius = UNNAMED_RADIUS if options.unnamed or options.classes else radius
+    score = evaluate(found, log.truth, align="none" if options.localised else "se2", radius=radius).to_dict()
+    matched = score["matched"]
+    inside = (score["inside_95_3d"] or 0.0) * matched
+    rmse, squared = (score[name] if matched else np.nan for name in ("position_rmse", "mahalanobis_median"))
+    return matched, len(log.truth.objects), score["false"], inside, rmse, np.nan if squared is None else squared
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time, s, of this process and of those that it started and that have ended."""
+    of_children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + of_children.ru_utime + of_children.ru_stime
 
 
 def deviations(found: Calibration | None, true: dict[str, float]) -> dict[str, float]:
