@@ -49,9 +49,11 @@ def plan_of(m: MapState, found: AssociationMessage) -> Plan:
     landmark. Rays that came after the association follow the other rays of their landmark.
     """
     rays, landmarks = m.rays, m.landmarks
-    index = np.full(len(rays.number), _LATER)
-    for number, mine in enumerate((found.free, *found.rays), -1):
-        index[np.isin(rays.number, mine)] = number
+    groups = (found.free, *found.rays)
+    numbers, index = np.concatenate(groups), np.full(len(rays.number), _LATER)
+    there = np.isin(numbers, rays.number)
+    of = np.repeat(np.arange(-1, len(found.rays)), [len(group) for group in groups])
+    index[np.searchsorted(rays.number, numbers[there])] = of[there]
     objects, answered = np.unique(index[index >= 0]), index > _LATER
     index = np.where(index >= 0, np.searchsorted(objects, index), index)
     held, count = answered & (rays.owner >= 0), len(objects)
@@ -172,7 +174,9 @@ def _update_landmarks(m: MapState, plan: Plan, positions: Floats) -> None:
             "expected": max(inherited[j], len(mine)),
         }
         if is_new:
-            landmarks.add(id=[j], label=[int(rays.label[mine[0]])], **{name: [one] for name, one in columns.items()})
+            landmarks.add(
+                id=[j], label=[int(np.bincount(rays.label[mine]).argmax())], **{name: [one] for name, one in columns.items()}
+            )
             m.graph.add_landmark(j, position)
             continue
         row = int(np.searchsorted(landmarks.id, j))
