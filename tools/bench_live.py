@@ -8,9 +8,9 @@ minutes). Its second line has the times without the other processes of the machi
 the end and the final map, compared with offline `run --mode joint` on the same data. The data are ten simulated drives, and
 robots 1, 3 and 5 of UTIAS MRCLAM 6 from the folder in OBJSLAM_DATA. localised: the last snapshots of sessions whose
 localisation errs for seconds. rare: those of sessions whose detector misses most boxes. unnamed: those of sessions whose
-things have one label. overload: five times as many frames as the session can map. kill: twenty sessions that are killed with signal 9 at random moments, and resumed. disorder: late,
-repeated and swapped messages, a clock that jumps, and odometry that restarts. memory: one hour of odometry at 200 Hz and
-frames at 10 Hz (--minutes), pushed as fast as possible.
+things have one label. overload: five times as many frames as the session can map. kill: twenty sessions that are killed with
+signal 9 at random moments, and resumed. disorder: late, repeated and swapped messages, a clock that jumps, and odometry that
+restarts. memory: one hour of odometry at 200 Hz and frames at 10 Hz (--minutes), pushed as fast as possible.
 """
 
 from __future__ import annotations
