@@ -141,7 +141,7 @@ def test_a_search_begins_without_the_errors_of_a_map_by_names(monkeypatch):
         return Named(replace(named, errors=named.errors.with_noise(replace(named.errors.noise, turning=20.0))), False)
 
     monkeypatch.setattr(joint_solve, "by_label", wrong)
-    monkeypatch.setattr(joint_solve, "from_several_starts", lambda state, named: begun.append(state) or search(state, named))
+    monkeypatch.setattr(joint_solve, "from_several_starts", lambda state, *more: begun.append(state) or search(state, *more))
     log = simulate(preset("demo", objects=4, frames=80, localization=None, odometry=Odometry(), false=0.0), 1)
     assert len({one.label for one in log.truth.objects}) == 4
     settings = load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false"))
