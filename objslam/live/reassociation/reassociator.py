@@ -38,9 +38,10 @@ suits slower machines, but corrects the map later."""
 _KNOWN = 0.5
 """An object is in the map already if at least this share of its rays belongs to landmarks of the session. Any other object
 enters the map only if its position is reliable. A larger share keeps more objects out."""
-_RIGHT = 0.7
+_RIGHT = 0.5
 """An association takes effect only if it gives at least this share of the rays of all landmarks to objects. With a smaller
-share, a solve that went wrong may spoil the map."""
+share, a solve that went wrong may spoil the map. With a larger one, people who walk stay landmarks where there are many of
+them: with 0.7, four simulated sessions among eight people had 23 false objects at the end of the drive, and with 0.5 had 15."""
 
 
 @dataclass(frozen=True)
