@@ -41,7 +41,7 @@ enters the map only if its position is reliable. A larger share keeps more objec
 _RIGHT = 0.5
 """An association takes effect only if it gives at least this share of the rays of all landmarks to objects. With a smaller
 share, a solve that went wrong may spoil the map. With a larger one, people who walk stay landmarks where there are many of
-them: with 0.7, four simulated sessions among eight people had 23 false objects at the end of the drive, and with 0.5 had 15."""
+them: with 0.7, four simulated sessions among eight people ended their drive with 23 false objects, and with 0.5 with 15."""
 
 
 @dataclass(frozen=True)
