@@ -56,6 +56,19 @@ def from_several_starts(
         found = _Found(first, _searched(first))
         if not found.unclear or _has_things_that_move(found.state):
             return state.replaced(found.state)
+    before = state.ledger.copy()
+    try:
+        return _from_explorations(state, found, named)
+    except SolveError:  # The map of the known start is there, whatever is wrong with the exploration.
+        if found is None:
+            raise
+        state.ledger.restore(before)
+        return state.replaced(found.state)
+
+
+def _from_explorations(state: JointState, found: _Found | None, named: JointState | None) -> JointState:
+    """Return the state after a search from the first exploration, and from further starts while the map is unclear. found:
+    with a known start."""
     begin, path = with_errors_of_tracks(state)
     start, sure = explored(begin)
     first = from_start(*solved_if_sure(begin, start, sure))
@@ -174,7 +187,7 @@ def _has_things_that_move(state: JointState) -> bool:
     """Return whether many boxes of tracks have no object (`_AT_REST`)."""
     assert state.association is not None
     tracked = associate_tracks(state.keyframes, state.rays).object >= 0
-    return bool((state.association.object[tracked] < 0).mean() > 1 - _AT_REST)
+    return bool(tracked.any() and (state.association.object[tracked] < 0).mean() > 1 - _AT_REST)
 
 
 def from_start(state: JointState, start: InitialEstimate | None) -> JointState:

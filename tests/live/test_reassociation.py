@@ -10,6 +10,7 @@ from driving import feed
 from objslam.config import load_settings
 from objslam.evaluation.evaluate import evaluate
 from objslam.live.adapters.replay import events
+from objslam.live.label_kinds import LabelKinds
 from objslam.live.mapper.landmark_table import LandmarkTable
 from objslam.live.mapper.tables import RayTable
 from objslam.live.reassociation.adoption import plan_of
@@ -144,6 +145,7 @@ def table(ids, owner, next_landmark):
         landmarks=landmarks,
         rays=rays,
         next_id=SimpleNamespace(landmark=next_landmark),
+        kinds=LabelKinds(are_names=False),
         rows_of=lambda some: np.searchsorted(landmarks.id, some),
     )
 
@@ -182,3 +184,19 @@ def test_an_association_of_no_object_leaves_no_landmark_that_it_knows():
     plan = plan_of(m, answer([], [0, 1]))
     assert plan.owner.tolist() == [-1, -1, 4]
     assert plan.gone.tolist() == [3]
+
+
+def test_a_landmark_of_which_hardly_a_ray_is_explained_is_no_object():
+    m = table([3, 7], [3] * 20 + [7] * 20, 8)
+    plan = plan_of(m, answer([[*range(20), 20, 21]], [*range(22, 40)]))
+    assert plan.heirs == {3: 3, 7: -1}
+    assert plan_of(m, answer([[*range(20), 20, 21, 22]], [*range(23, 40)])).heirs == {3: 3, 7: 3}
+
+
+def test_an_association_leaves_labels_alone_that_are_no_classes_any_more():
+    m = table([3, 7], [3, 3, 7, -1], 8)
+    m.rays.label[2:] = 5
+    m.kinds.add_moving(5)
+    plan = plan_of(m, answer([[0, 1, 2, 3]], []))
+    assert plan.owner.tolist() == [3, 3, 7, -1]
+    assert not len(plan.gone)

@@ -54,6 +54,7 @@ def plan_of(m: MapState, found: AssociationMessage) -> Plan:
     there = np.isin(numbers, rays.number)
     of = np.repeat(np.arange(-1, len(found.rays)), [len(group) for group in groups])
     index[np.searchsorted(rays.number, numbers[there])] = of[there]
+    index[~m.kinds.classes(rays.label)] = _LATER  # Meanwhile, a label may be judged a name, or of things that move.
     objects, answered = np.unique(index[index >= 0]), index > _LATER
     index = np.where(index >= 0, np.searchsorted(objects, index), index)
     held, count = answered & (rays.owner >= 0), len(objects)
