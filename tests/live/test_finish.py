@@ -77,7 +77,7 @@ def test_the_end_names_depths_that_are_distances_along_the_ray(power, words):
 @pytest.mark.long
 def test_the_end_trusts_no_object_of_a_camera_that_somebody_turned():
     log = simulate(preset("demo", frames=160, objects=12, classes=12, localization=None), 3)
-    settings = load_settings(None, ("mode=joint", "bodies.use=false"))
+    settings = load_settings(None, ("mode=joint", "bodies.use=false", "live.search_from=0"))
     for degrees, names in ((0.0, []), (10.0, ["camera moved"])):
         result = feed(Session(settings, patient=True).start(), turned(log, 0, degrees)).stop()
         assert [one["name"] for one in result.summary["wrong_input"]] == names
