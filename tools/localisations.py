@@ -3,7 +3,7 @@
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.geometry import inverse, lift_se2
+from objslam.core.geometry import interpolate, inverse, lift_se2
 from objslam.core.types import Trajectory
 
 KINDS = ("filter", "poses", "slam", "satellites")
@@ -43,7 +43,8 @@ def localised(rng: np.random.Generator, kind: str, stamps: Floats, path: Floats,
             corrected.append(i)
     if kind == "poses":
         return Trajectory(stamps[corrected], said[corrected])
-    at = np.clip(np.searchsorted(odometry.stamps, stamps[corrected]), 0, len(odometry.stamps) - 1)
-    map_T_odom = said[corrected] @ inverse(odometry.poses[at])
+    # As tf does, the odometry is interpolated to the time of the scan. The last scan may come after the odometry.
+    moments = np.minimum(stamps[corrected], odometry.stamps[-1])
+    map_T_odom = said[corrected] @ inverse(interpolate(odometry.stamps, odometry.poses, moments, np.inf)[0])
     last = np.maximum(np.searchsorted(stamps[corrected], odometry.stamps, side="right") - 1, 0)
     return Trajectory(odometry.stamps, map_T_odom[last] @ odometry.poses)
