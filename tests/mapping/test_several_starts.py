@@ -111,6 +111,43 @@ def test_a_noisy_map_is_clear_if_another_start_finds_its_objects(monkeypatch, no
     assert found.unclear == unclear
 
 
+@dataclass(frozen=True)
+class Begin:
+    """A log before its first association."""
+
+    ledger: Ledger
+    effort: object = None
+
+    def attempt(self):
+        return self
+
+    def replaced(self, other):
+        return other
+
+
+@pytest.mark.parametrize(("moves", "tried"), [(False, True), (True, False)])
+def test_an_exploration_that_fails_loses_no_map_of_a_known_start(monkeypatch, moves, tried):
+    """Without a known start, the failure is an error. Where things move, other starts are not tried."""
+    ledger, explorations = Ledger(), []
+
+    def fail(state):
+        explorations.append(state)
+        ledger.drop("boxes of the exploration")
+        raise SolveError("the path is torn")
+
+    monkeypatch.setattr(several_starts, "with_errors_of_tracks", fail)
+    monkeypatch.setattr(several_starts, "from_start", lambda state, known: known)
+    monkeypatch.setattr(several_starts, "_searched", lambda one: one)
+    monkeypatch.setattr(several_starts, "_unclear", lambda one, confirmed: True)
+    monkeypatch.setattr(several_starts, "_has_things_that_move", lambda one: moves)
+    ended = Map(100.0)
+    assert several_starts.from_several_starts(Begin(ledger), ended) == ended
+    assert bool(explorations) == tried
+    assert not ledger.dropped
+    with pytest.raises(SolveError, match="torn"):
+        several_starts.from_several_starts(Begin(ledger))
+
+
 def test_a_search_ends_after_its_solves(monkeypatch):
     """A log whose map stays unclear is tried from all starts, or until the solves are taken."""
     monkeypatch.setattr(several_starts, "_unclear", lambda state, confirmed: True)
