@@ -10,7 +10,6 @@ from scipy.optimize import linear_sum_assignment
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import inverse
-from objslam.errors import SolveError
 from objslam.live.mapper.landmark_update import measure_sizes, observed, remove_landmarks
 from objslam.live.mapper.state import MapState
 from objslam.sources.journal.corrections import AssociationMessage
@@ -18,8 +17,6 @@ from objslam.sources.journal.corrections import AssociationMessage
 _GONE = 0.1
 """A landmark is no object if the association gives at most this share of its rays to objects. Things that move and false
 boxes end so. A larger share drops more landmarks."""
-_ITERATIONS = 3
-"""The most iterations of the solve after an association. More iterations delay the next frame for longer."""
 _LATER = -2  # The index of a ray that the association does not know. The index of a ray without an object is -1.
 
 
@@ -112,12 +109,9 @@ def adopt(m: MapState, found: AssociationMessage) -> tuple[int, int, int]:
 
 
 def _solve(m: MapState) -> None:
-    """Solve the corrected map at once. Its estimate is near, because the association comes with a solve of its own."""
-    try:
-        m.graph.solve(_ITERATIONS)
-    except SolveError:
-        m.counters.accept("solves given up")
-        m.graph.rebuild()
+    """Solve the corrected map at once, by one step. Its estimate is near, because the association comes with a solve of its
+    own. Relinearisations follow."""
+    m.graph.rebuild()
     m.read_positions()
     m.schedule.relinearise_soon()
 
