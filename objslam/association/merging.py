@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from objslam.association.duplicates import show_one_thing
 from objslam.association.existence import rates_of_classes
 from objslam.association.gating import gated_edges
 from objslam.association.label_fusion import SIZE_RATIO
@@ -23,12 +24,16 @@ the larger size. Larger shares merge more landmarks."""
 _MOST_APART = 0.1
 """The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, or of the
 frames that should show both landmarks. A larger share merges more landmarks."""
+_OFTEN = 5
+"""In at least this number of frames, two landmarks have boxes that lie on each other. If hardly another frame shows them
+apart, and the distance is below the smaller size, one of them has second boxes of the other, because things do not go
+through each other. A larger number leaves second boxes in short logs."""
 _MIN_EXPECTED = 5.0
 """The number of frames that should show both landmarks is assumed to be at least this. A larger number merges more
 landmarks."""
 _DUPLICATE_OVERLAP = 0.5
-"""The least intersection over union of two boxes in one frame that show one object. A larger overlap merges fewer
-landmarks."""
+"""The least intersection over union of two boxes in one frame whose second box says nothing about a second object. With a
+smaller overlap, rays of two neighbours that overlap in many frames become one object."""
 _NEIGHBOURS = 8  # The number of nearest landmarks that each one is compared with. A larger value costs time in dense scenes.
 _REACH_GATES = 2.0
 """The distance up to which two landmarks are compared, in gates of the noise of their rays. It is large because one object
@@ -63,13 +68,14 @@ def merge_targets(state: State, gate: float, across_labels: bool) -> Ints:
     pairs = _with_rays(a, b, state)
     both_seen, both_expected, seen_a, seen_b = common_frames(state.history, a, b)
     gain = _gains(state, gate, pairs, both_seen, both_expected)
-    apart = _seen_apart(obs, pairs, state.matched)
+    together, apart = _seen_together(obs, pairs, state.matched)
     should = seen_a * seen_b / np.maximum(both_expected, 1.0)  # The frames with both, if detections are independent.
     gap = np.linalg.norm(state.landmarks.position[a] - state.landmarks.position[b], axis=1)
     small, large = np.minimum(diameter[a], diameter[b]), np.maximum(diameter[a], diameter[b])
     never = apart <= _MOST_APART * np.minimum(number[a], number[b])
     shared = (gap < _SHARED_SPACE[0] * small) & never
     shared |= (gap < _SHARED_SPACE[1] * large) & (apart <= _MOST_APART * np.maximum(should, _MIN_EXPECTED))
+    shared |= (gap < small) & (together >= _OFTEN) & (apart <= _MOST_APART * together)
     one = (gain > 0) | shared
     if across_labels:
         one &= never & (large < SIZE_RATIO * small)
@@ -178,10 +184,11 @@ def common_frames(history: DetectionHistory, a: Ints, b: Ints) -> list[Ints]:
     return [np.asarray(one[a].multiply(two[b]).sum(axis=1)).ravel() for one, two in tables]
 
 
-def _seen_apart(obs: Observations, pairs: _Pairs, matched: Ints) -> Ints:
-    """Return the number of frames (P,) in which both landmarks have a box and the two boxes hardly overlap."""
+def _seen_together(obs: Observations, pairs: _Pairs, matched: Ints) -> tuple[Ints, Ints]:
+    """Return the number of frames (P,) in which both landmarks have a box, and in which these two boxes do not lie on each
+    other."""
     order = np.lexsort((matched[pairs.ray], obs.frame[pairs.ray], pairs.pair))
     ray, pair = pairs.ray[order], pairs.pair[order]
     both = np.flatnonzero((np.diff(pair) == 0) & (np.diff(obs.frame[ray]) == 0))
-    different = overlap(obs.box[ray[both]], obs.box[ray[both + 1]]) < _DUPLICATE_OVERLAP
-    return np.bincount(pair[both[different]], minlength=len(pairs.a))
+    different = ~show_one_thing(obs.box[ray[both]], obs.box[ray[both + 1]])
+    return np.bincount(pair[both], minlength=len(pairs.a)), np.bincount(pair[both[different]], minlength=len(pairs.a))
