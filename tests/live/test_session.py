@@ -111,12 +111,14 @@ def test_poses_that_the_settings_leave_unused_are_no_loss(log):
     assert not session.counters.dropped()
 
 
-def test_an_object_whose_covariance_is_not_computed_yet_is_not_surer_than_the_path(log, monkeypatch):
-    """The first snapshot of a map has time for one covariance of the graph. The rays alone know nothing of the path."""
+@pytest.mark.parametrize("budget", [1.5, 0.0])
+def test_an_object_whose_covariance_is_not_computed_yet_is_not_surer_than_the_path(log, monkeypatch, budget):
+    """The first snapshot of a map has time for one covariance of the graph, or for none. The rays alone know nothing of the
+    path."""
     session = drive(log)
     state = session._mapper.state
     exact = {o.id: np.trace(o.covariance) for o in Describer().map(state, whole=True).resolved()}
-    monkeypatch.setattr("objslam.live.session.snapshots._BUDGET", 1.5)
+    monkeypatch.setattr("objslam.live.session.snapshots._BUDGET", budget)
     monkeypatch.setattr("objslam.live.session.snapshots.time.perf_counter", lambda ticks=count(): float(next(ticks)))
     soon = {o.id: np.trace(o.covariance) for o in Describer().map(state).resolved()}
     monkeypatch.undo()

@@ -41,6 +41,8 @@ class Describer:
 
         After the time budget is spent, objects keep their last description, but landmarks get their present position.
         New landmarks get a covariance from their rays and the widest one of the others for now, and new tracks are left out.
+        At least one covariance comes from the graph, however busy the machine is. Else nothing would contain the error of
+        the path.
         whole: ignore the time budget.
         """
         end = np.inf if whole else time.perf_counter() + _BUDGET
@@ -51,7 +53,8 @@ class Describer:
         points = m.graph.points(landmarks.id)
         found: dict[int, tuple[tuple[int, float, bool], MapObject]] = {}
         against, widest = contradicted(m), None
-        order = np.argsort([known[j][0][1] if j in known else -np.inf for j in landmarks.id.tolist()], kind="stable")
+        described_at = np.array([known[j][0][1] if j in known else -np.inf for j in landmarks.id.tolist()])
+        order = np.lexsort((-landmarks.id, described_at))  # Of new ones the newest first, which the path errs most for.
         for row in order.tolist():
             j = int(landmarks.id[row])
             sure = not against[row]
@@ -59,7 +62,7 @@ class Describer:
             before = known.get(j)
             if before is not None and (before[0] == state or time.perf_counter() > end):
                 described, state = replace(before[1], position=points[row]), before[0]
-            elif time.perf_counter() > end:
+            elif time.perf_counter() > end and self._covariances:
                 widest = self._widest(landmarks) if widest is None else widest
                 alone = covariances(landmarks, np.array([row]))[0]
                 described = describe_landmark(m, row, points[row], alone + widest, sure=sure)
@@ -86,8 +89,8 @@ class Describer:
         return ObjectMap(tuple(objects))
 
     def _widest(self, landmarks: LandmarkTable) -> Floats:
-        """Return the widest covariance (3, 3), m^2, of a landmark that is known from the graph, 0 without one. The rays of a
-        new landmark leave out the error of the path, which this one contains."""
+        """Return the widest covariance (3, 3), m^2, of a landmark that is known from the graph, 0 if none is known any more.
+        The rays of a new landmark leave out the error of the path, which this one contains."""
         known = [self._covariances[j] for j in landmarks.id.tolist() if j in self._covariances]
         return max(known, key=np.trace, default=np.zeros((3, 3)))
 
