@@ -25,9 +25,9 @@ _MOST_APART = 0.1
 """The largest share of frames in which one object may look like two. It is a share of the rarer landmark's rays, or of the
 frames that should show both landmarks. A larger share merges more landmarks."""
 _OFTEN = 5
-"""In at least this number of frames, two landmarks have boxes that lie on each other. If hardly another frame shows them
-apart, and the distance is below the smaller size, one of them has second boxes of the other, because things do not go
-through each other. A larger number leaves second boxes in short logs."""
+"""One of two landmarks has second boxes of the other if at least this number of frames has boxes of both, nearly all of
+these pairs lie on each other, and the landmarks are nearer than the smaller size. Things do not go through each other. A
+larger number leaves second boxes in short logs."""
 _MIN_EXPECTED = 5.0
 """The number of frames that should show both landmarks is assumed to be at least this. A larger number merges more
 landmarks."""

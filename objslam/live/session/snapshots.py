@@ -59,11 +59,12 @@ class Describer:
             j = int(landmarks.id[row])
             sure = not against[row]
             state = (int(landmarks.seen[row]), float(landmarks.last[row]), sure)
-            before = known.get(j)
-            if before is not None and (before[0] == state or time.perf_counter() > end):
+            before, late = known.get(j), time.perf_counter() > end
+            if late and widest is None:
+                widest = self._widest(landmarks)
+            if before is not None and (before[0] == state or late):
                 described, state = replace(before[1], position=points[row]), before[0]
-            elif time.perf_counter() > end and self._covariances:
-                widest = self._widest(landmarks) if widest is None else widest
+            elif late and widest is not None:
                 alone = covariances(landmarks, np.array([row]))[0]
                 described = describe_landmark(m, row, points[row], alone + widest, sure=sure)
                 state = (-1, -np.inf, sure)
@@ -88,11 +89,11 @@ class Describer:
         objects += [replace(o, id=first + i) for i, (_, o) in enumerate(self._waiting.values())]
         return ObjectMap(tuple(objects))
 
-    def _widest(self, landmarks: LandmarkTable) -> Floats:
-        """Return the widest covariance (3, 3), m^2, of a landmark that is known from the graph, 0 if none is known any more.
-        The rays of a new landmark leave out the error of the path, which this one contains."""
+    def _widest(self, landmarks: LandmarkTable) -> Floats | None:
+        """Return the widest covariance (3, 3), m^2, of a landmark that is known from the graph, None if none is known. The
+        rays of a new landmark leave out the error of the path, which this one contains."""
         known = [self._covariances[j] for j in landmarks.id.tolist() if j in self._covariances]
-        return max(known, key=np.trace, default=np.zeros((3, 3)))
+        return max(known, key=lambda one: np.nan_to_num(np.trace(one), nan=-1.0), default=None)
 
     def _covariance(self, m: MapState, j: int) -> Floats:
         """Return the covariance (3, 3), m^2, of landmark j, along the axes of the session.
