@@ -141,9 +141,9 @@ def _mrclam(folder: Path, robot: int) -> Drive:
     return Drive(name, poses, frame, found.label, distance, bearing, noise, 0.15, np.radians(0.5), truth, log)
 
 
-def _simulated(rays: int) -> Drive:
+def _simulated(rays: int, seed: int = 0) -> Drive:
     """Laps on a circle between landmarks, five observations a frame."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     frames, count = rays // 5, rays // 200
     radius = 10.0 * np.sqrt(count / 20)
     turned = 0.1 * np.arange(frames) / radius
@@ -158,17 +158,21 @@ def _simulated(rays: int) -> Drive:
         landmark += near.tolist()
     at, mark = np.array(frame), np.array(landmark)
     to = truth[mark] - true[at, :2]
-    bearing = np.arctan2(to[:, 1], to[:, 0]) - true[at, 2] + rng.normal(scale=0.006, size=len(at))
-    bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
+    ahead = np.arctan2(to[:, 1], to[:, 0]) - true[at, 2]
+    ahead = (ahead + np.pi) % (2 * np.pi) - np.pi
+    bearing = ahead + rng.normal(scale=0.006, size=len(at))
     distance = np.hypot(*to.T) * (1 + rng.normal(scale=0.02, size=len(at)))
     noise = np.tile([0.004, 0.002, 0.002], (frames - 1, 1))
-    step = np.array([0.1, 0.0, 0.1 / radius]) + noise * rng.normal(size=noise.shape)
+    turn = 0.1 / radius
+    chord = radius * np.array([np.sin(turn), 1 - np.cos(turn)])
+    step = np.array([*chord, turn]) + noise * rng.normal(size=noise.shape)
     yaw = np.append(0.0, np.cumsum(step[:, 2]))
     c, s = np.cos(yaw[:-1]), np.sin(yaw[:-1])
     moves = np.column_stack([c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1]])
     poses = np.column_stack([np.vstack([np.zeros(2), np.cumsum(moves, axis=0)]), yaw])
     stamps = 0.2 * np.arange(frames)
-    log = _rig_log("simulated", Trajectory(stamps, lift_se2(poses)), stamps, (at, mark), distance, bearing, 0.0)
+    odometry = Trajectory(stamps, lift_se2(poses))
+    log = _rig_log("simulated", odometry, stamps, (at, mark), distance, bearing, 0.0, toward=ahead)
     return Drive("simulated, 50,000 rays", poses, at, mark, distance, bearing, noise, 0.1, 0.006, truth, log)
 
 
@@ -180,15 +184,27 @@ def _wheel_noise(poses: Floats) -> Floats:
 
 
 def _rig_log(
-    name: str, odometry: Trajectory, stamps: Floats, seen: tuple[Ints, Ints], ranges: Floats, bearing: Floats, ahead: float
+    name: str,
+    odometry: Trajectory,
+    stamps: Floats,
+    seen: tuple[Ints, Ints],
+    ranges: Floats,
+    bearing: Floats,
+    ahead: float,
+    toward: Floats | None = None,
 ) -> Log:
-    """Return the log of a rig of pinhole cameras at the place of the laser, of which each sees a third of its view."""
+    """Return the log of a rig of pinhole cameras at the place of the laser, of which each sees a third of its view.
+
+    toward: (n,) rad, the true bearings, which say what camera sees a landmark. None means that they are not known. If the
+    measured ones decided, bearings whose noise points out of the image would be missing, which moves the image's centre.
+    """
+    toward = bearing if toward is None else toward
     frame, landmark = seen
     names = tuple(f"landmark {i}" for i in range(int(landmark.max()) + 1))
-    nearest = np.argmin(np.abs(bearing[:, None] - _YAWS), axis=1)
+    nearest = np.argmin(np.abs(toward[:, None] - _YAWS), axis=1)
     cameras = []
     for i, yaw in enumerate(_YAWS.tolist()):
-        mine = np.flatnonzero((nearest == i) & (np.abs(bearing - yaw) < np.radians(39.0)))
+        mine = np.flatnonzero((nearest == i) & (np.abs(toward - yaw) < np.radians(39.0)))
         mine = mine[np.argsort(frame[mine], kind="stable")]
         aside = bearing[mine] - yaw
         centre = np.column_stack([_WIDTH / 2 - _FOCAL * np.tan(aside), np.full(len(mine), 240.0)])
