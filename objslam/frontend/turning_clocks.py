@@ -34,6 +34,10 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
     At the right offset, the turns in the bearings are nearest to the turns of the odometry. This offset is judged with the
     prior of the clock, by Laplace's distribution of unknown width. A search that begins at a clock 0.2 s off can end at a
     wrong optimum, where a large noise of turns explains what the clock causes.
+
+    An interpolated pose has less noise midway between two poses of the odometry, because it averages the noise of both. If
+    the images come at the rate of the odometry, an offset of half a step would therefore fit better. So an offset does not
+    count as better by more than it would be if all that is missed were noise of the odometry.
     """
     theta, odometry, cameras = errors.mean.copy(), errors.log.odometry, [one.camera.name for one in errors.log.cameras]
     if odometry is None or len(odometry) < 2 or errors.keyframes.odom_T_base is None:
@@ -46,10 +50,13 @@ def clocks_of_turns(errors: SharedErrors) -> Floats:
         stamps, bearings, weight = _pairs(errors, cameras.index(name.rpartition(".")[0]))
         if not len(stamps):
             continue
-        missed = _missed(odometry, stamps, bearings, np.append(offsets, theta[k]))
+        tried = np.append(offsets, theta[k])
+        missed = _missed(odometry, stamps, bearings, tried)
+        noise = _noise_of_turns(odometry.stamps, stamps, tried)
+        missed *= np.maximum(noise[-1] / np.maximum(noise, 1e-9), 1.0)
         floor = float(np.median(errors.rays.sigma))
         cost = weight * np.log(missed + floor)
-        cost += (np.append(offsets, theta[k]) - errors.mean[k]) ** 2 / (2 * errors.prior[k, k])
+        cost += (tried - errors.mean[k]) ** 2 / (2 * errors.prior[k, k])
         best = int(cost.argmin())
         if cost[best] < cost[-1] - _SURE:
             theta[k] = offsets[best]
@@ -113,6 +120,23 @@ def _missed(odometry: Trajectory, stamps: Floats, bearings: Floats, offsets: Flo
         fixed = np.einsum("nij,nj->ni", before, bearings[:, 0])
         told = np.einsum("nji,nj->ni", after, fixed)
         found[i] = angles_off(np.zeros(3), bearings[:, 1], told).mean()
+    return found
+
+
+def _noise_of_turns(known: Floats, stamps: Floats, offsets: Floats) -> Floats:
+    """Return the mean noise (m,) of the turns between pairs of stamps (n, 2), s, at offsets (m,), s, of the clock.
+
+    The noise is a random walk with steps at stamps `known` (N,), s, interpolated linearly. It is in units of the walk after
+    1 s.
+    """
+    found, step = np.zeros(len(offsets)), np.diff(known)
+    for i, offset in enumerate(offsets.tolist()):
+        before, after = (np.clip(np.searchsorted(known, stamps[:, k] + offset), 1, len(known) - 1) for k in (0, 1))
+        first, last = (
+            np.clip((stamps[:, k] + offset - known[at - 1]) / step[at - 1], 0.0, 1.0) for k, at in ((0, before), (1, after))
+        )
+        across = (1 - first) ** 2 * step[before - 1] + known[after - 1] - known[before] + last**2 * step[after - 1]
+        found[i] = np.sqrt(np.where(before == after, (last - first) ** 2 * step[after - 1], across)).mean()
     return found
 
 

@@ -60,3 +60,13 @@ def test_a_clock_that_is_held_stays():
 def test_no_offset_beyond_the_largest_is_found():
     errors = errors_of(drive(clock=0.4), "calibration.max_clock=0.2")
     assert abs(clock_of(errors, clocks_of_turns(errors))) <= 0.2 + 1e-9
+
+
+def test_odometry_at_the_rate_of_the_images_does_not_look_better_midway():
+    """The turns are mostly noise, of which poses midway between two poses of the odometry have less."""
+    log, rng = drive(1, turns=0.1), np.random.default_rng(0)
+    stamps = np.arange(1.0, 59.0, 0.2)
+    walk = np.cumsum(rng.normal(scale=0.02, size=len(stamps)))
+    turned = make_pose(Rotation.from_rotvec(np.outer(walk, [0.0, 0.0, 1.0])).as_matrix(), np.zeros((len(stamps), 3)))
+    errors = errors_of(replace(log, odometry=Trajectory(stamps, log.odometry.poses[20:1180:4] @ turned)))
+    assert abs(clock_of(errors, clocks_of_turns(errors))) < 0.02
