@@ -224,6 +224,10 @@ class CalibratedMeasurements(Protocol):
     def take(self, keyframes: Keyframes, rays: Rays) -> Self:
         """Return the same errors for other keyframes and rays of the log."""
 
+    def with_rays(self, directions: Floats, ranges: Floats, values: Floats) -> Self:
+        """Return the same measurements with other directions (R, 3), unit, and ranges (R,), m, of the rays that `at` returns
+        at values (P,)."""
+
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same measurements with other noise."""
 

@@ -14,13 +14,20 @@ from objslam.core.geometry import inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.trajectory import poses_near
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
-from objslam.frontend.corrected_log import corrected_mount, later, lens_errors, refocused, take_out
+from objslam.frontend.corrected_log import corrected_mount, inverse_lens, later, lens_errors, refocused, take_out
 from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath
 from objslam.frontend.corrected_rays import corrected_poses, corrected_rays
 from objslam.frontend.localization.measured_poses import carried_variance
 from objslam.frontend.odometry_drift import DriftPath, scaled_noise
 from objslam.frontend.recent_values import RecentValues
-from objslam.frontend.surface_ranges import corrected_lengths, half_widths_of_rays, weights_of
+from objslam.frontend.surface_ranges import (
+    corrected_lengths,
+    half_widths_of_rays,
+    measured_ranges,
+    range_factors,
+    weights_of,
+)
+from objslam.frontend.unknown_noise import unknown_noise
 
 _STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
@@ -58,26 +65,8 @@ class SharedErrors:
 
     @property
     def unknown_noise(self) -> frozenset[str]:
-        """The kinds of noise that are estimated: those that the settings allow, if the log has their measurements.
-
-        The set is empty in fixed mode. Without odometry, only the noise of the localisation is estimated. How long its
-        errors last is estimated even if the settings say how large they are.
-        """
-        of, default = self.settings, Settings()
-        if of.mode != "joint":
-            return frozenset()
-        localized = {"localization"} if self.keyframes.localized_every and of.noise.localization is not False else set()
-        if self.keyframes.odom_T_base is None:
-            return frozenset(localized)
-        ranged = bool(np.isfinite(self.rays.range).any())
-        told = any(one.camera.depth_noise is not None for one in self.log.cameras)
-        kinds = {
-            "rays": (of.noise.rays, of.rays == default.rays, of.joint.factor == "bearing"),
-            "ranges": (of.noise.ranges, of.depth == default.depth and not told, ranged),
-            "odometry": (of.noise.odometry, of.odometry == default.odometry, True),
-        }
-        unknown = {k for k, (use, usual, there) in kinds.items() if there and (usual if use == "auto" else use)}
-        return frozenset(unknown | localized)
+        """The kinds of noise that are estimated, as `unknown_noise`."""
+        return unknown_noise(self.settings, self.log, self.keyframes, self.rays)
 
     @cached_property
     def unknown_scales(self) -> frozenset[str]:
@@ -103,8 +92,19 @@ class SharedErrors:
 
     def with_noise(self, noise: NoiseFactors) -> Self:
         """Return the same measurements with other noise. They share the kept poses, which do not depend on the noise."""
-        other = replace(self, noise=noise)
-        vars(other).update(_kept_poses=self._kept_poses, _kept_drift=self._kept_drift)
+        return self._sharing_poses(replace(self, noise=noise))
+
+    def with_rays(self, directions: Floats, ranges: Floats, values: Floats) -> Self:
+        """Return the same measurements with other directions (R, 3), unit, and ranges (R,), m, of the rays that `at` returns
+        at values (P,). They share the kept poses, which do not depend on the rays."""
+        error = dict(zip(self.names, values.tolist(), strict=True))
+        lens, factors = self._lens(error), range_factors(error, self._half) * (1 + self.noise.shrinkage)
+        if lens.any():
+            back = np.array([inverse_lens((focal, cx, cy)) for focal, cx, cy in lens.tolist()])
+            directions, _ = refocused(directions, back[self.keyframes.camera[self.rays.keyframe]])
+        rays = replace(self.rays, direction=directions, range=measured_ranges(error, ranges, directions, factors))
+        other = self._sharing_poses(replace(self, rays=rays))
+        vars(other).update(_half=self._half)
         return other
 
     def with_paths_of(self, other: Self) -> Self:
@@ -163,7 +163,7 @@ class SharedErrors:
         keyframes, rays = self.keyframes, self.noise.rays_with_noise(self.rays)
         settings, poses = self._scaled_noise(error), self._poses(error)
         base_T_camera, direction, sigma = poses.base_T_camera.copy(), rays.direction, rays.sigma
-        lens = np.array([lens_errors(error, name) for name in self.cameras])
+        lens = self._lens(error)
         if lens.any():
             direction, factors = refocused(direction, lens[keyframes.camera[rays.keyframe]])
             sigma = sigma * factors
@@ -229,7 +229,8 @@ class SharedErrors:
 
     def take(self, keyframes: Keyframes, rays: Rays) -> Self:
         """Return the same errors for other keyframes and rays of the log."""
-        return replace(self, keyframes=keyframes, rays=rays)
+        other = replace(self, keyframes=keyframes, rays=rays)
+        return self._sharing_poses(other) if keyframes is self.keyframes else other
 
     def drift_components(self, values: Floats) -> list[tuple[Keyframes, Settings]]:
         """Return four pairs of keyframes and settings, each with one component of the noise of motions.
@@ -250,6 +251,15 @@ class SharedErrors:
                 settings = settings.model_copy(update={"planar": flat})
             found.append((replace(keyframes, drift=path.gathered(stamps, settings.odometry)), settings))
         return found
+
+    def _sharing_poses(self, other: Self) -> Self:
+        """Return errors `other` of the same keyframes. They share the kept poses of these."""
+        vars(other).update(_kept_poses=self._kept_poses, _kept_drift=self._kept_drift)
+        return other
+
+    def _lens(self, error: Mapping[str, float]) -> Floats:
+        """The errors (C, 3) of the lenses of the cameras, as `lens_errors`."""
+        return np.array([lens_errors(error, name) for name in self.cameras])
 
     def _scaled_noise(self, error: Mapping[str, float]) -> Settings:
         """The settings with the estimated noise, scaled like the odometry's distances."""

@@ -68,12 +68,16 @@ class Multiframes:
         """Return the rays of images as the rays of the multiframes, in the frame of the first camera."""
         if len(self.first) == len(images):
             return rays
-        path_T_camera = _path(images) @ images.base_T_camera
-        first_T_camera = inverse(path_T_camera[self.first])[self.number] @ path_T_camera
-        own = self.first[self.number] == np.arange(len(images))
-        first_T_camera[own] = np.eye(4)  # With rounding errors, all rays would get an offset.
-        offset, direction = rays.in_map(first_T_camera)
+        offset, direction = rays.in_map(self.first_T_camera(images))
         return replace(rays, keyframe=self.number[rays.keyframe], direction=direction, offset=offset)
+
+    def first_T_camera(self, images: Keyframes) -> Floats:
+        """Return the poses (K, 4, 4) of the cameras of images in the frame of the first camera of their multiframe."""
+        path_T_camera = _path(images) @ images.base_T_camera
+        poses = inverse(path_T_camera[self.first])[self.number] @ path_T_camera
+        own = self.first[self.number] == np.arange(len(images))
+        poses[own] = np.eye(4)  # With rounding errors, all rays would get an offset.
+        return np.asarray(poses)
 
     def map_T_base(self, images: Keyframes, map_T_camera: Floats) -> Floats:
         """Return the base poses (K, 4, 4) at the images, from the poses (P, 4, 4) of the first camera of each multiframe."""

@@ -212,8 +212,8 @@ def test_the_errors_of_each_camera_of_a_rig_are_found(seed):
     off = found.values - np.array([true.get(name, 0.0) for name in found.names])
     clock = np.array([name.endswith(".clock") for name in found.names])
     # The images of a stamp share one pose, so the odometry between them counts as exact, and clocks follow its noise.
-    assert np.abs(off[clock]).max() < 0.07
-    assert (np.abs(off) < np.where(clock, 6, 4) * found.sigma).all(), dict(zip(found.names, off / found.sigma, strict=True))
+    assert np.abs(off[clock]).max() < 0.1
+    assert (np.abs(off) < 4 * found.sigma).all(), dict(zip(found.names, off / found.sigma, strict=True))
     at = {name: i for i, name in enumerate(found.names)}
     assert abs(off[at["left.yaw"]]) < 0.01
     assert abs(off[at["right.tilt"]]) < 0.01
@@ -222,3 +222,29 @@ def test_the_errors_of_each_camera_of_a_rig_are_found(seed):
         sigma = np.sqrt(apart @ found.covariance @ apart)
         assert abs(apart @ off) < 4 * sigma
         assert sigma < 0.25 * np.sqrt(apart @ errors.prior @ apart)
+
+
+def test_rays_across_a_rig_have_the_derivatives_by_its_clocks():
+    """The derivatives by clocks with the velocities of the solved path, against differences with an exact odometry."""
+    still = Odometry(**dict.fromkeys(("x_per_m", "y_per_m", "xy_per_rad", "yaw_per_m", "yaw_per_rad"), 0.0))
+    made, errors = rig_drive(depth=DepthNoise(), odometry=still, frames=600, false=0.0)
+    theta, every = np.zeros(len(errors.names)), np.ones(len(made.rays), dtype=bool)
+    joined = Multiframes.of(made.keyframes)
+    measured = Measurements.of(*errors.at(theta), joined)
+    first = (made.map_T_base @ made.keyframes.base_T_camera)[joined.first]
+    system = linearise(Linearised(measured, made.association, first, made.points, every), errors, theta)
+    assert system.clocks is not None
+    rays = slice(0, system.first_motion)
+    clocks = list(system.clocks.moved)
+    told, sides = system.by_path[rays], system.sides[rays][:, clocks]
+    assert (sides != 0).any(axis=0).all()
+    # The path has a velocity for two steps, and the differences one for 0.1 s. So they agree but for the acceleration.
+    for mine, other in zip(told.T, sides.T, strict=True):
+        assert mine @ other / np.linalg.norm(mine) / np.linalg.norm(other) > 0.98
+        assert np.linalg.norm(mine) == pytest.approx(np.linalg.norm(other), rel=0.05)
+    velocity, rng = np.random.default_rng(0).normal(size=(len(first), 6, 3)), np.random.default_rng(1)
+    residual = rng.normal(size=len(system.residual))
+    for k in clocks:
+        columns = np.zeros((len(residual), 3))
+        system.clocks.put(columns, k, velocity)
+        np.testing.assert_allclose(system.clocks.products(residual, k, velocity), residual @ columns, rtol=1e-9)

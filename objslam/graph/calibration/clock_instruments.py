@@ -10,15 +10,16 @@ from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, inverse, log_se3
 from objslam.graph.calibration.instruments import Motions, moment_of
 from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.rays_across import RaysAcross
 
 
 @dataclass(frozen=True)
 class ClockInstruments:
     """The instruments of clocks (see `instruments`), as a linear function of velocities of base at the K poses of a graph.
 
-    If a clock changes, a motion changes by the difference of the velocities at its two ends. The noise of measured
-    velocities is also in the residuals, so it would bias the clock. The velocities of the solved path do not correlate with
-    the residuals. So the instruments are made of these.
+    If a clock changes, a motion changes by the difference of the velocities at its two ends. In a multiframe, the rays of
+    one camera move against those of another. The noise of measured velocities is also in the residuals, so it would bias the
+    clock. The velocities of the solved path do not correlate with the residuals. So the instruments are made of these.
 
     All twists have the rotation first. Matrices (..., 6, 6) convert twists or velocities, which are twists per s.
 
@@ -28,7 +29,7 @@ class ClockInstruments:
     the first of these rows. before, after: (K,) the two poses from which the velocity at a pose is computed. along: (K, 6,
     6) from twists of `before` to twists of `after`. seconds: (K,) the time between the two, 0 without a measured motion.
     to_base: (K, 6, 6) from twists of the camera to twists of base. velocity: (K, 6) the velocities of base on the solved
-    path.
+    path. across: the rays of cameras that are not the first of their multiframe.
     """
 
     moved: Mapping[int, Bools]
@@ -43,9 +44,10 @@ class ClockInstruments:
     seconds: Floats
     to_base: Floats
     velocity: Floats
+    across: RaysAcross
 
     @classmethod
-    def of(cls, of: Linearised, moved: Mapping[int, Bools], motions: Motions | None) -> Self:
+    def of(cls, of: Linearised, moved: Mapping[int, Bools], motions: Motions | None, across: RaysAcross) -> Self:
         """Return the instruments of a graph with these motions."""
         keyframes, graph = of.measured.keyframes, of.graph
         path = of.map_T_camera @ inverse(keyframes.base_T_camera)
@@ -69,6 +71,7 @@ class ClockInstruments:
             seconds,
             adjoint(keyframes.base_T_camera),
             log_se3(moves) * rate[:, None],
+            across,
         )
 
     def put(self, instruments: Floats, clock: int, velocity: Floats) -> None:
@@ -79,6 +82,7 @@ class ClockInstruments:
         if len(self.absolute):
             rows = (self.absolute @ own).reshape(-1, own.shape[2])
             instruments[self.first : self.first + len(rows)] = -rows
+        self.across.put(instruments, clock, velocity)
 
     def products(self, residual: Floats, clock: int, velocity: Floats) -> Floats:
         """Return the products (n,) of residuals (M,) with the columns that `put` writes. The columns themselves are not
@@ -92,7 +96,7 @@ class ClockInstruments:
             last = self.first + 6 * len(self.absolute)
             pull = np.einsum("kji,kj->ki", self.absolute, residual[self.first : last].reshape(-1, 6))
             products -= np.einsum("ki,kin->n", pull, own)
-        return products
+        return products + np.einsum("ki,kin->n", self.across.pull(residual, clock, len(velocity)), velocity)
 
     def _own(self, clock: int, velocity: Floats) -> Floats:
         """Return the velocities (K, 6, n) of the poses that a clock moves, with 0 for all other poses."""

@@ -97,6 +97,9 @@ def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Flo
     short would weigh more, and bias the errors of the odometry. Hence the neighbours also predict the covariance for these
     errors. The prediction has limits (`_ALIKE`), because a motion between two stops differs from its neighbours. The
     derivatives by other errors do not point along the noise that changes the weight.
+
+    The odometry also moves the cameras of a multiframe against each other, if their clocks differ. These short motions are
+    mostly noise, and tell next to nothing about the odometry. So the instruments leave the rays out.
     """
     instruments = sides.copy()
     own = [k for k, name in enumerate(names) if name.startswith("odometry.")]
@@ -104,6 +107,7 @@ def motion_instruments(motions: Motions | None, names: Sequence[str], sides: Flo
         scaled = np.isin([names[k] for k in own], ODOMETRY_SCALES)
         twists = motions.twists(sides[:, own])
         twists[..., scaled] = motions.predicted(twists[..., scaled])
+        instruments[: motions.rows.start, own] = 0.0
         instruments[motions.rows, own] = motions.weighted(twists)
     return instruments
 

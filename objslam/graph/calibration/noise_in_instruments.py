@@ -45,7 +45,8 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     all ties end at about the same share of a step if the rates of images and odometry have a simple ratio. On simulated
     wheels that slip, with one pose in a second, this moved a clock by 0.09 s.
     """
-    names, clocks = errors.names, {} if system.clocks is None else system.clocks.moved
+    names, instruments = errors.names, system.clocks
+    clocks = {} if instruments is None else instruments.moved
     scales = {k: _AXES_OF[name] for k, name in enumerate(names) if name in _AXES_OF}
     motions, stamps, (before, after) = system.motions, of.measured.keyframes.stamps, of.graph.moves
     if motions is None or not (scales or clocks):
@@ -55,11 +56,14 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
     walks = _random_walks(errors.odometry_stamps)
     at = walks(stamps)
     walk = at[after] - at[before]
-    rates = {}
+    rates, at_poses = {}, {}
     for k, mine in clocks.items():
         step = errors.steps[k]
-        rate = mine[:, None] * (walks(stamps + step) - walks(stamps - step)) / (2 * step)
+        at_poses[k] = (walks(stamps + step) - walks(stamps - step)) / (2 * step)
+        rate = mine[:, None] * at_poses[k]
         rates[k] = rate[after] - rate[before]
+    of_pose = np.zeros((len(stamps), 6))
+    of_pose[before], of_pose[after] = sigma, sigma  # The noise around a pose is that of a motion at it.
     odometry = of.measured.keyframes.odom_T_base
     assert odometry is not None
     said = log_se3(inverse(odometry[before]) @ odometry[after]) / sigma
@@ -75,7 +79,13 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
 
         probes = np.zeros((len(system.residual), _PROBES * (1 + len(clocks))))
         probes[motions.rows] = rows(np.hstack([walk, *rates.values()]))
-        left = system.left(probes)[motions.rows]
+        for i, k in enumerate(rates):
+            velocity = np.zeros((len(stamps), 6, _PROBES))
+            velocity[:, axis] = -of_pose[:, axis, None] * at_poses[k]  # Opposite to the motions, as in the sides.
+            assert instruments is not None
+            instruments.across.put(probes[:, _PROBES * (1 + i) : _PROBES * (2 + i)], k, velocity)
+        of_all = system.left(probes)
+        left = of_all[motions.rows]
         along = rows(np.ones((len(sigma), 1)))
         fits = _energy(np.repeat(motions.by_odometry[:, axis], 6)[:, None] * along * residual) / max(
             _energy(along * left[:, :_PROBES]), 1e-12
@@ -88,7 +98,7 @@ def noise_shares(of: Linearised, system: LinearSystem, errors: CalibratedMeasure
                 noise[:, axis] = sigma[:, axis, None] * walk
                 told = motions.weighted(motions.predicted(noise))
                 products[k] += size * float((told * left[:, :_PROBES]).sum()) / _PROBES
-        of_clocks = (one[:, _PROBES:].reshape(len(left), len(rates), _PROBES) for one in (probes[motions.rows], left))
+        of_clocks = (one[:, _PROBES:].reshape(len(one), len(rates), _PROBES) for one in (probes, of_all))
         between += size * np.einsum("mip,mjp->ij", *of_clocks) / _PROBES
     sides = system.left(system.sides)
     shares = np.diag(products / np.maximum((sides**2).sum(axis=0), 1e-300))

@@ -18,7 +18,6 @@ from objslam.core.noise import NOMINAL, NoiseFactors
 from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.graph.assembly import Measurements
-from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.correlated_errors import correlation_factors
 from objslam.graph.calibration.information import covariance_of, likelihood, without_shrinking
 from objslam.graph.calibration.inner_solve import InnerSolve
@@ -27,6 +26,7 @@ from objslam.graph.calibration.noise_in_instruments import noise_shares
 from objslam.graph.calibration.prior_conflict import with_wider_priors
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem, ReducedSystem, linearise
 from objslam.graph.calibration.variance_components import estimate_noise
+from objslam.graph.least_squares.anderson import MEMORY, accelerated
 from objslam.graph.outlier_rejection import JointSolution, known_landmarks, misfit, reject_outliers
 
 _ROUNDS = 8

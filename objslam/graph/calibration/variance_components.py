@@ -16,13 +16,13 @@ from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import MOST_NOISE, NoiseFactors
 from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
-from objslam.graph.calibration.anderson import MEMORY, accelerated
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.factors.bearing import tangent_basis
 from objslam.graph.factors.odometry_motions import OdometryMotions
 from objslam.graph.factors.residual_algebra import whitening
+from objslam.graph.least_squares.anderson import MEMORY, accelerated
 from objslam.graph.least_squares.chain import ChainRows
 from objslam.graph.least_squares.normal_equations import Equations, factored
 
