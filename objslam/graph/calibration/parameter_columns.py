@@ -48,7 +48,8 @@ def parameter_columns(
         images, rays, settings = errors.at(theta, drift=False)
         return joined.keyframes(images), joined.rays(images, rays), settings
 
-    here = measured(theta)
+    images, rays, settings = errors.at(theta, drift=False)
+    here = joined.keyframes(images), joined.rays(images, rays), settings
     parts = _parts(of, here[0].base_T_camera, here[1].range)
     inputs, values = [part.inputs(*here) for part in parts], [part.measured(*here) for part in parts]
     residuals = [part.residuals(*value) if value else np.zeros(0) for part, value in zip(parts, values, strict=True)]
@@ -64,7 +65,6 @@ def parameter_columns(
                 before = residual if behind is None else part.residuals(*part.measured(*behind))
                 off = (part.residuals(*part.measured(*ahead)) - before).ravel()
                 result[part.first : part.first + len(off), k] = off / (2 * step if clock else step)
-    images, rays, _ = errors.at(theta, drift=False)
     clocks = {k: errors.cameras.index(errors.names[k].removesuffix(".clock")) for k in moved}
     return result, moved, RaysAcross.of(of, images, rays, clocks)
 

@@ -46,6 +46,8 @@ class RaysAcross:
         which = np.flatnonzero(first != image)
         pose, camera, of_first = joined.number[image[which]], images.camera[image[which]], images.camera[first[which]]
         sign = {k: (camera == one).astype(np.int64) - (of_first == one) for k, one in clocks.items()}
+        if not len(which):
+            return cls(pose, sign, np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3, 6)))
         ranged = np.full(len(image), -1)
         ranged[graph.ranged] = np.arange(len(graph.ranged))
         ranged = ranged[which]
