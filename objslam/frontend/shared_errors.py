@@ -38,6 +38,9 @@ _MOST_SIGMAS = 6.0
 """The bound of a parameter is the absolute value of its prior mean, plus this many standard deviations of its prior.
 MOST_SCALE bounds scales further. Clocks have their own bound. A larger value lets a parameter move farther from its
 prior."""
+_LEAST = 0.1
+"""The least measured range, as a share of the corrected range that it gives. With a larger share, more of the shortest
+ranges are longer than asked. Things that are farther than their offset of ranges never reach it."""
 _KEPT = 9
 """For how many values of the errors the poses of the keyframes are kept. A larger number takes more memory. A round of
 derivatives needs seven."""
@@ -96,14 +99,18 @@ class SharedErrors:
 
     def with_rays(self, directions: Floats, ranges: Floats, values: Floats) -> Self:
         """Return the same measurements with other directions (R, 3), unit, and ranges (R,), m, of the rays that `at` returns
-        at values (P,). They share the kept poses, which do not depend on the rays."""
+        at values (P,).
+
+        They share the kept poses, which do not depend on the rays. A range that an offset would make 0 or less stays
+        positive (`_LEAST`), so `at` returns a longer one there.
+        """
         error = dict(zip(self.names, values.tolist(), strict=True))
         lens, factors = self._lens(error), range_factors(error, self._half) * (1 + self.noise.shrinkage)
         if lens.any():
             back = np.array([inverse_lens((focal, cx, cy)) for focal, cx, cy in lens.tolist()])
             directions, _ = refocused(directions, back[self.keyframes.camera[self.rays.keyframe]])
-        rays = replace(self.rays, direction=directions, range=measured_ranges(error, ranges, directions, factors))
-        other = self._sharing_poses(replace(self, rays=rays))
+        measured = np.maximum(measured_ranges(error, ranges, directions, factors), _LEAST * ranges)
+        other = self._sharing_poses(replace(self, rays=replace(self.rays, direction=directions, range=measured)))
         vars(other).update(_half=self._half)
         return other
 
@@ -112,9 +119,8 @@ class SharedErrors:
         if self.log.odometry is not other.log.odometry:
             return self
         found = replace(self, _path=other._path)
-        if self.log is other.log and self.keyframes is other.keyframes and self.settings.poses == other.settings.poses:
-            vars(found).update(_kept_poses=other._kept_poses, _kept_drift=other._kept_drift)
-        return found
+        same = self.log is other.log and self.keyframes is other.keyframes and self.settings.poses == other.settings.poses
+        return other._sharing_poses(found) if same else found
 
     def with_unknown_noise(self) -> Self:
         """Return the same measurements with all kinds of noise unknown, whatever the settings say."""

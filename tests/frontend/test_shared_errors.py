@@ -362,3 +362,19 @@ def test_another_lens_does_not_fit_noise_better(lens, off):
     each = np.where(np.arange(len(true))[:, None] % 2 == 0, lens, 0.0)
     assert refocused(true, each)[1][1::2] == pytest.approx(1.0, abs=1e-12)
     np.testing.assert_allclose(refocused(true, each)[0][::2], moved[::2], rtol=1e-12)
+
+
+def test_rays_that_are_put_in_come_out_at_the_same_errors(clean):
+    """Also for a lens and ranges with errors. A range shorter than its offset stays above 0."""
+    _, _, errors = measured(clean)
+    values = vector(errors, {"front.focal": 0.03, "front.cx": -0.02, "range_scale": 0.04, "range_offset": 0.1})
+    rng, count = np.random.default_rng(0), len(errors.rays)
+    direction = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), np.ones(count)])
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    ranges = rng.uniform(0.5, 5.0, count)
+    _, rays, _ = errors.with_rays(direction, ranges, values).at(values)
+    assert_allclose(rays.direction, direction, atol=1e-12)
+    assert_allclose(rays.range, ranges, rtol=1e-12)
+    short = errors.with_rays(direction, np.full(count, 0.05), values)
+    assert (short.rays.range > 0).all()
+    assert (short.at(values)[1].range > 0).all()
