@@ -20,6 +20,11 @@ value, fewer pairs trade off."""
 
 SCALES = ("scale", "lateral_scale", "turn_scale", "range_scale", "tag_scale", "focal")
 """The kinds of parameters that are shares: the correction multiplies a measurement by 1 + the share."""
+AXES = ("roll", "tilt", "yaw")
+"""The rotations of a camera on the robot, about the axes x, y and z of base."""
+LENS = ("focal", "cx", "cy")
+"""The errors of a camera matrix. The focal length is too short by the share `focal`. The image centre is too far left by cx
+and too far up by cy, both as shares of the focal length."""
 OF_PLACES = ("tag_scale", "surface")
 """The parameters of a place, not of a robot. The calibration of a robot has none of them."""
 MOST_SCALE = 0.5

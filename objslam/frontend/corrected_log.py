@@ -7,17 +7,13 @@ from functools import lru_cache
 import numpy as np
 
 from objslam.core.arrays import Floats
+from objslam.core.calibration import AXES, LENS
 from objslam.core.geometry import lengths, make_pose
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.types import CameraLog, Images, Log, Trajectory
 from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.surface_ranges import corrected_ranges
 
-AXES = ("roll", "tilt", "yaw")
-"""The rotations of a camera on the robot, about the axes x, y and z of base."""
-LENS = ("focal", "cx", "cy")
-"""The errors of a camera matrix. The focal length is too short by the share `focal`. The image centre is too far left by cx
-and too far up by cy, both as shares of the focal length."""
 _SQUEEZED = 1e-3
 """A clock offset may move frames beyond an end of the path. They are placed within this time (s) of that end. A larger value
 moves more frames. With a smaller value, stamps of fast cameras become equal, because float64 resolves Unix time to 0.2

@@ -10,10 +10,11 @@ from functools import partial
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.calibration import AXES, LENS
 from objslam.core.rotation import rotation_from_vector
 from objslam.core.trajectory import poses_near
 from objslam.core.types import Keyframes, Log, Rays
-from objslam.frontend.corrected_log import AXES, LENS, refocused
+from objslam.frontend.corrected_log import refocused
 from objslam.frontend.localization.measured_poses import carried_by_odometry
 
 PLACE = ("x", "y", "z")

@@ -9,12 +9,12 @@ import numpy as np
 
 from objslam.config import Settings
 from objslam.core.arrays import Floats
-from objslam.core.calibration import Calibration, kind
+from objslam.core.calibration import AXES, LENS, Calibration, kind
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import is_planar
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.errors import ConfigError
-from objslam.frontend.corrected_log import AXES, LENS, take_out
+from objslam.frontend.corrected_log import take_out
 from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath
 from objslam.frontend.recent_values import ValuesOfObjects
 from objslam.frontend.shared_errors import SharedErrors

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.core.calibration import CalibratedMeasurements, Calibration, kind
+from objslam.core.calibration import AXES, LENS, CalibratedMeasurements, Calibration, kind
 from objslam.core.geometry import lengths
 from objslam.core.rotation import cross
 from objslam.core.types import Association
@@ -179,15 +179,18 @@ def linearise_points(
     """
     target = points[owner]
 
-    def misses(values: Floats) -> _Misses:
-        origins, directions, sigma = (part[:, held] for part in errors.rays_in_map(values))
+    def misses(values: Floats, of: CalibratedMeasurements = errors) -> _Misses:
+        origins, directions, sigma = (part[:, held] for part in of.rays_in_map(values))
         return _Misses.of(origins, directions, target, np.hypot(sigma, noise[0]), noise[1])
 
     here = misses(theta[None])
     e, by_point = here.deviation[0], here.by_point(trusted)[0]
     weight = 1 / (1 + (np.linalg.norm(e, axis=1) / _CAUCHY) ** 2)
     camera = errors.keyframes.camera[errors.rays.keyframe[held]]
-    by_error = _slopes(lambda values: misses(values).deviation, errors, theta, camera)
+    expected = _with_directions(errors, theta, held, here.expected[0])
+    by_error = _slopes(
+        lambda values: misses(values).deviation, lambda values: misses(values, expected).deviation, errors, theta, camera
+    )
     n, p = len(points), len(theta)
     # All rows of a point lie together, so that each sum over its rays is one product of matrices.
     order, root = np.argsort(owner, kind="stable"), np.sqrt(weight)[:, None, None]
@@ -223,22 +226,48 @@ def _dependence(system: PointSystem, keyframe: Ints, prior: Floats) -> float:
     return max(1.0, float(((sums**2).sum(axis=0)[told] / np.diagonal(system.matrix)[told]).max()))
 
 
-def _slopes(residual: Callable[[Floats], Floats], errors: CalibratedMeasurements, theta: Floats, camera: Ints) -> Floats:
+def _with_directions(
+    errors: CalibratedMeasurements, theta: Floats, held: Bools, map_direction: Floats
+) -> CalibratedMeasurements:
+    """Return the measurements whose rays `held` (R,) have unit directions (n, 3) in map at errors (P,)."""
+    rays, direction = errors.rays, errors.rays.direction.copy()
+    keyframes, corrected, _ = errors.at(theta, drift=False)
+    turns = keyframes.map_T_camera[rays.keyframe[held], :3, :3]
+    direction[held] = np.einsum("rji,rj->ri", turns, map_direction)
+    return errors.with_rays(direction, corrected.range, theta)
+
+
+def _slopes(
+    measured: Callable[[Floats], Floats],
+    expected: Callable[[Floats], Floats],
+    errors: CalibratedMeasurements,
+    theta: Floats,
+    camera: Ints,
+) -> Floats:
     """Return the derivatives (n, 2, P) of the residuals by the errors, as central differences.
 
     An error of a camera moves no ray of another camera. So the errors of one kind are moved at once for all cameras
-    (Curtis, Powell and Reid 1974), and each ray shows the error of its own camera. residual: returns the residuals (M, n, 2)
-    at M values (M, P). camera: (n,) the camera of each ray.
+    (Curtis, Powell and Reid 1974), and each ray shows the error of its own camera.
+
+    How much a lens or a rotation of the camera turns a ray depends on where the ray lies in the image. At the measured rays,
+    these derivatives would contain the noise of the residuals, and their product would bias the errors (errors in
+    variables; Fuller 1987). So they are taken at the expected rays.
+
+    measured, expected: return the residuals (M, n, 2) at M values (M, P), of the rays as measured and as expected. camera:
+    (n,) the camera of each ray.
     """
     groups, owner = _moved_together(errors.names, errors.cameras)
-    moves = np.array([np.isin(np.arange(len(theta)), group) for group in groups]).reshape(-1, len(theta)) * errors.steps
     slopes = np.zeros((len(camera), 2, len(theta)))
-    for some in _batches(len(groups), len(errors.rays)):
-        ends = residual(theta + np.concatenate([moves[some], -moves[some]]))
-        for number, change in zip(some.tolist(), ends[: len(some)] - ends[len(some) :], strict=True):
-            for k in groups[number]:
-                mine = slice(None) if owner[k] is None else camera == owner[k]
-                slopes[mine, :, k] = change[mine] / (2 * errors.steps[k])
+    turns = np.array([kind(errors.names[group[0]]) in (*LENS, *AXES) for group in groups], dtype=bool)
+    for some, residuals in ((np.flatnonzero(~turns), measured), (np.flatnonzero(turns), expected)):
+        for batch in _batches(len(some), len(errors.rays)) if len(some) else ():
+            moved = [groups[number] for number in some[batch].tolist()]
+            moves = np.array([np.isin(np.arange(len(theta)), group) for group in moved]) * errors.steps
+            ends = residuals(theta + np.concatenate([moves, -moves]))
+            for group, change in zip(moved, ends[: len(moved)] - ends[len(moved) :], strict=True):
+                for k in group:
+                    mine = slice(None) if owner[k] is None else camera == owner[k]
+                    slopes[mine, :, k] = change[mine] / (2 * errors.steps[k])
     return slopes
 
 
@@ -282,6 +311,14 @@ class _Misses:
         basis = np.stack([level, cross(directions, level)], axis=-2)
         sigma = np.hypot(angle, place / distance)
         return cls(np.einsum("mnki,mni->mnk", basis, to) / sigma[..., None], basis, to, distance, angle, sigma)
+
+    @property
+    def expected(self) -> Floats:
+        """(M, n, 3) the unit directions of the rays without their own noise: turned towards the points by the share of the
+        misses that the noise of directions has. The noise of origins has the rest."""
+        turned = self.deviation * self.sigma[..., None] * (self.angle / self.sigma)[..., None] ** 2
+        direction = cross(self.basis[..., 0, :], self.basis[..., 1, :]) + np.einsum("mnk,mnki->mni", turned, self.basis)
+        return np.asarray(direction / lengths(direction)[..., None])
 
     def by_point(self, trusted: bool) -> Floats:
         """Return the derivatives (M, n, 2, 3) of the deviations by the points.

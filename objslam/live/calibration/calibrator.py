@@ -10,9 +10,8 @@ import numpy as np
 
 from objslam.config import Noise, Settings
 from objslam.core.arrays import Floats
-from objslam.core.calibration import OBSERVABLE, Calibration, kind
+from objslam.core.calibration import LENS, OBSERVABLE, Calibration, kind
 from objslam.core.noise import NoiseFactors
-from objslam.frontend.corrected_log import LENS
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.live.calibration.collected import collect
 from objslam.live.calibration.recalibration import recalibrate
