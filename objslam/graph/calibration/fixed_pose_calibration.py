@@ -181,7 +181,7 @@ def linearise_points(
 
     def misses(values: Floats, of: CalibratedMeasurements = errors) -> _Misses:
         origins, directions, sigma = (part[:, held] for part in of.rays_in_map(values))
-        return _Misses.of(origins, directions, target, np.hypot(sigma, noise[0]), noise[1])
+        return _Misses.of(origins, directions, target, sigma, noise)
 
     here = misses(theta[None])
     e, by_point = here.deviation[0], here.by_point(trusted)[0]
@@ -290,33 +290,36 @@ class _Misses:
 
     All arrays have a first axis for M values of the errors. deviation: (M, n, 2) the angles between rays and points, in
     standard deviations, along the axes `basis` (M, n, 2, 3). to: (M, n, 3) the unit vectors to the points. distance: (M, n)
-    m. angle: (M, n) rad, the noise of directions. sigma: (M, n) rad, the noise of misses.
+    m. box: (M, n) rad, the noise of the box. angle: (M, n) rad, the noise of directions, which the heading of the pose has
+    too. sigma: (M, n) rad, the noise of misses.
     """
 
     deviation: Floats
     basis: Floats
     to: Floats
     distance: Floats
+    box: Floats
     angle: Floats
     sigma: Floats
 
     @classmethod
-    def of(cls, origins: Floats, directions: Floats, target: Floats, angle: Floats, place: float) -> Self:
-        """Measure rays (M, n, 3) against points `target` (n, 3). place: m, the noise of origins."""
+    def of(cls, origins: Floats, directions: Floats, target: Floats, box: Floats, noise: Noise) -> Self:
+        """Measure rays (M, n, 3) against points `target` (n, 3). box: (M, n) rad, their own noise. noise: of the poses."""
         to = target - origins
         distance = np.maximum(lengths(to), 1e-3)
         to = to / distance[..., None]
         level = np.stack([-directions[..., 1], directions[..., 0], np.zeros(distance.shape)], axis=-1)
         level /= np.maximum(lengths(level), 1e-6)[..., None]
         basis = np.stack([level, cross(directions, level)], axis=-2)
-        sigma = np.hypot(angle, place / distance)
-        return cls(np.einsum("mnki,mni->mnk", basis, to) / sigma[..., None], basis, to, distance, angle, sigma)
+        angle = np.hypot(box, noise[0])
+        sigma = np.hypot(angle, noise[1] / distance)
+        return cls(np.einsum("mnki,mni->mnk", basis, to) / sigma[..., None], basis, to, distance, box, angle, sigma)
 
     @property
     def expected(self) -> Floats:
-        """(M, n, 3) the unit directions of the rays without their own noise: turned towards the points by the share of the
-        misses that the noise of directions has. The noise of origins has the rest."""
-        turned = self.deviation * self.sigma[..., None] * (self.angle / self.sigma)[..., None] ** 2
+        """(M, n, 3) the unit directions of the rays without their own noise. They are turned towards the points by its share
+        of the misses. The noise of poses has the rest, and does not move a ray in its image."""
+        turned = self.deviation * self.sigma[..., None] * (self.box / self.sigma)[..., None] ** 2
         direction = cross(self.basis[..., 0, :], self.basis[..., 1, :]) + np.einsum("mnk,mnki->mni", turned, self.basis)
         return np.asarray(direction / lengths(direction)[..., None])
 
