@@ -38,6 +38,7 @@ def doctor(
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.boxes.robot_parts import without_robot_parts
     from objslam.frontend.known_errors import take_out_expected
+    from objslam.mapping.checks.assessment import lost_input, malformed_frames
     from objslam.mapping.checks.diagnosis import diagnose
     from objslam.mapping.fixed.sparse_noise import with_sparse_noise
     from objslam.mapping.ground.uneven_ground import with_uneven_ground
@@ -61,7 +62,9 @@ def doctor(
     for finding in wrong:
         say(f"wrong: {finding['message']}")
     # The boxes show whether a calibration is right. Without enough boxes, only its unusual properties can be shown.
-    doubts = [] if found.trials else [doubt for c in given.cameras for doubt in doubts_of(c.camera)]
+    frames = sum(len(c.detections.frame_stamps) for c in given.cameras if c.detections is not None)
+    doubts = lost_input(ledger.unused, malformed_frames(ledger.dropped), frames)
+    doubts += [] if found.trials else [doubt for c in given.cameras for doubt in doubts_of(c.camera)]
     for doubt in doubts:
         say(f"check: {doubt}")
     if not wrong and not doubts:

@@ -19,12 +19,13 @@ def is_drop(line: str) -> bool:
 @dataclass
 class Ledger:
     """The dropped data by reason, and warnings of one line each. For each reason: the count, the first places, and the
-    number of data that were checked, if known."""
+    number of data that were checked, if known. unused: the paths of the robot in the log that a run does without."""
 
     dropped: dict[str, int] = field(default_factory=dict)
     totals: dict[str, int] = field(default_factory=dict)
     examples: dict[str, list[str]] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)
 
     def drop(self, reason: str, count: int = 1, where: str | None = None, of: int | None = None) -> None:
         """Count dropped data under a reason.
@@ -51,22 +52,27 @@ class Ledger:
         else:
             self.drop(f"warnings beyond the first {_MOST_WARNINGS}", where=message)
 
+    def do_without(self, name: str, reason: object) -> None:
+        """Count a path of the robot as unused, and warn of the reason."""
+        self.unused.append(one_line(name))
+        self.warn(f"{reason}: left out")
+
     def add(self, other: Ledger) -> None:
         """Add the counts and warnings of another ledger, with the first example of each reason."""
         for reason, count in other.dropped.items():
             self.drop(reason, count, next(iter(other.examples.get(reason, [])), None), other.totals.get(reason))
         for message in other.warnings:
             self.warn(message)
+        self.unused.extend(other.unused)
 
     def copy(self) -> Ledger:
         """Return a ledger with the same entries."""
-        return Ledger(
-            dict(self.dropped), dict(self.totals), {k: list(v) for k, v in self.examples.items()}, list(self.warnings)
-        )
+        examples = {reason: list(places) for reason, places in self.examples.items()}
+        return Ledger(dict(self.dropped), dict(self.totals), examples, list(self.warnings), list(self.unused))
 
     def restore(self, earlier: Ledger) -> None:
         """Replace all entries by the entries of an earlier copy."""
-        self.dropped, self.totals, self.examples, self.warnings = vars(earlier.copy()).values()
+        self.dropped, self.totals, self.examples, self.warnings, self.unused = vars(earlier.copy()).values()
 
     def lines(self) -> list[str]:
         """Return each drop and then each warning as one line of text, as the terminal and summary.json show them."""

@@ -202,6 +202,10 @@ def is_date(stamp: float) -> bool:
     return 1e8 < stamp < _LAST_DATE
 
 
+NO_LABEL = ""
+"""The label of a box without a usable one. It is not a name, so the box is invalid."""
+
+
 def is_name(value: object) -> bool:
     """Return whether a value is a printable text on one line that is not blank."""
     return isinstance(value, str) and value.isprintable() and bool(value.strip())
@@ -219,7 +223,7 @@ def box_rules(boxes: Floats, scores: Floats, names: Bools) -> tuple[tuple[Bools,
         (np.asarray((np.abs(boxes) < MAX_PIXEL).all(axis=1)), "box with a corner that is not finite or too large"),
         (area, NO_AREA),
         ((scores >= 0) & (scores <= 1), "box with a score outside 0 to 1"),
-        (names, "box with a label that is empty or not printable"),
+        (names, "box with a label that is no printable text"),
     )
 
 

@@ -18,7 +18,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import pose_from_quaternion, quaternion
 from objslam.core.validity import MAX_SIDE, camera_fault, lengths, valid_positions
 from objslam.errors import LogError
-from objslam.io.text import read_bytes
+from objslam.io.text import misspelt, read_bytes
 
 _CAMERAS = "cameras"
 _AHEAD = "rotation_xyzw: [-0.5, 0.5, -0.5, 0.5]"
@@ -28,6 +28,13 @@ _FORMS = {
     "rotation_xyzw": f"{_AHEAD} for a camera that looks straight ahead",
 }
 """The right form of keys that people often write in another way."""
+_KEYS = frozenset(
+    (
+        *("camera_name", "image_width", "image_height", "camera_matrix", "distortion_model", "distortion_coefficients"),
+        *("base_T_camera", "depth_scale", "depth_noise", "sees_size", "rectification_matrix", "projection_matrix"),
+    )
+)
+"""The keys of a camera. Files of ROS have the last two, which are not read."""
 _Mapping = dict[str, yaml.Node]
 
 
@@ -99,6 +106,8 @@ def _only_mount(keys: _Mapping) -> bool:
 def _read(
     path: Path, top: _Mapping, ledger: Ledger, name: str | None = None, placed: bool = False, depth_scale: float = 1000.0
 ) -> Calibration:
+    for key, meant in misspelt(top, _KEYS).items():
+        ledger.warn(f"{path}: the key {key} is not known, and is not read (did you mean {meant}?)")
     width, height = _size(path, top, "image_width"), _size(path, top, "image_height")
     matrix = _matrix(path, _get(path, top, "camera_matrix"))
     if abs(matrix[0, 1]) > 1e-6 * matrix[0, 0]:

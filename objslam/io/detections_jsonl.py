@@ -12,10 +12,14 @@ import numpy as np
 from objslam.core.appearance.features import short_numbers
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import MAX_BOXES, Detections
+from objslam.core.validity import NO_LABEL
 from objslam.errors import LogError
 from objslam.io.box_collector import BoxCollector
-from objslam.io.text import in_order, read_lines, require_order
+from objslam.io.text import in_order, misspelt, read_lines, require_order
 
+MALFORMED = "detection frame malformed: "
+"""The begin of the reason to drop a frame that is malformed."""
+_KEYS = frozenset(("stamp", "boxes", "labels", "scores", "depths", "track_ids", "corners", "features", "whole"))
 _EXAMPLE = 'a line is {"stamp": 12.5, "boxes": [[x1, y1, x2, y2]], "labels": ["cup"], "scores": [0.9]}'
 
 
@@ -26,21 +30,28 @@ class Malformed(ValueError):
 def read_detections(path: Path, ledger: Ledger) -> Detections:
     """Read a detections file. Boxes are in px of the raw image, timestamps in s, and depths z along the optical axis in m.
 
-    Malformed lines, frames out of time order and invalid boxes are dropped and counted. Raises LogError if no frame is left.
+    Malformed lines, frames out of time order and invalid boxes are dropped and counted. A key that is probably misspelt is a
+    warning. Raises LogError if no frame is left.
     """
     collector = BoxCollector()
     lines = read_lines(path, ledger)
     if lines and lines[0][1].strip() == "[":  # Else its last frame, which no comma follows, would be the whole log.
         hint = "write one frame a line, without brackets around them and commas between them"
         raise LogError("the file is one JSON list", where=str(path), hint=hint)
-    whole, reasons = True, Counter[str]()
+    whole, reasons, keys = True, Counter[str](), set[str]()
     for number, text in lines:
         place = f"{path}:{number}"
         try:
-            whole &= add_frame(parse_object(text), place, collector)
+            frame = parse_object(text)
+            keys |= frame.keys()
+            whole &= add_frame(frame, place, collector)
         except Malformed as malformed:
-            ledger.drop(f"detection frame malformed: {malformed}", where=place)
+            ledger.drop(f"{MALFORMED}{malformed}", where=place)
             reasons[str(malformed)] += 1
+    for reason in reasons:
+        ledger.drop(f"{MALFORMED}{reason}", 0, of=len(lines))
+    for key, meant in misspelt(sorted(keys), _KEYS).items():
+        ledger.warn(f"{path}: the key {key!r} is not known, and is not read (did you mean {meant!r}?)")
     if not collector.stamps:
         if not lines:
             hint = "remove this file, and run a detector on rgb.txt (--detector)"
@@ -99,7 +110,10 @@ def read_stamp(message: dict[str, Any]) -> float:
 
 def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> bool:
     """Add a frame with its boxes. Return its key "whole": True if the image edge cuts no box off.
-    Raises Malformed if the frame is invalid."""
+
+    A label may be an integer, as detectors number their classes. A box with another label that is no text is invalid.
+    Raises Malformed if the frame is invalid.
+    """
     stamp = read_stamp(frame)
     boxes = _list(frame, "boxes")
     if len(boxes) > MAX_BOXES:
@@ -107,14 +121,13 @@ def add_frame(frame: dict[str, Any], place: str, collector: BoxCollector) -> boo
     if any(type(box) is not list for box in boxes):
         raise Malformed("boxes must hold lists x1, y1, x2, y2")
     boxes = [read_numbers(box, "a box") for box in boxes]
-    labels, scores = _list(frame, "labels"), read_numbers(_list(frame, "scores"), "scores")
+    labels = [str(label) if type(label) in (str, int) else NO_LABEL for label in _list(frame, "labels")]
+    scores = read_numbers(_list(frame, "scores"), "scores")
     unknown = [None] * len(boxes)
     depths = [_depth(depth) for depth in _list(frame, "depths", unknown)]
     track_ids = [_track_id(track_id) for track_id in _list(frame, "track_ids", unknown)]
     corners = [_corners(four) for four in _list(frame, "corners", unknown)]
     features = [_features(vector) for vector in _list(frame, "features", unknown)]
-    if any(type(label) is not str for label in labels):
-        raise Malformed("a label is not a string")
     if any(len(box) != 4 for box in boxes):
         raise Malformed("a box is not 4 numbers")
     if not len(boxes) == len(labels) == len(scores) == len(depths) == len(track_ids):

@@ -4,9 +4,10 @@ import gzip
 import io
 import stat
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 
@@ -22,6 +23,9 @@ A larger value also rejects files of a robot whose clock was set back."""
 _PLACES = 3
 """The most places (file:line) of dropped rows that the ledger gets for a reason. A larger number gives more examples."""
 _SHOWN = 80  # The most characters of a line that a message shows. A larger number makes the message longer.
+_CLOSE = 0.75
+"""The least similarity, from 0 to 1, of a name to the name that is meant. A larger number finds fewer misspelt names, and a
+smaller one takes names of other programs for misspelt ones."""
 _MAX_UNPACKED = 1 << 30  # The largest size of an unpacked file, bytes. A day of poses at 200 Hz is smaller.
 
 
@@ -186,3 +190,15 @@ def in_order(stamps: Floats, repeats: bool = False) -> Bools:
     alone[:-2] = (before[:-2] < stamps[1:-1]) & (stamps[1:-1] < stamps[2:]) & (stamps[2:] < stamps[:-2])
     latest = np.concatenate([[-np.inf], np.maximum.accumulate(np.where(alone, -np.inf, stamps))])[:-1]
     return ~alone & ((stamps >= latest) if repeats else (stamps > latest))
+
+
+def misspelt(given: Iterable[str], names: Collection[str]) -> dict[str, str]:
+    """Return the given names that are probably misspelt, with the name that is meant.
+
+    Nothing reads such a file, for example localisation.txt, or such a key. names: all names that are read. A name that is
+    given is not the meaning of another one.
+    """
+    given = list(dict.fromkeys(given))
+    absent = [name for name in names if name not in given]
+    meant = {name: get_close_matches(name, absent, 1, _CLOSE) for name in given if name not in names}
+    return {name: close[0] for name, close in meant.items() if close}

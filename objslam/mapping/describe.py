@@ -50,7 +50,7 @@ def make_result(
         origins=origins,
         directions=directions,
         residual=residual,
-        weight=estimate.weight,
+        weight=counted_weights(solution.association, estimate.weight),
         trace=solution.trace,
         calibration=estimate.calibration,
         summary={**summary, **judged},
@@ -58,6 +58,18 @@ def make_result(
         **more,
     )
     return with_doubts(result)
+
+
+def counted_weights(association: Association, weight: Floats) -> Floats:
+    """Return the weights (R,) of rays, where only a ray that misses its object has the weight 0.
+
+    A solve also gives the weight 0 to all rays of an object that it cannot place, for example without parallax. Such rays
+    miss nothing, so they have the weight 1 here.
+    """
+    held = association.object >= 0
+    some = np.bincount(association.object[held & (weight > 0)], minlength=association.count) > 0
+    outside = held & ~np.append(some, True)[association.object]
+    return np.where(outside, 1.0, weight)
 
 
 def describe(
@@ -181,6 +193,7 @@ def summarise(
     one height, roll and pitch. `up` is the axis of the map that points up, for example "z".
     """
     estimate, rays = solution.estimate, solution.rays
+    weight = counted_weights(solution.association, estimate.weight)
     unexplained = rays.label[solution.association.object < 0]
     total, left = (np.bincount(labels, minlength=len(rays.label_names)) for labels in (rays.label, unexplained))
     return {
@@ -194,7 +207,7 @@ def summarise(
             **counts,
             "keyframes": len(solution.keyframes),
             "rays": len(rays),
-            "rays_rejected": int((estimate.weight[solution.association.object >= 0] == 0).sum()),
+            "rays_rejected": int(((weight == 0) & (solution.association.object >= 0)).sum()),
             "rays_unexplained": len(unexplained),
             "objects": len(objects),
             "unresolved": len(objects) - len(objects.resolved()),
@@ -213,6 +226,7 @@ def summarise(
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),
         "noise": None if estimate.noise is None else estimate.noise.to_dict(),
         "box_offset": None if estimate.box_offset is None else round(estimate.box_offset, 4),
+        "unused_paths": list(ledger.unused),
         "dropped": dict(ledger.dropped),
         "dropped_examples": {k: v for k, v in ledger.examples.items() if v},
         "cost_before": estimate.cost_before,

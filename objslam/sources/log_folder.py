@@ -17,7 +17,7 @@ from objslam.io.detections_jsonl import read_detections, write_detections
 from objslam.io.folders import OLD, no_empty_folders, remove_leftovers, temporary_name
 from objslam.io.image_list import read_images, write_images
 from objslam.io.objects_json import dump_truth_objects, read_truth_objects
-from objslam.io.text import reading
+from objslam.io.text import misspelt, reading
 from objslam.io.tum_trajectory import read_trajectory, write_trajectory
 from objslam.sources.no_camera import NoCamera
 
@@ -25,6 +25,7 @@ CAMERA, CAMERAS, MOUNT = "camera.yaml", "cameras", "camera_poses.txt"
 ODOMETRY, LOCALIZATION = "odometry.txt", "localization.txt"
 MOUNTS = "mounts.yaml"  # The file of base_T_camera from tf, for a recording whose cameras have no calibration.
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
+_FILES = (CAMERA, MOUNT, ODOMETRY, LOCALIZATION, f"{RGB}.txt", f"{DEPTH}.txt", DETECTIONS)
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 
 _T = TypeVar("_T")
@@ -45,13 +46,16 @@ def read_log_folder(path: Path, ledger: Ledger) -> Log:
     """Read a log folder.
 
     Malformed lines are dropped, and counted with their file and line. Unusable lists of images and unusable ground truth are
-    left out with a warning. If only one of odometry and localisation is usable, the other is left out with a warning. Images
-    are not opened. Raises LogError if a camera, its detections or its mount is unusable, or if no path is usable.
+    left out with a warning. If only one of odometry and localisation is usable, the other is left out with a warning. A file
+    whose name is probably misspelt is a warning. Images are not opened. Raises LogError if a camera, its detections or its
+    mount is unusable, or if no path is usable.
     """
     with reading(path):
         if not path.is_dir():
             raise LogError("not a folder" if path.exists() else "no such folder", where=str(path))
         cameras, paths = _read_cameras(path, ledger), _read_paths(path, ledger)
+        for folder in (path, *sorted((path / CAMERAS).glob("*/"))):
+            _check_names(folder, ledger)
         return Log(path.resolve().name, cameras, *paths, read_truth(path / TRUTH, ledger))
 
 
@@ -189,15 +193,21 @@ def _read_camera_log(folder: Path, name: str | None, ledger: Ledger) -> CameraLo
     )
 
 
+def _check_names(folder: Path, ledger: Ledger) -> None:
+    files = sorted(file.name for file in folder.iterdir() if file.is_file() and not file.name.startswith("."))
+    for name, meant in misspelt(files, _FILES).items():
+        ledger.warn(f"{folder / name}: no file of a log has this name, so it is not read (did you mean {meant}?)")
+
+
 def _read_paths(path: Path, ledger: Ledger) -> tuple[Trajectory | None, Trajectory | None]:
     paths: dict[str, Trajectory] = {}
-    refused = []
+    refused: dict[str, LogError] = {}
     for name in (ODOMETRY, LOCALIZATION):
         try:
             if (path / name).exists():
                 paths[name] = read_trajectory(path / name, ledger)
         except LogError as error:
-            refused.append(error)
+            refused[name] = error
     if not paths and not refused:
         other = [
             (file.name, name) for name in (ODOMETRY, LOCALIZATION) for file in sorted(path.glob(f"{Path(name).stem}.*"))
@@ -205,9 +215,9 @@ def _read_paths(path: Path, ledger: Ledger) -> tuple[Trajectory | None, Trajecto
         hint = "; ".join(f"found {found}: rename it to {name}" for found, name in other) or "add one of the two"
         raise LogError(f"the log has neither {ODOMETRY} nor {LOCALIZATION}", where=str(path), hint=hint)
     if not paths:
-        raise refused[0]
-    for reason in refused:
-        ledger.warn(f"{reason}: left out")
+        raise next(iter(refused.values()))
+    for name, reason in refused.items():
+        ledger.do_without(name, reason)
     return paths.get(ODOMETRY), paths.get(LOCALIZATION)
 
 

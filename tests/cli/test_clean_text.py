@@ -121,7 +121,7 @@ def test_run(objslam: Callable[..., tuple[str, str]], log: Path, tmp_path: Path)
     said, warned = objslam("run", log, "-o", folder, *least, *QUICK)
     assert r"wrote " in said
     assert r"[/red]\x1b[2J=out" in said
-    assert "label that is empty or not printable" in warned
+    assert "label that is no printable text" in warned
     objslam("report", folder)
     objslam("export", folder, "--to", "csv")
 

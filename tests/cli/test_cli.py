@@ -439,8 +439,8 @@ def with_an_unknown_lens(folder):
     file.write_text(file.read_text().replace("plumb_bob", "tilted"))
 
 
-def with_every_label_a_number(folder):
-    rewrite_frames(folder, lambda i, frame: {**frame, "labels": [7] * len(frame["labels"])})
+def with_every_label_a_list(folder):
+    rewrite_frames(folder, lambda i, frame: {**frame, "labels": [["cup"]] * len(frame["labels"])})
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -457,7 +457,7 @@ def with_every_label_a_number(folder):
         (with_half_a_camera, ("camera.yaml", "image_height is missing")),
         (with_a_camera_that_is_no_yaml, ("camera.yaml:", "not YAML")),
         (with_an_unknown_lens, ("camera.yaml:", "tilted", "plumb_bob")),
-        (with_every_label_a_number, ("detections.jsonl", "none of its 80 lines")),
+        (with_every_label_a_list, ("no box gives a usable ray", "no printable text")),
     ],
 )
 def test_a_log_that_cannot_be_mapped(objslam, variant, tmp_path, mode, spoil, words):
@@ -484,7 +484,7 @@ def with_stamps_going_back(folder):
 
 
 def with_labels_of_unknown_type(folder):
-    odd = {3: 5, 6: None, 7: ["cup"], 9: {"name": "cup"}}
+    odd = {3: 5.5, 6: None, 7: ["cup"], 9: {"name": "cup"}}
     rewrite_frames(folder, lambda i, frame: {**frame, "labels": [odd[i]] * len(frame["labels"])} if i in odd else frame)
 
 
@@ -514,7 +514,7 @@ def with_boxes_that_are_none(folder):
     [
         (with_a_few_nan_poses, ("pose line with a value that is not finite", "odometry.txt:21")),
         (with_stamps_going_back, ("stamp that repeats or goes back", "odometry.txt:61", "detections.jsonl:31")),
-        (with_labels_of_unknown_type, ("a label is not a string", "detections.jsonl:4")),
+        (with_labels_of_unknown_type, ("label that is no printable text", "detections.jsonl:4")),
         (with_a_path_that_begins_late, ("before or after the localisation", f"stamp {START:.3f}")),
         (with_boxes_that_are_none, ("detections.jsonl:5", "detections.jsonl:6")),
     ],
@@ -1028,6 +1028,20 @@ def test_doctor_names_what_is_wrong_and_leaves_the_log_alone(objslam, tmp_path):
     assert re.search(r"with base_T_camera inverted, \d+ % of the boxes fit instead of \d+ %", wrong.out)
     assert "the log as it is" in wrong.out
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+def test_a_path_that_cannot_be_used_and_malformed_frames_are_no_good_input(objslam, variant, tmp_path):
+    """The map is in another frame then, or lacks things, so neither a run nor doctor may call all good."""
+    rewrite_frames(variant, lambda i, frame: {**frame, "scores": 1} if i % 3 == 0 else frame)
+    (variant / "localization.txt").write_text("none\n")
+    called, doctor = objslam("run", variant, "-o", tmp_path / "out", *LEAN), objslam("doctor", variant)
+    found = summary(tmp_path / "out")["assessment"]
+    assert found["level"] == "check"
+    lost = ["The map is made without localization.txt", "of the frames of boxes were dropped, because they are malformed"]
+    assert all(any(text in reason for reason in found["reasons"]) for text in lost)
+    assert all(text in doctor.out for text in lost)
+    assert "nothing wrong" not in doctor.out
+    assert called.code == 0
 
 
 def test_a_run_on_wrong_input_says_so(objslam, tmp_path):

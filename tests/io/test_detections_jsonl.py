@@ -142,8 +142,6 @@ def test_a_frame_as_the_format_describes_it(tmp_path):
         (_GOOD | {"boxes": [[1, 2, 3, True]]}, "a box must hold numbers only"),
         (_GOOD | {"boxes": [[1, 2, 3, 10**400]]}, "a box holds an integer beyond the range of floats"),
         (_GOOD | {"boxes": [[1, 2, 3]]}, "a box is not 4 numbers"),
-        (_GOOD | {"labels": [7]}, "a label is not a string"),
-        (_GOOD | {"labels": [None]}, "a label is not a string"),
         (_GOOD | {"labels": "c"}, "labels is missing or not a list"),
         (_GOOD | {"labels": ["a", "b"]}, "boxes, labels, scores, depths and track_ids differ in length"),
         (_GOOD | {"scores": []}, "boxes, labels, scores, depths and track_ids differ in length"),
@@ -183,9 +181,12 @@ def test_a_malformed_frame_is_dropped_and_named(tmp_path, frame, reason):
         ({"scores": [1.5]}, "box with a score outside 0 to 1"),
         ({"scores": [-0.1]}, "box with a score outside 0 to 1"),
         ({"scores": [float("nan")]}, "box with a score outside 0 to 1"),
-        ({"labels": [" "]}, "box with a label that is empty or not printable"),
-        ({"labels": ["a\nb"]}, "box with a label that is empty or not printable"),
-        ({"labels": ["\ud800"]}, "box with a label that is empty or not printable"),
+        ({"labels": [" "]}, "box with a label that is no printable text"),
+        ({"labels": ["a\nb"]}, "box with a label that is no printable text"),
+        ({"labels": ["\ud800"]}, "box with a label that is no printable text"),
+        ({"labels": [None]}, "box with a label that is no printable text"),
+        ({"labels": [["cup"]]}, "box with a label that is no printable text"),
+        ({"labels": [1.5]}, "box with a label that is no printable text"),
     ],
 )
 def test_a_bad_box_is_dropped_and_its_frame_stays(tmp_path, change, reason):
@@ -261,3 +262,25 @@ def test_a_file_without_a_good_line_says_why(tmp_path, text, why, hint):
     assert caught.value.where == str(file)
     assert why in caught.value.message
     assert hint in caught.value.hint
+
+
+def test_a_detector_that_numbers_its_classes_has_labels(tmp_path):
+    detections, ledger, _ = _read(tmp_path, _GOOD | {"labels": [7]}, _GOOD | {"stamp": 2.0, "labels": [56]})
+    assert detections.label_names == ("56", "7")
+    assert ledger.lines() == []
+
+
+def test_a_key_that_is_probably_misspelt_is_named_once(tmp_path):
+    """A key that resembles none may be of another program."""
+    odd = {"depth": [1.5], "trackids": [3], "image": "a.png"}
+    _, ledger, file = _read(tmp_path, _GOOD | odd, _GOOD | odd | {"stamp": 2.0})
+    assert ledger.lines() == [
+        f"{file}: the key 'depth' is not known, and is not read (did you mean 'depths'?)",
+        f"{file}: the key 'trackids' is not known, and is not read (did you mean 'track_ids'?)",
+    ]
+
+
+def test_the_share_of_malformed_frames_is_told(tmp_path):
+    _, ledger, file = _read(tmp_path, _GOOD, _GOOD | {"scores": []}, "", _GOOD | {"stamp": 3.0})
+    reason = "detection frame malformed: boxes, labels, scores, depths and track_ids differ in length"
+    assert ledger.lines() == [f"dropped 1 of 3 (33 %): {reason} (first: {file}:2)"]

@@ -61,6 +61,13 @@ def test_a_usual_result_is_good() -> None:
             "10 % of the used boxes belong to no object, and 20 % miss their object. An object may be two.",
         ),
         ({"unexplained": 220, "rejected": 10}, "check", "24 % of the used boxes belong to no object, and 1 % miss their"),
+        ({"unexplained": 0, "rejected": 240}, "check", "27 % of the used boxes miss their object. An object may be two."),
+        ({"unused": ("localization.txt",)}, "check", "The map is made without localization.txt, which cannot be used"),
+        (
+            {"frames": 186, "malformed": 114},
+            "check",
+            "38 % of the frames of boxes were dropped, because they are",
+        ),
         ({"odometry": 10.8}, "check", "The boxes agree only if the odometry is 11 times as noisy as the settings say"),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
         ({"fixed": True, "odometry_frame": True}, "check", "The poses come from the odometry, so the map has"),

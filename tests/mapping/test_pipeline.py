@@ -15,10 +15,11 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import exp_se3, interpolate, inverse, lift_se2
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import RunResult
-from objslam.core.types import CameraLog, Detections, Log, Trajectory, Truth, TruthObject
+from objslam.core.types import Association, CameraLog, Detections, Log, Trajectory, Truth, TruthObject
 from objslam.errors import LogError, SolveError
 from objslam.frontend.boxes.nested_boxes import PARTS
 from objslam.mapping import pipeline
+from objslam.mapping.describe import counted_weights
 from objslam.simulation import DepthNoise, make_camera, pair, preset, simulate
 from objslam.simulation.trajectory import START
 
@@ -430,3 +431,26 @@ def test_boxes_of_a_mirrored_image_are_said_to_be_wrong_input():
     for said, one in ((False, log), (True, replace(log, cameras=tuple(map(mirrored, log.cameras))))):
         result = run(one, "fixed", *HELD, "checks.use=true")
         assert any("the input may be wrong" in text for text in result.summary["warnings"]) == said
+
+
+def test_rays_of_a_thing_without_parallax_are_not_rejected():
+    """A thing straight ahead of a robot that drives along a line: no solve can place it, and its rays miss nothing."""
+    line = lift_se2(np.column_stack([np.linspace(0, 1, 40), np.zeros((40, 2))]))
+    camera, stamps = make_camera("ahead"), np.arange(40) / 10
+    middle = np.tile([320.0, 240.0], (40, 1)) + np.random.default_rng(0).normal(scale=1.0, size=(40, 2))
+    boxes = np.hstack([middle - 10, middle + 10])
+    none = np.full(40, np.nan)
+    ones = np.full(40, 1)
+    found = Detections(stamps, np.arange(40), boxes, 0 * ones, 0.9 * ones, none, -ones, ("sign",))
+    result = run(Log("line", (CameraLog(camera, found),), odometry=Trajectory(stamps, line)), "joint")
+    (sign,) = result.map.objects
+    assert (sign.status, sign.rays) == ("unresolved", 40)
+    assert (result.weight == 1).all()
+    assert result.summary["counts"]["rays_rejected"] == 0
+
+
+def test_only_a_ray_that_misses_its_object_has_no_weight():
+    """The second object has no place, so all its rays are outside the solve."""
+    association = Association(object=np.array([0, 0, 0, 1, 1, -1]), label=np.array([0, 0]))
+    weight = np.array([1.0, 0.4, 0.0, 0.0, 0.0, 0.0])
+    assert counted_weights(association, weight).tolist() == [1.0, 0.4, 0.0, 1.0, 1.0, 0.0]

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -228,6 +229,29 @@ def test_a_path_under_another_name_is_named(written):
         read_log_folder(written, Ledger())
 
 
+def test_a_file_whose_name_is_probably_misspelt_is_named(written):
+    """A file of another name, or beside the file that is meant, is nobody's mistake."""
+    (written / "localization.txt").rename(written / "localisation.txt")
+    (written / "odometry.txt.old").write_text("")
+    (written / "notes.txt").write_text("")
+    ledger = Ledger()
+    assert read_log_folder(written, ledger).localization is None
+    (line,) = ledger.lines()
+    assert line == (
+        f"{written / 'localisation.txt'}: no file of a log has this name, so it is not read (did you mean localization.txt?)"
+    )
+
+
+def test_a_key_of_a_camera_that_is_probably_misspelt_is_named(written):
+    """Keys that ROS writes, and keys that resemble none, may be there."""
+    file = written / "camera.yaml"
+    ros = "projection_matrix: {rows: 3, cols: 4, data: [1]}\nroi: 3\n"
+    file.write_text(re.sub("sees_size: [a-z]*\n", "", file.read_text()) + "sees_sizes: false\n" + ros)
+    ledger = Ledger()
+    read_log_folder(written, ledger)
+    assert ledger.lines() == [f"{file}: the key sees_sizes is not known, and is not read (did you mean sees_size?)"]
+
+
 def test_neither_path(written):
     (written / "odometry.txt").unlink()
     (written / "localization.txt").unlink()
@@ -247,6 +271,7 @@ def test_a_path_that_cannot_be_used(written, content):
     assert log.localization is None
     assert log.odometry is not None
     assert str(written / "localization.txt") in ledger.warnings[0]
+    assert ledger.unused == ["localization.txt"]
     spoil(written / "odometry.txt")
     with pytest.raises(LogError) as caught:
         read_log_folder(written, Ledger())

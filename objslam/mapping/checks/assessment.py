@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -9,6 +10,7 @@ from typing import Any, Literal
 from objslam.core.snapshot import RARE_POSES, TOO_SLOW
 from objslam.frontend.bearings import CUT_OFF
 from objslam.frontend.log_part import part_in_words
+from objslam.io.detections_jsonl import MALFORMED
 from objslam.mapping.checks.finding import NOISIER
 
 Level = Literal["good", "check", "bad"]
@@ -40,6 +42,9 @@ _FEW = 60
 gives more warnings."""
 
 
+_MALFORMED = 0.05
+"""The input needs a look if more than this share of the frames of boxes is malformed. A log that was cut off while it was
+written has one such frame. A larger value gives fewer warnings."""
 _LATE = 0.1
 """A live result needs a look if more than this share of its camera frames came too late for the map. At 0.1, nine of ten
 views of each object remain. A larger value gives fewer warnings."""
@@ -62,6 +67,7 @@ class Evidence:
     label has several objects. uncalibrated: whether the estimation of the shared errors failed. odometry: the largest
     factor on a noise of the odometry that the log shows. scale: the standard deviation of the scale of the odometry, as
     a share. None if the log shows the scale. part: the limits of a log that is a part of a recording, as in `Log`.
+    malformed: the frames of boxes that were malformed. unused: the paths of the robot that could not be used.
     odometry_unused: whether the mode was left to the log, and a `fixed` run did not use its odometry.
     """
 
@@ -90,6 +96,8 @@ class Evidence:
     scale: float | None = None
     part: tuple[float | None, float | None] = (None, None)
     odometry_unused: bool = False
+    malformed: int = 0
+    unused: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -139,7 +147,26 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         scale=_untold_scale(summary),
         part=(summary["part"]["begin"], summary["part"]["end"]) if "part" in summary else (None, None),
         odometry_unused=summary.get("odometry_unused", False),
+        malformed=malformed_frames(summary["dropped"]),
+        unused=tuple(summary.get("unused_paths", ())),
     )
+
+
+def malformed_frames(dropped: dict[str, int]) -> int:
+    """Return how many frames of boxes were dropped because they are malformed. dropped: the counts by reason."""
+    return sum(count for reason, count in dropped.items() if reason.startswith(MALFORMED))
+
+
+def lost_input(unused: Sequence[str], malformed: int, frames: int) -> list[str]:
+    """Return a sentence for each part of the input that a map lacks although the log has it.
+
+    unused: the paths of the robot that could not be used. malformed: the malformed frames of boxes, and frames: the others.
+    """
+    found = [f"The map is made without {name}, which cannot be used: the warnings say why." for name in unused]
+    if malformed > _MALFORMED * (malformed + frames):
+        share = 100 * malformed / (malformed + frames)
+        found.append(f"{share:.0f} % of the frames of boxes were dropped, because they are malformed.")
+    return found
 
 
 def _untold_scale(summary: dict[str, Any]) -> float | None:
@@ -213,6 +240,7 @@ def _check(e: Evidence) -> list[str]:
             f"The boxes agree only if the odometry is {e.odometry:.0f} times as noisy as the settings say: it may slip, or "
             "the camera may turn on the robot (camera_poses)."
         )
+    found += lost_input(e.unused, e.malformed, e.frames)
     if _may_be_bent(e):
         found.append(
             f"The boxes agree only if the odometry is {e.odometry:.1f} times as noisy as the settings say, and labels do "
@@ -251,10 +279,10 @@ def _check(e: Evidence) -> list[str]:
         found.append(f"{100 * e.unexplained / e.rays:.0f} % of the used boxes belong to no object.")
     elif e.unexplained + e.rejected > _UNEXPLAINED * e.rays:
         none, missed = (100 * part / e.rays for part in (e.unexplained, e.rejected))
-        found.append(
-            f"{none:.0f} % of the used boxes belong to no object, and {missed:.0f} % miss their object."
-            + (" An object may be two." if e.rejected > e.unexplained else "")
-        )
+        those = "of the used boxes"
+        alone = f"{missed:.0f} % {those} miss their object."
+        both = f"{none:.0f} % {those} belong to no object, and {missed:.0f} % miss their object."
+        found.append((both if e.unexplained else alone) + (" An object may be two." if e.rejected > e.unexplained else ""))
     if e.unresolved > e.resolved:
         found.append(f"Only {e.resolved} of {e.resolved + e.unresolved} objects have a place. Drive around the others.")
     if e.rays < _FEW:
