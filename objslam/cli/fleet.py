@@ -207,7 +207,8 @@ def _say(found: FleetResult, summary: dict[str, Any]) -> None:
         more = f", {one.islands} islands" if one.islands > 1 else ""
         state = "" if one.changed else ", as before"
         sessions = f"{one.sessions} session{'' if one.sessions == 1 else 's'}"
-        say(f"{one.site}: {one.objects} objects ({one.gone} gone) from {sessions}{more}{state}")
+        objects = f"{one.objects} object{'' if one.objects == 1 else 's'}"
+        say(f"{one.site}: {objects} ({one.gone} gone) from {sessions}{more}{state}")
     for failure in found.failures[:20]:
         say(f"failed ({failure.kind}): {failure.name}: {failure.error.removeprefix(f'{failure.name}: ')}", stderr=True)
     logs = "log" if len(found.mapped) == 1 else "logs"

@@ -85,7 +85,8 @@ def merge_results(
         lives = [o.life.state for o in objects if o.life is not None]
         count = f"{len(island.sessions)} session{'' if len(island.sessions) == 1 else 's'}"
         fates = ", ".join(f"{lives.count(fate)} {fate}" for fate in FATES if fate != "gone")
-        say(f"{len(objects)} objects ({len(objects.gone)} gone) from {count}: {fates}")
+        number = f"{len(objects)} object{'' if len(objects) == 1 else 's'}"
+        say(f"{number} ({len(objects.gone)} gone) from {count}: {fates}")
         say(f"wrote {folder}")
 
 

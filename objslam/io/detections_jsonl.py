@@ -54,7 +54,7 @@ def read_detections(path: Path, ledger: Ledger) -> Detections:
         ledger.warn(f"{path}: the key {key!r} is not known, and is not read (did you mean {meant!r}?)")
     if not collector.stamps:
         if not lines:
-            hint = "remove this file, and run a detector on rgb.txt (--detector)"
+            hint = "write the boxes into it, or remove it and run a detector on the images of rgb.txt (--detector)"
             raise LogError("no detection frame in it", where=str(path), hint=hint)
         why = f": {reasons.most_common(1)[0][0]}" if reasons else ""
         hint = "the file is one JSON list: write one frame a line" if lines[0][1].startswith("[") else _EXAMPLE

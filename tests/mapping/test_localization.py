@@ -101,7 +101,7 @@ def test_the_map_of_another_room_refuses_the_drive(days):
 def test_an_empty_map_says_why(days):
     ledger = Ledger()
     result = run(days[1], settings(), ledger, known=PriorMap("empty", ObjectMap(())))
-    assert "the map has 0 resolved objects" in result.summary["localisation"]["line"]
+    assert "the map has no resolved object" in result.summary["localisation"]["line"]
 
 
 Y_DOWN = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])

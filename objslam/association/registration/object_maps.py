@@ -39,8 +39,8 @@ def placed(objects: ObjectMap) -> list[int]:
 def reason(found: Registration, a: ObjectMap, b: ObjectMap, names: tuple[str, str]) -> str:
     """Return in a few words why the registration of a to b was accepted or refused. names: of a and b, for this text."""
     for name, objects in zip(names, (a, b), strict=True):
-        if len(placed(objects)) < 2:
-            return f"too little evidence, because {name} has {len(placed(objects))} resolved objects"
+        if (number := len(placed(objects))) < 2:
+            return f"too little evidence, because {name} has {number or 'no'} resolved object"
     if not len(found.matches):
         return "too little evidence, because no two objects have the same offset in both maps"
     odds = f"{len(found.matches)} objects match, log odds {found.log_odds:.1f}, lead {found.lead:.1f}"

@@ -13,7 +13,7 @@ from objslam.config import Settings, dump_settings, load_settings
 from objslam.core.bodies.body import UNKNOWN_YAW
 from objslam.core.diagnostics import is_drop
 from objslam.core.validity import is_date
-from objslam.errors import ConfigError, OutputError
+from objslam.errors import ConfigError, LogError, OutputError
 from objslam.evaluation.alignment import lay_truth
 from objslam.evaluation.evaluate_folder import evaluate_folder
 from objslam.io.atomic_files import write_file
@@ -72,7 +72,7 @@ def write_report(
         progress: a function that gets the stage, the steps done and the total number of steps.
     Raises:
         OutputError: the result cannot be read, or the page cannot be written.
-        LogError: the ground truth cannot be read.
+        LogError: the ground truth cannot be read, or `log` is given and has no images.
     """
     if is_site(out):
         return write_site_report(out)
@@ -93,6 +93,8 @@ def write_report(
     of_doubt = [spread_over_time(rays, one.rays[one.rays < len(rays)], crops) for one in doubts]
     counts = summary.get("counts", {})
     images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
+    if log is not None and no_images is not None:
+        raise LogError(no_images)
     wanted: dict[int, Kind] = {}
     for some in (*chosen.values(), *unexplained.values(), *of_doubt):
         wanted |= some

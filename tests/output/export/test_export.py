@@ -23,6 +23,7 @@ from objslam.io.results.read import load_map, load_trajectory
 from objslam.mapping import pipeline
 from objslam.output.export import FORMATS, write_export
 from objslam.output.export.content import Datum
+from objslam.output.plot.style import body_outline
 from objslam.output.result_folder import write_result
 
 SCHEMA = json.loads((Path(__file__).parent / "rfc7946.json").read_text())
@@ -58,6 +59,8 @@ def test_geojson_is_what_the_rfc_asks_for(result, tmp_path, datum):
     assert [f["properties"]["label"] for f in found] == [o.label for o in objects]
     assert [f["geometry"] is None for f in found] == [o.status != "ok" for o in objects]
     assert [f["properties"]["object"] for f in prints] == [o.id for o in objects if o.body is not None and o.status == "ok"]
+    outlines = [body_outline(o) for o in objects if o.body is not None and o.status == "ok"]
+    assert [len(f["geometry"]["coordinates"][0]) for f in prints] == [len(outline) for outline in outlines]
     assert all(f["geometry"]["coordinates"][0][0] == f["geometry"]["coordinates"][0][-1] for f in prints)
     assert len(path["geometry"]["coordinates"]) == len(trajectory)
     if datum is None:

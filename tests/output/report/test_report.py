@@ -26,7 +26,7 @@ from objslam.core.bodies.body import UNKNOWN_YAW, Body
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import DOUBT_KINDS, Doubt
-from objslam.errors import OutputError
+from objslam.errors import LogError, OutputError
 from objslam.evaluation.evaluate import evaluate
 from objslam.evaluation.evaluate_folder import evaluate_folder, write_evaluation
 from objslam.io.results.files import dump_doubts
@@ -379,6 +379,10 @@ def test_a_log_that_is_gone_or_elsewhere(mapped: Path) -> None:
     page = Page(write_report(mapped / "out"))
     assert not pictures(page)
     assert f"No pictures. The log is not at {mapped / 'log'} any more" in page.all_text
+    before = (mapped / "out" / "report.html").read_bytes()
+    with pytest.raises(LogError, match="The log is not at /nowhere"):  # A page with pictures is not replaced by one without.
+        write_report(mapped / "out", log=Path("/nowhere"))
+    assert (mapped / "out" / "report.html").read_bytes() == before
     assert len(pictures(Page(write_report(mapped / "out", log=mapped / "moved")))) > 16
 
 

@@ -10,7 +10,6 @@ from objslam.output.export.export_format import ExportFormat
 
 if TYPE_CHECKING:
     from objslam.core.arrays import Floats
-    from objslam.core.bodies.body import Body
     from objslam.core.object_map import MapObject
     from objslam.output.export.content import Content, Datum
 
@@ -32,7 +31,7 @@ def _dump(content: Content) -> bytes:
         geometry = {"type": "LineString", "coordinates": _coordinates(path.poses[:, :3, 3], datum)}
         properties = {"kind": "path", "start": float(path.stamps[0]), "end": float(path.stamps[-1])}
         features.append({"type": "Feature", "geometry": geometry, "properties": properties})
-    features += [_footprint(o, o.body, datum) for o in content.objects.objects if o.body is not None and o.status == "ok"]
+    features += [footprint for o in content.objects.objects if (footprint := _footprint(o, datum))]
     collection: dict[str, Any] = {"type": "FeatureCollection"}
     if datum is None:
         collection["coordinates_in"] = f"metres in the frame {content.objects.frame}"
@@ -59,15 +58,20 @@ def _object(o: MapObject, datum: Datum | None) -> dict[str, Any]:
     return {"type": "Feature", "geometry": geometry, "properties": properties, "id": o.id}
 
 
-def _footprint(o: MapObject, body: Body, datum: Datum | None) -> dict[str, Any]:
-    """Return the footprint of a body as a rectangle. Its corners go counter-clockwise, as the RFC asks."""
+def _footprint(o: MapObject, datum: Datum | None) -> dict[str, Any] | None:
+    """Return the footprint of an object's body, as map.png draws it. None without an outline.
+
+    The corners go counter-clockwise, and the last is the first, as the RFC asks.
+    """
     import numpy as np
 
-    from objslam.core.bodies.upright_box import footprint
+    from objslam.output.plot.style import body_outline
 
-    corners = footprint((o.position, body.size, body.yaw))
-    closed = np.concatenate([corners, corners[:1]])
-    ring = np.column_stack([closed, np.full(len(closed), o.position[2])])
+    outline = body_outline(o)
+    if outline is None:
+        return None
+    outline[-1] = outline[0]
+    ring = np.column_stack([outline, np.full(len(outline), o.position[2])])
     geometry = {"type": "Polygon", "coordinates": [_coordinates(ring, datum)]}
     return {"type": "Feature", "geometry": geometry, "properties": {"kind": "footprint", "object": o.id, "label": o.label}}
 
