@@ -6,7 +6,19 @@ import numpy as np
 
 from objslam.association.observations import overlap
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.frontend.boxes.robot_parts import AGREE, FEWEST, LIKE_BOX, NEXT, SAME_BOX, STEADY, TURN, WINDOWS, misses
+from objslam.frontend.boxes.robot_parts import (
+    ABSENT,
+    AGREE,
+    FEWEST,
+    LIKE_BOX,
+    NEXT,
+    SAME_BOX,
+    STEADY,
+    TURN,
+    WINDOWS,
+    drifts,
+    misses,
+)
 
 _PLACES = 16
 """The most places of the image that are followed for each label. A place stays among them if more than one in 17 boxes of
@@ -16,6 +28,8 @@ _OF_WINDOW = 32
 _MOVED = np.cos(np.radians(1.0))
 """A ray is kept if the camera has turned since the last kept ray by an angle with at most this cosine. A robot that waits
 adds none. A larger cosine keeps more rays."""
+_GAPS = 31
+"""The number of times between two boxes from which the usual time is taken. A larger number takes more memory."""
 _FORGOTTEN = 500
 """A part of the robot is forgotten if so many frames of its camera do not show it. An arm may have moved away. With a larger
 number, boxes of things are dropped at its place for longer."""
@@ -27,7 +41,9 @@ class _Place:
     found no place. at, near: the numbers of boxes at the place, and near it. last: the last frame with a box there. ahead,
     origin, direction: of the rays of the present window. open: those of the last `NEXT` windows whose rays meet until now:
     the number of the window, and the origins and directions of the rays since its begin. missed, windows: how many windows
-    show that no thing at rest is there, and how many windows there were.
+    show that no thing at rest is there, and how many windows there were. latest: (4,) px, the last box. changes: how many
+    times two images in a row had a box here, and the sums of its changes and of their squares. gaps: the last numbers of
+    frames between two boxes.
     """
 
     box: Floats
@@ -41,17 +57,29 @@ class _Place:
     origin: list[Floats] = field(default_factory=list)
     direction: list[Floats] = field(default_factory=list)
     open: list[tuple[int, list[Floats], list[Floats]]] = field(default_factory=list)
+    latest: Floats = field(default_factory=lambda: np.zeros(4))
+    gaps: list[int] = field(default_factory=list)
+    changes: tuple[int, Floats, Floats] = field(default_factory=lambda: (0, np.zeros(4), np.zeros(4)))
 
     @property
     def is_part(self) -> bool:
         """Whether a part of the robot is there."""
         enough = self.at >= FEWEST and self.at >= STEADY * self.near
-        return enough and self.missed >= max(WINDOWS, AGREE * self.windows)
+        return enough and self.missed >= max(WINDOWS, AGREE * self.windows) and not drifts(*self.changes)
 
     def add(self, box: Floats, frame: int, pose: Floats, direction: Floats) -> None:
         """Add a box at this place. pose: (4, 4) of the camera. direction: (3,) of the ray, in the frame of the path."""
         if self.at < FEWEST:  # A mean of later boxes would follow a thing that moves slowly through the image.
             self.box += (box - self.box) / (self.at + 1)
+        if frame == self.last + 1 and self.latest.any():
+            count, total, squares = self.changes
+            change = box - self.latest
+            self.changes = count + 1, total + change, squares + change**2
+        self.latest = box
+        if self.gaps and frame - self.last > ABSENT * float(np.median(self.gaps)):
+            self.open = []
+            self._keep(slice(0, 0))
+        self.gaps = [*self.gaps[1 - _GAPS :], frame - self.last]
         self.hits, self.at, self.near, self.last = self.hits + 1, self.at + 1, self.near + 1, frame
         ahead = pose[:3, 2]
         if self.ahead and ahead @ self.ahead[-1] > _MOVED:

@@ -5,6 +5,7 @@ No thing at rest stays there, unless the robot drives around it. Then its rays m
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -40,6 +41,10 @@ and take more time. The first two also take memory: without limits, 600,000 boxe
 TURN = np.radians(30.0)
 """The angle (rad) by which the camera turns in a window. Odometry is good over such a turn, and a thing at rest moves by
 much of the image. A larger angle needs more turning."""
+ABSENT = 10.0
+"""A window ends where the boxes are absent for more than this multiple of the usual time between two of them. A part of the
+robot stays while the camera turns. Things that the robot meets again on its way come and go. A larger number drops more
+boxes."""
 _MISSED = np.radians(5.0)
 """A window shows that boxes are of no thing at rest if the point that fits their rays best is missed by more than this (rad,
 root mean square). Poses err by less over such a turn. If the camera turns in its place, rays of boxes that stay in the image
@@ -51,6 +56,10 @@ NEXT = 2
 """The rays of a window are also compared together with those of up to this number of windows after it. Odometry is good over
 90 degrees too. With 1, the part of a robot whose curves change slowly stayed beside a camera that looks to the side. A
 larger number drops more boxes."""
+_DRIFTING = 4.0
+"""Boxes drift if their mean change from one image to the next is more than this number of its standard deviations. A robot
+that drives along a row of equal things sees one thing after another at the same place of the image, and each grows or moves
+on. Boxes of a part of the robot change by noise alone. A larger number drops more boxes."""
 WINDOWS, AGREE = 3, 0.8
 """The first is the least number of windows that must show that boxes are of no thing at rest, and the second is the least
 share of all windows. Larger values drop fewer boxes. A window has at least two boxes, because rays of a part of the robot
@@ -75,7 +84,7 @@ def _cleaned(one: CameraLog, path: Trajectory, settings: Settings, ledger: Ledge
     poses, known = interpolate(path.stamps, path.poses, found.frame_stamps, settings.poses.max_gap)
     part = np.zeros(len(found), dtype=bool)
     for group in _steady(found, known[found.frame] & (found.scores >= settings.rays.min_score)):
-        if _never_rests(found, group, poses @ one.camera.base_T_camera, one.camera):
+        if not _drifts(found, group) and _never_rests(found, group, poses @ one.camera.base_T_camera, one.camera):
             part[group] = True
             label = found.label_names[found.label[group[0]]]
             where = f"{spoken_name(one.camera.name)}, stamp {found.stamps[group[0]]:.3f}, label {label}"
@@ -109,6 +118,27 @@ def _steady(found: Detections, usable: Bools) -> Iterator[Ints]:
             mine = mine[alike < SAME_BOX]
 
 
+def drifts(count: int, total: Floats, squares: Floats) -> bool:
+    """Return whether boxes at one place of the image move on, from their changes from one image to the next.
+
+    count: the number of changes. total, squares: (4,) px and px^2, the sums of the changes of each coordinate and of their
+    squares.
+    """
+    if count < FEWEST / 2:
+        return False
+    mean = total / count
+    deviation = np.sqrt(np.maximum(squares / count - mean**2, 1e-12) / count)
+    return bool((np.abs(mean) > _DRIFTING * deviation).any())
+
+
+def _drifts(found: Detections, group: Ints) -> bool:
+    """Return whether boxes (M,) at one place of the image move on (`drifts`)."""
+    order = group[np.argsort(found.frame[group], kind="stable")]
+    next_ = np.flatnonzero(np.diff(found.frame[order]) == 1)
+    change = found.boxes[order[next_ + 1]] - found.boxes[order[next_]]
+    return drifts(len(change), change.sum(axis=0), (change**2).sum(axis=0))
+
+
 def _spread(number: int, most: int) -> Ints:
     """Return at most `most` indices below a number, spread evenly."""
     return np.linspace(0, number - 1, min(most, number)).astype(np.int64)
@@ -122,26 +152,33 @@ def _never_rests(found: Detections, group: Ints, map_T_camera: Floats, camera: C
     """
     middle = (found.boxes[group, :2] + found.boxes[group, 2:]) / 2
     direction, valid = undistort(camera, middle)
-    poses = map_T_camera[found.frame[group[valid]]]
+    frame = found.frame[group[valid]]
+    poses, gaps = map_T_camera[frame], np.diff(frame)
+    breaks = np.flatnonzero(gaps > ABSENT * np.median(gaps)) + 1 if len(gaps) else gaps
     direction, origin = np.einsum("mij,mj->mi", poses[:, :3, :3], direction[valid]), poses[:, :3, 3]
-    windows = list(_windows(poses[:, :3, 2]))
+    windows = list(_windows(poses[:, :3, 2], breaks))
     missed = 0
     for number, first in enumerate(windows):
-        longer = (slice(first.start, last.stop) for last in windows[number : number + NEXT + 1])
+        after = windows[number : number + NEXT + 1]
+        longer = (slice(first.start, last.stop) for last in after if not _any_between(breaks, first.start, last.stop))
         missed += any(misses(origin[part], direction[part]) for part in longer)
     return missed >= max(WINDOWS, AGREE * len(windows))
 
 
-def _windows(ahead: Floats) -> Iterator[slice]:
-    """Yield windows of boxes, in each of which the camera turns by `TURN`. ahead: (M, 3) its direction at each box."""
-    first = 0
-    while first < len(ahead):
-        turned = np.flatnonzero(ahead[first:] @ ahead[first] < np.cos(TURN))
-        if not len(turned):
-            return
-        last = first + int(turned[0])
-        yield slice(first, last + 1)
-        first = last
+def _any_between(values: Ints, low: int, high: int) -> bool:
+    return bool(((values > low) & (values < high)).any())
+
+
+def _windows(ahead: Floats, breaks: Ints) -> Iterator[slice]:
+    """Yield windows of boxes, in each of which the camera turns by `TURN`.
+
+    ahead: (M, 3) its direction at each box. breaks: the boxes before which there was none for long. No window contains one.
+    """
+    for first, end in pairwise([0, *breaks.tolist(), len(ahead)]):
+        while len(turned := np.flatnonzero(ahead[first:end] @ ahead[first] < np.cos(TURN))):
+            last = first + int(turned[0])
+            yield slice(first, last + 1)
+            first = last
 
 
 def misses(origin: Floats, direction: Floats) -> bool:
