@@ -168,14 +168,15 @@ def scene(rng, *, groups=7, pillars=False):
     return solids
 
 
-def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, noise=2.0):
+def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, noise=2.0, solids=None):
     """Two laps on an ellipse inside a ring of groups of things, with boxes of 2 px noise.
 
     The poses are a localisation with a noise of 1 cm and 0.2 degrees, or for joint mode drifting odometry. hiding: see
-    `boxes_at`. The same seed gives the same things, poses and noise of poses with hiding and without.
+    `boxes_at`. solids: instead of those of `scene`. The same seed gives the same things, poses and noise of poses with
+    hiding and without.
     """
     rng = np.random.default_rng(seed)
-    solids = scene(rng, pillars=pillars)
+    solids = solids or scene(rng, pillars=pillars)
     lines = {
         (i, j): apart(solids[i].footprint, solids[j].footprint)
         for i in range(len(solids))

@@ -68,6 +68,7 @@ def test_a_usual_result_is_good() -> None:
             "check",
             "38 % of the frames of boxes were dropped, because they are",
         ),
+        ({"poses": 13.7}, "check", "The boxes agree only if the localisation is 14 times as noisy as the settings say"),
         ({"odometry": 10.8}, "check", "The boxes agree only if the odometry is 11 times as noisy as the settings say"),
         ({"unresolved": 20}, "check", "Only 12 of 32 objects have a place. Drive around the others."),
         ({"fixed": True, "odometry_frame": True}, "check", "The poses come from the odometry, so the map has"),

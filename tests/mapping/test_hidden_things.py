@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mapping.hiding_drives import FORWARD, boxes_at, hiding_drive, lines_between, scene
+from mapping.hiding_drives import FORWARD, Solid, boxes_at, hiding_drive, lines_between, scene
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
@@ -52,6 +52,21 @@ def test_things_in_front_move_and_shrink_no_objects(no_hidden_edges):
     assert (squared <= INSIDE_95_3D).mean() > 0.9
     assert np.median(sizes[:, 2]) > np.median(plain_sizes[:, 2])  # Things in front mostly hide the lower parts.
     assert abs(np.median(sizes)) < 0.05
+
+
+@pytest.mark.parametrize("away", [2.8, 3.2])
+def test_a_chair_before_one_end_of_a_desk_leaves_no_centre_that_is_too_sure(away):
+    """The chair hides the same end from nearly all sides. Its centre is farther than that of the desk from some of them."""
+    solids = [
+        Solid("cuboid", "desk", np.array([0.0, away, 0.375]), np.array([0.7, 0.35, 0.375]), 0.0),
+        Solid("cuboid", "chair", np.array([0.25, away - 0.75, 0.45]), np.array([0.25, 0.25, 0.45]), 0.0),
+        *(Solid("cylinder", "bin", np.array([x, y, 0.3]), np.array([0.2, 0.2, 0.3]), 0.0) for x, y in ((3, -1), (-3, -1))),
+    ]
+    result = pipeline.run(hiding_drive(1, noise=0.5, solids=solids), SETTINGS, Ledger())
+    (desk,) = (o for o in result.map.resolved() if o.label == "desk")
+    off = desk.position - solids[0].centre
+    assert np.linalg.norm(off) > 0.3
+    assert off @ np.linalg.solve(desk.covariance, off) < INSIDE_95_3D
 
 
 def test_edges_of_visible_parts_are_found_behind_boxes(monkeypatch):

@@ -122,3 +122,18 @@ def test_one_edge_tells_the_direction_to_the_centre():
             angle = np.linalg.norm(np.cross(turned, towards), axis=1) / np.linalg.norm(towards, axis=1)
             miss = np.linalg.norm(np.cross(edges.direction, towards), axis=1) / np.linalg.norm(towards, axis=1)
             assert (angle < 0.1 * miss + 2e-3).all()
+
+
+def test_an_end_that_no_box_shows_may_be_anywhere_beyond():
+    """Something hides one end of each thing from all sides that are seen, and a tenth of the boxes do not show what hides
+    it. Then the visible part fits well, and its centre is far off. Without its bounds, the same centre would look exact."""
+    rng = np.random.default_rng(5)
+    true, box, pose, owner = seen(25, 40, rng)
+    front = behind(pose, 1.2)
+    box, pose, owner = box[front], pose[front], owner[front]
+    short, bound = hide(box, np.ones(len(box), bool), 2, np.full(len(box), 0.35)), np.zeros((len(box), 4), dtype=bool)
+    bound[:, 2] = rng.random(len(box)) < 0.9
+    found = solved(short, pose, owner, true, bound=bound)
+    assert np.median(off(found, true)) > 0.05
+    assert inside(found, true).mean() > 0.85
+    assert inside(solved(short, pose, owner, true), true).mean() < 0.5

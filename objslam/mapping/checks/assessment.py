@@ -31,6 +31,10 @@ _LOOSE = 9.0
 """A result needs a look if the noise of the odometry is this multiple of the settings, or more. Right maps of recorded
 robots have up to 8.1. If the multiple is larger, the fault is often not in the odometry: a camera that turns on the robot
 looks the same. A larger value gives fewer warnings."""
+_LOOSE_POSES = 9.0
+"""A result of the joint mode needs a look if the noise of the localisation is this multiple of the settings, or more.
+Simulated robots with AMCL or a scan matcher have up to 5.3. Wrong maps of rows of pallets that hide each other, which bent
+an exact path, have 10 to 15. A larger value gives fewer warnings."""
 _NAMED = 3.0
 """An assessment names the noise of the odometry if it is at least this multiple of the settings. Nine tenths of its variance
 are then not in the settings. The cause may be wheels that slip, or a path that was bent to make one object of two things.
@@ -65,8 +69,9 @@ class Evidence:
     unfinished: whether the search for a clear map took all its solves (joint.max_solves).
     copied: the objects in the largest part of the map that shows the same things as another part. several: whether a
     label has several objects. uncalibrated: whether the estimation of the shared errors failed. odometry: the largest
-    factor on a noise of the odometry that the log shows. scale: the standard deviation of the scale of the odometry, as
-    a share. None if the log shows the scale. part: the limits of a log that is a part of a recording, as in `Log`.
+    factor on a noise of the odometry that the log shows. poses: the same for the localisation. scale: the standard
+    deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log that is a
+    part of a recording, as in `Log`.
     malformed: the frames of boxes that were malformed. unused: the paths of the robot that could not be used.
     odometry_unused: whether the mode was left to the log, and a `fixed` run did not use its odometry.
     """
@@ -93,6 +98,7 @@ class Evidence:
     several: bool = False
     uncalibrated: bool = False
     odometry: float = 1.0
+    poses: float = 1.0
     scale: float | None = None
     part: tuple[float | None, float | None] = (None, None)
     odometry_unused: bool = False
@@ -144,6 +150,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         several=summary.get("several_objects_a_label", False),
         uncalibrated=summary.get("uncalibrated", False),
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
+        poses=max((summary.get("noise") or {}).get(name, 1.0) for name in ("heading", "place")),
         scale=_untold_scale(summary),
         part=(summary["part"]["begin"], summary["part"]["end"]) if "part" in summary else (None, None),
         odometry_unused=summary.get("odometry_unused", False),
@@ -239,6 +246,11 @@ def _check(e: Evidence) -> list[str]:
         found.append(
             f"The boxes agree only if the odometry is {e.odometry:.0f} times as noisy as the settings say: it may slip, or "
             "the camera may turn on the robot (camera_poses)."
+        )
+    if not e.fixed and e.poses >= _LOOSE_POSES:
+        found.append(
+            f"The boxes agree only if the localisation is {e.poses:.0f} times as noisy as the settings say: it may be, or "
+            "boxes of equal things that hide each other bend the path. Depths would show it."
         )
     found += lost_input(e.unused, e.malformed, e.frames)
     if _may_be_bent(e):

@@ -7,18 +7,19 @@ border. An edge that reaches too far does not count as hidden.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.triangulation.bodies.choice import log_evidence
-from objslam.triangulation.bodies.edges import BoxEdges
+from objslam.triangulation.bodies.edges import BOTTOM, TOP, BoxEdges
 from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Prior, fit
 from objslam.triangulation.bodies.prior import cuboid_prior
 from objslam.triangulation.bodies.residuals import beyond_edges
 from objslam.triangulation.bodies.shapes import CUBOID, KINDS, Kind
-from objslam.triangulation.bodies.shared import sides_of, spread_of, weights_of
+from objslam.triangulation.bodies.shared import BEYOND, sides_of, spread_of, weights_of
 
 _OUTER = 0.05
 """The outer body may reach beyond an edge. Then the edge counts with this share of its usual weight. With a smaller share,
@@ -27,6 +28,12 @@ _CLEAR = 2.0
 """An edge may be hidden if the body reaches beyond it by this number of standard deviations. The evidence decides whether it
 is hidden. With a larger number, bodies still bend to some hidden edges. With a smaller number, noise makes more visible
 edges count as hidden."""
+_UNSEEN = 0.5
+"""An end of a body is unseen if the body just reaches more than this share of the bounds there. A bound lies inside a body
+whose end is known from other edges. With a larger share, fewer ends are unseen."""
+_FEW_BOUNDS = 0.2
+"""At an unseen end, at least this share of the boxes have bounds. Fewer bounds may be where the body ends by chance. With a
+larger share, fewer ends are unseen."""
 _TURNS = 5
 """How often hidden edges and the body without them are found in turns. Two to four are usual. More are slower."""
 
@@ -89,6 +96,48 @@ def hidden_edges(
         one = _of_kind(own, few, start[mine], KINDS[number], loose, noise)
         found.edges[at], found.between[mine] = one.edges, one.between
     return found
+
+
+def unseen_ends(edges: BoxEdges, values: Floats, shape: Ints, factors: Floats, share: Floats) -> Floats:
+    """Return how uncertain centre and half axes (N, 6, 6), m, are because no box shows where bodies (N, 7) end.
+
+    If a thing in front hides one end of a thing from all sides that were seen, the body ends where its visible part does.
+    Then the edges there are bounds that the body just reaches. Edges of other boxes at the same end may be hidden by
+    something without a box, so they prove nothing. The end may be farther out by the hidden length (`BEYOND`), and then half
+    of it moves the centre. shape: (N,). factors, share: as in `Bodies`.
+    """
+    found = np.zeros((len(values), 6, 6))
+    number = np.maximum(np.bincount(edges.body, minlength=len(values)), 1)
+    for one in np.unique(shape).tolist():
+        at = np.flatnonzero((shape == one)[edges.body])
+        some, kind = edges.take(at), KINDS[one]
+        bound = np.asarray(some.bound >= 1)
+        bare = replace(some, bound=np.ones_like(some.bound))
+        reached = bound & (beyond_edges(some, values, kind) <= _CLEAR * spread_of(bare, factors, share)[:, :4])
+        away = np.linalg.norm(values[some.body, :3] - some.origin, axis=1)
+        for edge in range(4):
+            bounds, touched = (np.bincount(some.body, part[:, edge], len(values)) for part in (bound, reached))
+            unseen = (touched > _UNSEEN * bounds) & (bounds >= _FEW_BOUNDS * number)
+            length = BEYOND * some.size * some.turn[:, edge] * away
+            half = np.bincount(some.body, reached[:, edge] * length, len(values)) / np.maximum(touched, 1) / 2
+            for moved in _moved(values, kind, upright=edge in (TOP, BOTTOM)):
+                moved = (unseen * half)[:, None] * moved
+                found += moved[:, :, None] * moved[:, None, :]
+    return found
+
+
+def _moved(values: Floats, kind: Kind, *, upright: bool) -> Iterator[Floats]:
+    """Yield how centres and half axes (N, 6) of bodies (N, 7) change if an end goes on by 2 m in one direction.
+
+    The hidden part may go on in any level direction beyond a side, and upwards or downwards beyond the top or the bottom.
+    """
+    yaw, none = kind.heading(values), np.zeros(len(values))
+    if upright:
+        yield np.tile([0.0, 0.0, 1.0, 0.0, 0.0, 1.0], (len(values), 1))
+        return
+    along, across = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
+    yield np.stack([none + 1, none, none, along, across, none], axis=1)
+    yield np.stack([none, none + 1, none, across, along, none], axis=1)
 
 
 def _of_kind(edges: BoxEdges, some: Ints, start: Floats, kind: Kind, prior: Prior, noise: Noise) -> Hidden:

@@ -34,7 +34,7 @@ _ALONG = 1.0
 """The error of a side changes with the distance. This is the standard deviation of the change from a distance to e times
 this distance, in standard deviations of the error. With a larger change, the growth of boxes says less about the
 distance."""
-_BEYOND = 0.5
+BEYOND = 0.5
 """The root mean square of the hidden length beyond an edge that is a bound, as a share of the size of the box. Lengths that
 are evenly spread between 0 and 0.9 of the size have this value. A larger share makes objects that something hides less
 sure."""
@@ -250,10 +250,10 @@ def _weights_of_bounds(edges: BoxEdges, found: Residuals) -> Floats:
     """Return the weights (B, 4), 1/px^2, with which bounds count in a covariance, 0 for residuals that are no bounds.
 
     A body that just reaches a bound may go on beyond it, by a length that nobody sees. So a bound counts like a measured
-    edge with an error of this length, which is at least `_BEYOND`. All boxes of a body share this error, so they count as
+    edge with an error of this length, which is at least `BEYOND`. All boxes of a body share this error, so they count as
     one.
     """
-    length = np.hypot(_BEYOND * np.maximum(edges.size, 1.0)[:, None], np.maximum(found.value[:, : ROWS - 1], 0.0))
+    length = np.hypot(BEYOND * np.maximum(edges.size, 1.0)[:, None], np.maximum(found.value[:, : ROWS - 1], 0.0))
     number = np.bincount(edges.body)[edges.body, None]
     return np.asarray(edges.bound / (number * length**2))
 

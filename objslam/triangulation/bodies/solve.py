@@ -13,7 +13,7 @@ from objslam.triangulation.bodies.choice import log_evidence, shapes_disagree, w
 from objslam.triangulation.bodies.cuboid_fits import OtherCuboids, all_headings, best_cuboids, cuboid_starts, mixed_fit
 from objslam.triangulation.bodies.edges import BoxEdges
 from objslam.triangulation.bodies.fit import ENOUGH, STEPS, Fit, Prior, Weights, fit
-from objslam.triangulation.bodies.hidden_edges import hidden_edges, with_hidden
+from objslam.triangulation.bodies.hidden_edges import hidden_edges, unseen_ends, with_hidden
 from objslam.triangulation.bodies.prior import cuboid_prior, dot_prior, known_sizes, label_prior, sphere_prior, weak_prior
 from objslam.triangulation.bodies.residuals import residuals_of_shapes, touched_points, whole_axes
 from objslam.triangulation.bodies.shapes import CYLINDER, ELLIPSOID, KINDS, rows_of_kinds
@@ -178,8 +178,10 @@ def solve_bodies(
         if bent:
             edges = measure(touched_points(edges, _of_shapes(now.fitted, solid), solid))
     every = np.concatenate([now.evidence, now.others.evidence]), np.concatenate([_axes_of_shapes(now), now.others.axes])
-    between = shapes_disagree(*every, now.shape) + doubt.between
     edges = with_hidden(edges, hidden)
+    solid = np.where(now.shape == _POINT, _ELLIPSOID, now.shape)
+    unseen = unseen_ends(edges, _of_shapes(now.fitted, solid), solid, now.factors, now.share)
+    between = shapes_disagree(*every, now.shape) + doubt.between + unseen
     bodies = _finished(edges, sides_of(edges, points, _counted(edges, now)), now, between)
     others = None if more is None else more(bodies)
     return bodies if others is None else _refitted(edges, others, now, bodies)
