@@ -108,7 +108,7 @@ def test_a_log_of_arrays_gives_the_same_map_in_every_form_of_a_pose(log: Log, re
         ({"boxes": [[[0, 0, 5, 5]], [[5, 5, 4, 9]]]}, "frame 1: box without area"),
         ({"boxes": [[[0, 0, 5, 5]], [[1, 1, 6]]]}, "frame 1: boxes are .B, 4. x1, y1, x2, y2, got the shape .1, 3."),
         ({"boxes": [[[0, 0, 5, 5]], [1, 1, 6, 6]]}, "frame 1: boxes are .B, 4. x1, y1, x2, y2, got the shape .4,."),
-        ({"labels": [["cup"], [""]]}, "frame 1: box with a label that is empty"),
+        ({"labels": [["cup"], [""]]}, "frame 1: box with a label that is no printable text"),
         ({"scores": [[0.5], [1.5]]}, "frame 1: box with a score outside 0 to 1"),
         ({"scores": [[0.5], []]}, "scores needs one list for each frame"),
         ({"depths": [[1.0], [-1.0]]}, "frame 1: box with a depth that is not above zero"),

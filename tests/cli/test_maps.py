@@ -158,7 +158,7 @@ def test_maps_of_two_places_stay_apart_and_are_said(days, tmp_path, objslam):
     (tmp_path / "empty.json").write_text('{"format": "objslam.objects/2", "frame": "map", "objects": []}')
     code, said, _ = objslam("diff", out / "a", tmp_path / "empty.json")
     assert code == 1
-    assert said == f"not registered: too little evidence, because {tmp_path / 'empty.json'} has 0 resolved objects\n"
+    assert said == f"not registered: too little evidence, because {tmp_path / 'empty.json'} has no resolved object\n"
     code, _, warned = objslam("merge", out / "a", tmp_path / "empty.json", "-o", tmp_path / "site")
     assert code == 0
     assert "2 islands without objects in common" in warned
