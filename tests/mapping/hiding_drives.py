@@ -168,6 +168,24 @@ def scene(rng, *, groups=7, pillars=False):
     return solids
 
 
+def desks(rng, number=6):
+    """Desks of 1.4 m around the origin, and a chair before each, which hides a part of one end from most sides."""
+    solids = []
+    for turn in np.linspace(0, 2 * np.pi, number, endpoint=False) + rng.uniform(0, 1):
+        toward, along = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+        while True:
+            at, yaw = rng.uniform(3.6, 4.2) * toward, float(turn + np.pi / 2 + rng.normal(0, 0.1))
+            chair = at - 0.75 * toward + rng.uniform(-0.5, 0.5) * along
+            pair = [
+                Solid("cuboid", "desk", np.array([*at, 0.375]), np.array([0.7, 0.35, 0.375]), yaw),
+                Solid("cuboid", "chair", np.array([*chair, 0.45]), np.array([0.25, 0.25, 0.45]), yaw),
+            ]
+            if None not in lines_between([*solids, *pair]).values():
+                break
+        solids += pair
+    return solids
+
+
 def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, noise=2.0, solids=None):
     """Two laps on an ellipse inside a ring of groups of things, with boxes of 2 px noise.
 
