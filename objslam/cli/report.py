@@ -26,7 +26,8 @@ def report_result(
     from objslam.output.report import write_report
 
     with progress_bar(quiet=quiet) as show:
-        file = write_report(out, log=log, crops=crops, progress=show)
+        # Who names a log wants its pictures, and a page with them must not give way to one without.
+        file = write_report(out, log=log, crops=crops, images_needed=log is not None, progress=show)
     if json and not quiet:
         put(dump_json({"wrote": str(file)}))
     elif not quiet:

@@ -26,6 +26,8 @@ ODOMETRY, LOCALIZATION = "odometry.txt", "localization.txt"
 MOUNTS = "mounts.yaml"  # The file of base_T_camera from tf, for a recording whose cameras have no calibration.
 RGB, DEPTH, DETECTIONS = "rgb", "depth", "detections.jsonl"
 _FILES = (CAMERA, MOUNT, ODOMETRY, LOCALIZATION, f"{RGB}.txt", f"{DEPTH}.txt", DETECTIONS)
+_TEXT = (".txt", ".yaml", ".yml", ".json", ".jsonl", ".csv", ".gz")
+"""The suffixes of the files whose names are compared with those of a log."""
 TRUTH, TRUTH_OBJECTS, TRUTH_TRAJECTORY = "groundtruth", "objects.json", "trajectory.txt"
 
 _T = TypeVar("_T")
@@ -54,7 +56,7 @@ def read_log_folder(path: Path, ledger: Ledger) -> Log:
         if not path.is_dir():
             raise LogError("not a folder" if path.exists() else "no such folder", where=str(path))
         cameras, paths = _read_cameras(path, ledger), _read_paths(path, ledger)
-        for folder in (path, *sorted((path / CAMERAS).glob("*/"))):
+        for folder in (path, *(path / CAMERAS / one.camera.name for one in cameras if (path / CAMERAS).is_dir())):
             _check_names(folder, ledger)
         return Log(path.resolve().name, cameras, *paths, read_truth(path / TRUTH, ledger))
 
@@ -194,8 +196,9 @@ def _read_camera_log(folder: Path, name: str | None, ledger: Ledger) -> CameraLo
 
 
 def _check_names(folder: Path, ledger: Ledger) -> None:
-    files = sorted(file.name for file in folder.iterdir() if file.is_file() and not file.name.startswith("."))
-    for name, meant in misspelt(files, _FILES).items():
+    """Warn of files whose names are probably misspelt. A folder may also hold a hundred thousand images, which are none."""
+    files = [file for file in folder.iterdir() if file.suffix.lower() in _TEXT and file.is_file()]
+    for name, meant in misspelt(sorted(file.name for file in files), _FILES).items():
         ledger.warn(f"{folder / name}: no file of a log has this name, so it is not read (did you mean {meant}?)")
 
 

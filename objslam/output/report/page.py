@@ -61,6 +61,7 @@ def write_report(
     *,
     log: Path | None = None,
     crops: int = 4,
+    images_needed: bool = False,
     progress: Callable[[str, int, int], None] = lambda stage, done, total: None,
 ) -> Path:
     """Write report.html into the result folder `out` and return its path. The map of a site gets a page of its own kind.
@@ -69,10 +70,11 @@ def write_report(
         log: the path of the run's log, which has the images for the pictures; by default the path in summary.json.
         crops: the most pictures of the best boxes of an object, 0 for no pictures. The worst and the rejected boxes of an
             object get half as many each. The boxes of no object get `crops` for each label.
+        images_needed: whether a log without images is an error. Else the page says why it has no pictures.
         progress: a function that gets the stage, the steps done and the total number of steps.
     Raises:
         OutputError: the result cannot be read, or the page cannot be written.
-        LogError: the ground truth cannot be read, or `log` is given and has no images.
+        LogError: the ground truth cannot be read, or `images_needed` and there are no images.
     """
     if is_site(out):
         return write_site_report(out)
@@ -92,8 +94,9 @@ def write_report(
     doubts = load_doubts(out) or ()
     of_doubt = [spread_over_time(rays, one.rays[one.rays < len(rays)], crops) for one in doubts]
     counts = summary.get("counts", {})
-    images, no_images = images_of(log or summary.get("log_path"), counts.get("images")) if crops else ({}, None)
-    if log is not None and no_images is not None:
+    where, number = (summary.get("log_path"), counts.get("images")) if log is None else (log, None)
+    images, no_images = images_of(where, number) if crops else ({}, None)
+    if images_needed and no_images is not None:
         raise LogError(no_images)
     wanted: dict[int, Kind] = {}
     for some in (*chosen.values(), *unexplained.values(), *of_doubt):

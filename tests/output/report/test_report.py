@@ -381,8 +381,10 @@ def test_a_log_that_is_gone_or_elsewhere(mapped: Path) -> None:
     assert f"No pictures. The log is not at {mapped / 'log'} any more" in page.all_text
     before = (mapped / "out" / "report.html").read_bytes()
     with pytest.raises(LogError, match="The log is not at /nowhere"):  # A page with pictures is not replaced by one without.
-        write_report(mapped / "out", log=Path("/nowhere"))
+        write_report(mapped / "out", log=Path("/nowhere"), images_needed=True)
     assert (mapped / "out" / "report.html").read_bytes() == before
+    # A fleet names the log of each map, also of logs without images.
+    assert not pictures(Page(write_report(mapped / "out", log=Path("/nowhere"))))
     assert len(pictures(Page(write_report(mapped / "out", log=mapped / "moved")))) > 16
 
 
