@@ -44,6 +44,7 @@ from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
+from objslam.mapping.moves.near_sides import check_rows
 from objslam.mapping.moves.odometry_witness import odometry_contradicts
 from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.progress import Progress
@@ -217,6 +218,10 @@ def _run(
         and (near := check_neighbours(solution, before, settings, told)) is not None
     ):
         diagnosis = diagnosis.with_findings([near])
+        say(diagnosis, ledger)
+    names = tuple(camera.name for camera in cameras)
+    if settings.checks.use and settings.mode == "joint" and (rows := check_rows(solution, names, settings)) is not None:
+        diagnosis = diagnosis.with_findings([rows])
         say(diagnosis, ledger)
     used = keyframes, solution.rays, solution.association
     solved = estimate.map_T_base @ keyframes.base_T_camera

@@ -186,8 +186,26 @@ def desks(rng, number=6):
     return solids
 
 
-def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, noise=2.0, solids=None):
-    """Two laps on an ellipse inside a ring of groups of things, with boxes of 2 px noise.
+def aisle(rng, *, named=False):
+    """Two rows of seven equal lockers along an aisle. named: whether each has a label of its own."""
+    return [
+        Solid("cuboid", f"locker {k}{side}" if named else "locker", np.array([1.3 * k, 2.2 * side + y, 0.95]), half, 0.0)
+        for side, half in ((side, np.array([0.4, 0.25, 0.95])) for side in (-1, 1))
+        for k, y in enumerate(rng.normal(0, 0.02, 7))
+    ]
+
+
+def along_aisle(frames=300):
+    """Poses (F, 3) of three ways along the aisle, with turns at its ends."""
+    corners = np.array([(-3, 0), (9, 0.1), (9.6, 0.4), (9, 0.7), (-3, 0.4), (-3.6, 0.1), (-3, -0.2), (9, -0.3)])
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    at = np.linspace(0, way[-1], frames)
+    place = np.column_stack([np.interp(at, way, axis) for axis in corners.T])
+    return np.column_stack([place, np.unwrap(np.arctan2(*np.gradient(place, axis=0).T[::-1]))])
+
+
+def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, noise=2.0, solids=None, plane=None):
+    """Two laps on an ellipse inside a ring of groups of things, with boxes of 2 px noise. plane: poses (F, 3) instead.
 
     The poses are a localisation with a noise of 1 cm and 0.2 degrees, or for joint mode drifting odometry. hiding: see
     `boxes_at`. solids: instead of those of `scene`. The same seed gives the same things, poses and noise of poses with
@@ -200,10 +218,12 @@ def hiding_drive(seed, *, hiding=True, pillars=False, joint=False, frames=400, n
         for i in range(len(solids))
         for j in range(i + 1, len(solids))
     }
-    turn = np.linspace(0, 4 * np.pi, frames)
-    place = np.column_stack([1.8 * np.cos(turn), 1.5 * np.sin(turn)])
-    yaw = np.unwrap(np.arctan2(*np.gradient(place, axis=0).T[::-1])) - 0.7 + 0.7 * np.sin(3.5 * turn)
-    stamps, plane = 0.2 * np.arange(frames), np.column_stack([place, yaw])
+    if plane is None:
+        turn = np.linspace(0, 4 * np.pi, frames)
+        place = np.column_stack([1.8 * np.cos(turn), 1.5 * np.sin(turn)])
+        yaw = np.unwrap(np.arctan2(*np.gradient(place, axis=0).T[::-1])) - 0.7 + 0.7 * np.sin(3.5 * turn)
+        plane = np.column_stack([place, yaw])
+    frames, stamps = len(plane), 0.2 * np.arange(len(plane))
     true = lift_se2(plane)
     odometry = drifting_odometry(true, rng)
     localised = lift_se2(plane + [0.01, 0.01, 0.0035] * rng.standard_normal((frames, 3)))

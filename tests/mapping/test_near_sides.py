@@ -1,0 +1,80 @@
+"""Rows of large equal things, of which cameras see the near sides."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mapping.body_drives import FORWARD
+from mapping.hiding_drives import aisle, along_aisle, hiding_drive
+
+from objslam.config import load_settings
+from objslam.core.calibration import Calibration
+from objslam.core.diagnostics import Ledger
+from objslam.core.geometry import lift_se2
+from objslam.mapping import pipeline
+from objslam.mapping.moves.near_sides import BACK, moves_back, shift_ahead
+
+QUIET = ("output.recording=false", "mode=joint")
+
+
+def way(mount=FORWARD):
+    """Keyframes of 40 poses on a circle."""
+    turn = np.linspace(0, 2 * np.pi, 40)
+    poses = lift_se2(np.column_stack([3 * np.cos(turn), 3 * np.sin(turn), turn]))
+    return SimpleNamespace(
+        map_T_base=poses, base_T_camera=np.repeat(mount[None], 40, axis=0), camera=np.zeros(40, dtype=int)
+    )
+
+
+def test_the_shift_is_along_the_view_of_each_camera():
+    keyframes = way()
+    back = keyframes.map_T_base.copy()
+    back[:, :3, 3] -= 0.2 * back[:, :3, 0]
+    assert shift_ahead(keyframes, back, None, ("front",)) == pytest.approx((-0.2, 0.0), abs=1e-9)
+    aside = keyframes.map_T_base.copy()
+    aside[:, :3, 3] += 0.2 * aside[:, :3, 1]
+    assert shift_ahead(keyframes, aside, None, ("front",)) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_a_common_shift_of_the_map_is_no_shift_ahead():
+    keyframes = way()
+    moved = keyframes.map_T_base.copy()
+    moved[:, 0, 3] += 0.5
+    mean, sigma = shift_ahead(keyframes, moved, None, ("front",))
+    assert abs(mean) < sigma / 2
+
+
+def test_a_camera_that_is_moved_on_the_robot_counts():
+    keyframes = way()
+    found = Calibration(("front.x", "front.y"), np.array([-0.3, 0.1]), np.eye(2), np.ones(2))
+    assert shift_ahead(keyframes, keyframes.map_T_base, found, ("front",))[0] == pytest.approx(-0.3)
+
+
+def test_a_camera_that_looks_down_tells_nothing():
+    down = np.eye(4)
+    down[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    keyframes = way(down)
+    back = keyframes.map_T_base.copy()
+    back[:, :3, 3] -= 0.2 * back[:, :3, 0]
+    assert shift_ahead(keyframes, back, None, ("front",)) == (0.0, 0.0)
+
+
+def test_small_and_unsteady_shifts_are_not_clear():
+    settings = load_settings(None)
+    assert moves_back((-0.2, 0.03), settings)
+    assert not moves_back((0.2, 0.03), settings)
+    assert not moves_back((-0.2, 0.15), settings)
+    assert not moves_back((-1.5 * settings.localization.xy, 0.001), settings)
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_row_of_lockers_is_doubted_unless_labels_tell_them_apart(named):
+    solids = aisle(np.random.default_rng(0), named=named)
+    log = hiding_drive(0, solids=solids, plane=along_aisle())
+    result = pipeline.run(log, load_settings(None, QUIET), Ledger())
+    places = np.array([one.position for one in result.map.resolved()])
+    far = np.linalg.norm(places[:, None, :2] - [one.centre[:2] for one in solids], axis=2).min(axis=1)
+    found = BACK in [one["name"] for one in result.summary["wrong_input"]]
+    assert found == (not named)
+    assert (result.summary["assessment"]["level"] == "good") == named
+    assert (np.median(far) > 0.3) == (not named)
