@@ -40,16 +40,16 @@ def doctor(
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.assessment import lost_input, malformed_frames
     from objslam.mapping.checks.diagnosis import diagnose
+    from objslam.mapping.chosen_poses import with_chosen_poses, with_mode_of
     from objslam.mapping.fixed.sparse_noise import with_sparse_noise
     from objslam.mapping.ground.uneven_ground import with_uneven_ground
-    from objslam.mapping.pipeline import chosen_poses, with_mode_of
     from objslam.sources.camera_words import doubts_of
 
     settings = settings_of(mode, config, set_)
     ledger = Ledger()
     with progress_bar() as show:
         given = read(log, ledger, options)
-        chosen = without_robot_parts(chosen_poses(given, settings), settings, ledger)
+        chosen = without_robot_parts(with_chosen_poses(given, settings, ledger), settings, ledger)
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
         settings = with_uneven_ground(said, settings, ledger, show)

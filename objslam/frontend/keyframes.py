@@ -15,6 +15,10 @@ from objslam.frontend.localization.measured_poses import with_measurements
 from objslam.frontend.odometry_bridge import bridge_of
 from objslam.frontend.odometry_drift import gathered_drift
 
+OFF_PATH = ("boxes before or after the", "boxes in a gap of the")
+"""The reasons for which boxes without a pose of the robot are dropped, without the name of the path."""
+UNCOVERED = "boxes that the localisation does not cover"
+"""The reason for which a live session drops boxes at its end."""
 _DIRECTIONS = 400
 """The number of directions in which the views of several cameras are compared. A larger number is more exact and slower."""
 
@@ -77,6 +81,8 @@ def build_keyframes(log: Log, settings: Settings, ledger: Ledger, measured: Traj
         elif ((stamps >= path.stamps[0]) & (stamps <= path.stamps[-1])).any() and len(path) > 1:
             every = float(np.median(np.diff(path.stamps)))
             hint = f"its poses are {every:.3g} s apart: raise poses.max_gap to bridge longer gaps"
+            if localized and log.odometry is not None and settings.mode == "fixed":
+                hint += ", or let the odometry bridge them (--mode joint)"
         else:
             hint = "check that both use the same clock"
         raise LogError(
@@ -144,8 +150,8 @@ def _on_path(
     poses, valid = interpolate(path.stamps, path.poses, stamps, max_gap)
     outside = (stamps < path.stamps[0]) | (stamps > path.stamps[-1])
     lost = wanted & ~valid
-    for mask, why in ((lost & outside, f"before or after the {what}"), (lost & ~outside, f"in a gap of the {what}")):
+    for mask, why in zip((lost & outside, lost & ~outside), OFF_PATH, strict=True):
         where = f"stamp {stamps[mask][0]:.3f}" if mask.any() else None
-        ledger.drop(f"boxes {why}", int(boxes[mask].sum()), where)
-        ledger.drop(f"frames {why}", int(mask.sum()), where)
+        ledger.drop(f"{why} {what}", int(boxes[mask].sum()), where)
+        ledger.drop(f"{why.replace('boxes', 'frames')} {what}", int(mask.sum()), where)
     return poses, valid

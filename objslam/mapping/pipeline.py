@@ -14,12 +14,15 @@ from objslam.core.geometry import interpolate
 from objslam.core.result import RunResult
 from objslam.core.trajectory import correct_path
 from objslam.core.types import Keyframes, Log, Trajectory
-from objslam.errors import LogError, SolveError
+from objslam.errors import SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.boxes.robot_parts import without_robot_parts
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import shared_errors, take_out_expected, take_out_known
-from objslam.frontend.localization.continued_localization import continued_by_odometry, share_on_continuation
+from objslam.frontend.localization.continued_localization import (
+    continued_by_odometry,
+    share_on_continuation,
+)
 from objslam.frontend.turning_clocks import in_order_of_clocks
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
@@ -35,6 +38,7 @@ from objslam.mapping.checks.residuals import check_pose_noise, check_residuals
 from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
+from objslam.mapping.chosen_poses import chosen_poses, with_chosen_poses, with_mode_of
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.far_sides import with_far_sides
@@ -52,10 +56,6 @@ from objslam.mapping.refuted import with_known_labels, without_refuted
 from objslam.mapping.solution import seen_something, with_jumps
 from objslam.mapping.uncorrected import uncorrected_residual
 from objslam.mapping.views import solved_views
-
-_BEYOND = 0.1
-"""With the mode `auto`, the poses are solved if the odometry continues the localisation for this share of the boxes or more.
-A larger share leaves out more boxes, and spares more logs the time of a solve of the poses."""
 
 
 def run(
@@ -113,7 +113,7 @@ def _run(
     The third value is the lasting errors of the poses, None if they are too small for a finding. earlier: the lasting errors
     that an earlier map at the given poses found."""
     recorded = [c.detections for c in log.cameras if c.detections is not None]
-    given = log = without_robot_parts(chosen_poses(log, settings), settings, ledger)
+    given = log = without_robot_parts(with_chosen_poses(log, settings, ledger), settings, ledger)
     both, open_mode = log.localization is not None and log.odometry is not None, settings.mode == "auto"
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
@@ -301,25 +301,6 @@ def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Fl
     smooth = correct_path(way, keyframes.stamps, before, map_T_base)
     poses, inside = interpolate(way.stamps, smooth.poses, path.stamps, settings.poses.max_gap)
     return Trajectory(path.stamps, np.where(inside[:, None, None], poses, after.poses))
-
-
-def chosen_poses(log: Log, settings: Settings) -> Log:
-    """Return the log with the poses that the settings choose. LogError if the log lacks them."""
-    use = settings.poses.use
-    if use == "auto":
-        return log
-    if (log.odometry if use == "odometry" else log.localization) is None:
-        raise LogError(f"the log has no {use}", where=log.name, hint="set poses.use to auto")
-    return replace(log, localization=None) if use == "odometry" else replace(log, odometry=None)
-
-
-def with_mode_of(log: Log, settings: Settings) -> Settings:
-    """Return the settings with `auto` replaced by the mode that it means for a log with the chosen poses."""
-    if settings.mode != "auto":
-        return settings
-    more = share_on_continuation(log, continued_by_odometry(log, settings), settings)
-    joint = log.localization is None or more >= _BEYOND
-    return settings.model_copy(update={"mode": "joint" if joint else "fixed"})
 
 
 def _doubting(progress: Progress, diagnosis: Diagnosis) -> Progress:

@@ -11,7 +11,12 @@ from objslam.core.geometry import lift_se2
 from objslam.core.statistics import Lasting
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.keyframes import build_keyframes
-from objslam.frontend.localization.continued_localization import continued_by_odometry, share_on_continuation
+from objslam.frontend.localization.continued_localization import (
+    bridged,
+    continued_by_odometry,
+    share_on_continuation,
+    without_short_localization,
+)
 from objslam.graph.factors.localization import localization_covariance, localized, localized_motions
 from objslam.simulation import preset, simulate
 
@@ -102,3 +107,58 @@ def test_continued_keyframes_have_no_localisation():
     smallest = np.sqrt(np.linalg.eigvalsh(motions.covariance)[:, 0])  # Tilt and height are untold anyway.
     assert smallest.max() < 0.1
     assert share_on_continuation(log, continued, SETTINGS) == pytest.approx(0.4, abs=0.1)
+
+
+def rare(every: float) -> tuple[Log, Trajectory]:
+    """The drive with a localised pose each `every` s, as AMCL gives them."""
+    log, path = drive(lambda t: np.isclose(t % every, 0.0) | np.isclose(t % every, every))
+    assert np.diff(log.localization.stamps) == pytest.approx(every)
+    return log, path
+
+
+@pytest.mark.parametrize("every", [2.0, 5.0])
+def test_the_odometry_bridges_a_rare_localisation(every):
+    """Most boxes lie between two measurements, so they are used although their share is large."""
+    log, path = rare(every)
+    found = continued_by_odometry(log, SETTINGS).localization
+    np.testing.assert_allclose(found.stamps, path.stamps)
+    np.testing.assert_allclose(found.poses, path.poses, atol=1e-9)
+    assert share_on_continuation(log, replace(log, localization=found), SETTINGS) > 0.9
+
+
+def test_each_rare_measurement_counts_once_and_at_the_nearest_keyframe():
+    log, _ = rare(2.0)
+    frames = build_keyframes(continued_by_odometry(log, SETTINGS), SETTINGS, Ledger(), log.localization)
+    assert np.isfinite(frames.localized_at).all()
+    measured = localized(frames)
+    np.testing.assert_allclose(frames.localized_at[measured], log.localization.stamps)
+    assert np.abs(frames.stamps[measured] - log.localization.stamps).max() < 0.06
+    far = np.abs(frames.stamps - frames.localized_at) > 0.5
+    assert (frames.carried[far] > 0).all()
+    assert frames.localized_every == pytest.approx(len(frames) / 9)  # The first and the last lie outside of the frames.
+
+
+def test_stamps_are_bridged_only_between_two_measurements_that_the_odometry_joins():
+    log, path = drive(lambda t: (np.abs(t - 5) < 0.01) | (np.abs(t - 12) < 0.01))
+    stamps = np.array([4.0, 5.1, 6.0, 11.0, 13.0])
+    np.testing.assert_array_equal(
+        bridged(log.localization, log.odometry, stamps, SETTINGS), [False, True, True, True, False]
+    )
+    whole = (path.stamps < 7) | (path.stamps > 9)
+    broken = Trajectory(path.stamps[whole], path.poses[whole])
+    assert not bridged(log.localization, broken, stamps[2:], SETTINGS).any()
+    noisy = load_settings(None, ("mode=joint", "odometry.yaw_per_m=1.0"))
+    np.testing.assert_array_equal(bridged(log.localization, log.odometry, np.array([5.1, 8.5]), noisy), [True, False])
+
+
+@pytest.mark.parametrize("keep", [lambda t: t < 6, lambda t: np.abs(t - 9) < 0.11])
+def test_a_localisation_of_few_boxes_is_left_out(keep):
+    log, _ = drive(keep)
+    assert without_short_localization(log, SETTINGS).localization is None
+    assert without_short_localization(replace(log, odometry=None), SETTINGS).localization is not None
+
+
+@pytest.mark.parametrize("keep", [lambda t: t < 14, lambda t: t > 8, lambda t: np.isclose(t % 4, 0.0)])
+def test_a_localisation_that_the_odometry_completes_is_used(keep):
+    log, _ = drive(keep)
+    assert without_short_localization(log, SETTINGS) is log

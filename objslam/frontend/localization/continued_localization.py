@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Bools, Floats
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import interpolate, inverse
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.odometry_drift import gathered_drift
@@ -20,8 +20,13 @@ _DRIFT = 0.15
 of poses that drifted more are associated with wrong things. In MRCLAM drives that keep a part of their localisation, 0.2 rad
 gave 16 false objects in one drive, and 0.1 rad left out boxes that 0.15 rad uses. A larger value uses more boxes."""
 _MOST = 0.5
-"""The largest share of the boxes that may lie on continued poses. If the odometry gives most poses, nothing shows the noise
-of the localisation, and the ellipsoids become too small. A larger share continues shorter localisations."""
+"""The largest share of the boxes that may lie on continued poses that no measurements enclose. If the odometry gives most
+poses, nothing shows the noise of the localisation, and the ellipsoids become too small. A larger share continues shorter
+localisations."""
+
+_LEAST = 0.5
+"""The least share of the boxes with a pose of the odometry that a localisation has to cover, also with continued poses. Else
+the odometry is used alone. With a larger share, fewer maps have the frame of the localisation."""
 
 
 def continued_by_odometry(log: Log, settings: Settings) -> Log:
@@ -29,7 +34,8 @@ def continued_by_odometry(log: Log, settings: Settings) -> Log:
 
     The continued poses join the localised poses at both ends of a gap. A gap of the odometry ends the continuation, because
     somebody may have moved the robot in it. It also ends where the odometry has drifted too far. The log is returned
-    unchanged if there is nothing to continue, and if most boxes would lie on continued poses.
+    unchanged if there is nothing to continue, and if most boxes would lie outside of the localisation's time, or in gaps
+    that the odometry does not bridge (`bridged`).
     """
     localization, odometry = log.localization, log.odometry
     if localization is None or odometry is None or not len(localization):
@@ -40,7 +46,7 @@ def continued_by_odometry(log: Log, settings: Settings) -> Log:
         return log
     known = localization.stamps[covered]
     map_T_odom = localization.poses[covered] @ inverse(at[covered])
-    sure, times = _near_localization(odometry, known, settings)
+    sure, times = _near_localization(odometry, known, odometry.stamps, settings)
     free = sure & ~_between(localization.stamps, odometry.stamps, max_gap)
     if not free.any():
         return log
@@ -50,19 +56,58 @@ def continued_by_odometry(log: Log, settings: Settings) -> Log:
     poses = np.concatenate([localization.poses, offset @ odometry.poses[free]])
     order = np.argsort(every)
     continued = replace(log, localization=Trajectory(every[order], poses[order]))
-    return continued if share_on_continuation(log, continued, settings) <= _MOST else log
+    boxes = _stamps_of_boxes(log)
+    more = _only_continued(log, continued, boxes, settings) & ~bridged(localization, odometry, boxes, settings)
+    return continued if more.sum() <= _MOST * _on_path(continued, boxes, settings).sum() else log
+
+
+def without_short_localization(log: Log, settings: Settings) -> Log:
+    """Return the log without its localisation, if the odometry alone has poses for far more boxes (`_LEAST`).
+
+    The localisation counts with all poses that the odometry continues. Without it, the map has the frame of the odometry.
+    """
+    if log.localization is None or log.odometry is None:
+        return log
+    boxes = _stamps_of_boxes(log)
+    driven = _between(log.odometry.stamps, boxes, settings.poses.max_gap)
+    localized = _on_path(continued_by_odometry(log, settings), boxes[driven], settings)
+    return log if localized.sum() >= _LEAST * driven.sum() else replace(log, localization=None)
+
+
+def bridged(localization: Trajectory, odometry: Trajectory, stamps: Floats, settings: Settings) -> Bools:
+    """Return which stamps (Q,), s, lie between two poses of a localisation that the odometry joins without drifting too far.
+    The nearer one of the two measured the pose at such a stamp, and the odometry carried it there."""
+    _, covered = interpolate(odometry.stamps, odometry.poses, localization.stamps, settings.poses.max_gap)
+    known = localization.stamps[covered]
+    if len(known) < 2 or not len(stamps):
+        return np.zeros(len(stamps), dtype=bool)
+    joined, sure, _ = _ends(odometry, known, stamps, settings)
+    return joined.all(axis=0) & sure.any(axis=0) & _between(odometry.stamps, stamps, settings.poses.max_gap)
 
 
 def share_on_continuation(log: Log, continued: Log, settings: Settings) -> float:
     """Return the share of the boxes that have a pose in `continued`, from `continued_by_odometry`, but not in the log."""
-    before, after, max_gap = log.localization, continued.localization, settings.poses.max_gap
+    boxes = _stamps_of_boxes(log)
+    more = _only_continued(log, continued, boxes, settings)
+    return float(more.sum() / max(_on_path(continued, boxes, settings).sum(), 1))
+
+
+def _stamps_of_boxes(log: Log) -> Floats:
     stamps = [c.detections.frame_stamps[c.detections.frame] for c in log.cameras if c.detections is not None]
-    boxes = np.concatenate([np.zeros(0), *stamps])
-    if before is None or after is None or after is before or not len(boxes):
-        return 0.0
-    on_path = _between(after.stamps, boxes, max_gap)
-    more = on_path & ~_between(before.stamps, boxes, max_gap)
-    return float(more.sum() / max(on_path.sum(), 1))
+    return np.concatenate([np.zeros(0), *stamps])
+
+
+def _on_path(log: Log, stamps: Floats, settings: Settings) -> Bools:
+    """Return which stamps (Q,), s, have a pose in the localisation of a log."""
+    none = np.zeros(len(stamps), dtype=bool)
+    return none if log.localization is None else _between(log.localization.stamps, stamps, settings.poses.max_gap)
+
+
+def _only_continued(log: Log, continued: Log, stamps: Floats, settings: Settings) -> Bools:
+    """Return which stamps (Q,), s, have a pose in `continued`, but not in the log."""
+    if continued.localization is log.localization:
+        return np.zeros(len(stamps), dtype=bool)
+    return _on_path(continued, stamps, settings) & ~_on_path(log, stamps, settings)
 
 
 def _between(poses: Floats, stamps: Floats, max_gap: float) -> Bools:
@@ -74,21 +119,30 @@ def _between(poses: Floats, stamps: Floats, max_gap: float) -> Bools:
     return (next_ == stamps) | ((before <= stamps) & (stamps <= next_) & (next_ - before <= max_gap))
 
 
-def _near_localization(odometry: Trajectory, known: Floats, settings: Settings) -> tuple[Bools, Floats]:
-    """Return which poses of an odometry (N,) drifted little since, or until, the nearest localised stamp (L,), s, without a
-    gap of the odometry in between. Also return the times (N,), s, at which the offset of the odometry from the map holds for
-    them. It is their own time between two localised stamps, unless one of the two lies beyond a gap or does not exist.
+def _near_localization(odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings) -> tuple[Bools, Floats]:
+    """Return at which stamps (Q,), s, the odometry drifted little since, or until, the nearest localised stamp
+    (L,), s, without a gap of the odometry in between. Also return the times (Q,), s, at which the offset of the odometry
+    from the map holds for them. It is their own time between two localised stamps, unless one of the two lies beyond a gap
+    or does not exist.
     """
-    stamps = odometry.stamps
-    turned = gathered_drift(odometry, np.concatenate([stamps, known]), settings.odometry)[:, 2, 2]
-    drift, at_known = turned[: len(stamps)], turned[len(stamps) :]
-    stretch = np.concatenate([[0], np.cumsum(np.diff(stamps) > settings.poses.max_gap)])
-    of_known = stretch[np.clip(np.searchsorted(stamps, known), 0, len(stamps) - 1)]
-    after = np.searchsorted(known, stamps)
-    sure, joined, at = [], [], []
-    for end in (after - 1, after):
-        at.append(np.clip(end, 0, len(known) - 1))
-        joined.append((end == at[-1]) & (stretch == of_known[at[-1]]))
-        sure.append(joined[-1] & (np.abs(drift - at_known[at[-1]]) < _DRIFT**2))
+    joined, sure, at = _ends(odometry, known, stamps, settings)
     own = np.where(joined[0], known[at[0]], known[at[1]])
-    return sure[0] | sure[1], np.where(joined[0] & joined[1], stamps, own)
+    return np.asarray(sure.any(axis=0)), np.where(joined.all(axis=0), stamps, own)
+
+
+def _ends(odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings) -> tuple[Bools, Bools, Ints]:
+    """Compare stamps (Q,), s, with the localised stamps (L,), s, before and after them.
+
+    Returns for each of the two (2, Q): whether it exists without a gap of the odometry in between, whether the odometry
+    drifts little in between, and its index.
+    """
+    drift, at_known = np.split(
+        gathered_drift(odometry, np.concatenate([stamps, known]), settings.odometry)[:, 2, 2], [len(stamps)]
+    )
+    gap_ends = odometry.stamps[1:][np.diff(odometry.stamps) > settings.poses.max_gap]
+    stretch, of_known = (np.searchsorted(gap_ends, of, side="right") for of in (stamps, known))
+    after = np.searchsorted(known, stamps)
+    ends = np.stack([after - 1, after])
+    at = np.clip(ends, 0, len(known) - 1)
+    joined = (ends == at) & (stretch == of_known[at])
+    return joined, joined & (np.abs(drift - at_known[at]) < _DRIFT**2), at

@@ -17,6 +17,7 @@ from objslam.core.geometry import adjoint, interpolate, inverse
 from objslam.core.rotation import rotation_vector
 from objslam.core.trajectory import poses_near
 from objslam.core.types import Keyframes, Log, Trajectory
+from objslam.frontend.localization.continued_localization import bridged
 from objslam.frontend.odometry_drift import gathered_drift
 
 _STEP = 1e-3
@@ -39,9 +40,12 @@ def with_measurements(keyframes: Keyframes, log: Log, measured: Trajectory, sett
     stamps, max_gap, localization = keyframes.stamps, settings.poses.max_gap, log.localization
     assert localization is not None
     on_path = np.ones(len(stamps), dtype=bool)
+    between = ~on_path
     if measured is not localization:
         on_path = interpolate(measured.stamps, measured.poses, stamps, max_gap)[1]
-    used = stamps[on_path]
+        if log.odometry is not None:
+            between = bridged(measured, log.odometry, stamps, settings) & ~on_path
+    used = stamps[on_path | between]
     number = ((measured.stamps >= used[0]) & (measured.stamps <= used[-1])).sum() if len(used) else 0
     keyframes = replace(keyframes, localized_every=max(1.0, len(used) / max(float(number), 1.0)))
     if log.odometry is None or keyframes.odom_T_base is None:
@@ -49,7 +53,9 @@ def with_measurements(keyframes: Keyframes, log: Log, measured: Trajectory, sett
     localized_at = _measured_at(measured, log.odometry, keyframes, max_gap)
     if localized_at is None and on_path.all():
         return keyframes
-    localized_at = np.where(on_path, stamps if localized_at is None else localized_at, np.nan)
+    localized_at = np.where(on_path, stamps, np.nan) if localized_at is None else localized_at
+    localized_at = np.where(between, _nearest(measured.stamps, stamps), localized_at)
+    localized_at = np.where(on_path | between, localized_at, np.nan)
     on_odometry = partial(poses_near, log.odometry, max_gap=max_gap)
     odom_T_base = inverse(log.odometry.poses[0]) @ on_odometry(stamps)
     drift = (gathered_drift(log.odometry, at, settings.odometry) for at in (stamps, localized_at))
@@ -73,12 +79,17 @@ def _measured_at(localization: Trajectory, odometry: Trajectory, keyframes: Keyf
         known = corrected
     elif keyframes.localized_every <= _RARE:
         return None
-    after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
-    found = np.where(stamps - known[after - 1] < known[after] - stamps, known[after - 1], known[after])
+    found = _nearest(known, stamps)
     gap_ends = odometry.stamps[1:][np.diff(odometry.stamps) > max_gap]
     here, there = (np.searchsorted(gap_ends, of, side="right") for of in (stamps, found))
     _, on_odometry = interpolate(odometry.stamps, odometry.poses, stamps, max_gap)
     return np.where((here == there) & on_odometry, found, stamps)
+
+
+def _nearest(known: Floats, stamps: Floats) -> Floats:
+    """Return the nearest of at least two values `known` (L,), in order, to each of the stamps (Q,)."""
+    after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
+    return np.where(stamps - known[after - 1] < known[after] - stamps, known[after - 1], known[after])
 
 
 def _corrected(map_T_base: Floats, odom_T_base: Floats) -> Bools:

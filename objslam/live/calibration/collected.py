@@ -11,6 +11,7 @@ from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Tra
 from objslam.errors import ObjslamError
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
+from objslam.frontend.keyframes import UNCOVERED
 from objslam.frontend.known_errors import shared_errors
 from objslam.frontend.localization.measured_poses import with_measurements
 from objslam.frontend.shared_errors import SharedErrors
@@ -58,7 +59,7 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
         if len(off) and count_dropped:
             boxes, where = int(np.isin(r.keyframe, k.id[off]).sum()), f"stamp {k.stamp[off[0]]:.3f}"
             m.counters.drop("keyframes that the localisation does not cover", where, len(off))
-            m.counters.drop("boxes that the localisation does not cover", where, boxes)
+            m.counters.drop(UNCOVERED, where, boxes)
         order = order[k.localized[order]]
     number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
     number[k.id[order]] = np.arange(len(order))

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from objslam.core.snapshot import RARE_POSES, TOO_SLOW
 from objslam.frontend.bearings import CUT_OFF
+from objslam.frontend.keyframes import OFF_PATH, UNCOVERED
 from objslam.frontend.log_part import part_in_words
 from objslam.io.detections_jsonl import MALFORMED
 from objslam.mapping.checks.finding import NOISIER
@@ -24,6 +25,9 @@ variance is unexplained. A larger value gives fewer warnings."""
 _CUT = 1 / 3
 """A result needs a look if the image's edge cuts off more than this share of the boxes. A tenth is usual in the demo's
 rooms. A larger value gives fewer warnings."""
+_OFF_PATH = 1 / 3
+"""A result needs a look if more than this share of the boxes have no pose of the robot. Recordings often begin before the
+localisation, and end after it. A larger value gives fewer warnings."""
 _UNEXPLAINED = 0.25
 """A result needs a look if more than this share of the rays belong to no object or miss their object. A tenth is usual, from
 false boxes and moving things. A larger value gives fewer warnings."""
@@ -73,6 +77,7 @@ class Evidence:
     deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log that is a
     part of a recording, as in `Log`.
     malformed: the frames of boxes that were malformed. unused: the paths of the robot that could not be used.
+    off_path: the boxes without a pose of the robot.
     odometry_unused: whether the mode was left to the log, and a `fixed` run did not use its odometry.
     """
 
@@ -104,6 +109,7 @@ class Evidence:
     odometry_unused: bool = False
     malformed: int = 0
     unused: tuple[str, ...] = ()
+    off_path: int = 0
 
 
 @dataclass(frozen=True)
@@ -156,6 +162,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         odometry_unused=summary.get("odometry_unused", False),
         malformed=malformed_frames(summary["dropped"]),
         unused=tuple(summary.get("unused_paths", ())),
+        off_path=sum(n for reason, n in summary["dropped"].items() if reason.startswith((*OFF_PATH, UNCOVERED))),
     )
 
 
@@ -253,6 +260,11 @@ def _check(e: Evidence) -> list[str]:
             "boxes of equal things that hide each other bend the path. Depths would show it."
         )
     found += lost_input(e.unused, e.malformed, e.frames)
+    if e.off_path > _OFF_PATH * e.boxes:
+        found.append(
+            f"{100 * e.off_path / e.boxes:.0f} % of the boxes have no pose of the robot, so the map does without them: the "
+            "warnings say why."
+        )
     if _may_be_bent(e):
         found.append(
             f"The boxes agree only if the odometry is {e.odometry:.1f} times as noisy as the settings say, and labels do "

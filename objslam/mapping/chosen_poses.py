@@ -1,0 +1,50 @@
+"""Choose the poses and the mode of a run, where the settings leave them to the log."""
+
+from dataclasses import replace
+
+from objslam.config import Settings
+from objslam.core.diagnostics import Ledger
+from objslam.core.types import Log
+from objslam.errors import LogError
+from objslam.frontend.localization.continued_localization import (
+    continued_by_odometry,
+    share_on_continuation,
+    without_short_localization,
+)
+
+_BEYOND = 0.1
+"""With the mode `auto`, the poses are solved if the odometry continues the localisation for this share of the boxes or more.
+A larger share leaves out more boxes, and spares more logs the time of a solve of the poses."""
+_SHORT = "the localisation"
+"""The name of a localisation that is left out, in the warning and in the assessment."""
+
+
+def with_chosen_poses(log: Log, settings: Settings, ledger: Ledger) -> Log:
+    """Return the log with its `chosen_poses`. The ledger gets a warning if a short localisation is left out."""
+    chosen = chosen_poses(log, settings)
+    if settings.poses.use == "auto" and chosen.localization is not log.localization:
+        ledger.do_without(_SHORT, f"{_SHORT} covers less than half of the boxes (--set poses.use=localization keeps it)")
+    return chosen
+
+
+def chosen_poses(log: Log, settings: Settings) -> Log:
+    """Return the log with the poses that the settings choose.
+
+    If they leave the choice to the log, a localisation that covers few boxes is left out, unless the mode is `fixed`.
+    LogError if the log lacks the chosen poses.
+    """
+    use = settings.poses.use
+    if use == "auto":
+        return log if settings.mode == "fixed" else without_short_localization(log, settings)
+    if (log.odometry if use == "odometry" else log.localization) is None:
+        raise LogError(f"the log has no {use}", where=log.name, hint="set poses.use to auto")
+    return replace(log, localization=None) if use == "odometry" else replace(log, odometry=None)
+
+
+def with_mode_of(log: Log, settings: Settings) -> Settings:
+    """Return the settings with `auto` replaced by the mode that it means for a log with the chosen poses."""
+    if settings.mode != "auto":
+        return settings
+    more = share_on_continuation(log, continued_by_odometry(log, settings), settings)
+    joint = log.localization is None or more >= _BEYOND
+    return settings.model_copy(update={"mode": "joint" if joint else "fixed"})
