@@ -48,7 +48,10 @@ def corrected_poses(
         map_T_base = np.stack([odometry_at(error, stamps) for stamps, error in zip(known, errors, strict=True)])
         return known, map_T_base, base_T_camera
     map_T_base = poses_near(localization, known.ravel(), max_gap).reshape(*known.shape, 4, 4)
-    if (localized_at := keyframes.localized_at) is not None:
+    if keyframes.localized_at is not None:
+        # The odometry carries no pose to a keyframe that it does not reach, as sessions have them.
+        reached = True if keyframes.stretch is None else keyframes.stretch >= 0
+        localized_at = np.where(reached, keyframes.localized_at, np.nan)
         for at, stamps, error in zip(map_T_base, known, errors, strict=True):
             at[:] = carried_by_odometry(at, stamps, localized_at, localization, partial(odometry_at, error), max_gap)
     return known, map_T_base, base_T_camera

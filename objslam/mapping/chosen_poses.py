@@ -23,7 +23,7 @@ def with_chosen_poses(log: Log, settings: Settings, ledger: Ledger) -> Log:
     """Return the log with its `chosen_poses`. The ledger gets a warning if a short localisation is left out."""
     chosen = chosen_poses(log, settings)
     if settings.poses.use == "auto" and chosen.localization is not log.localization:
-        ledger.do_without(_SHORT, f"{_SHORT} covers less than half of the boxes (--set poses.use=localization keeps it)")
+        ledger.do_without(_SHORT, f"{_SHORT} covers too few boxes (--set poses.use=localization keeps it)")
     return chosen
 
 

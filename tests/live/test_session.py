@@ -19,6 +19,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import align, inverse, lift_se2
 from objslam.core.types import Trajectory
 from objslam.errors import SolveError
+from objslam.evaluation.evaluate import evaluate
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.boxes.nested_boxes import PARTS
 from objslam.frontend.keyframes import build_keyframes
@@ -265,18 +266,42 @@ def test_what_the_lens_cannot_see_is_not_missed():
     assert expected == seen
 
 
-def test_keyframes_that_the_localisation_does_not_cover_are_counted():
+def localised_until(share, gap=None):
+    """A log whose localisation ends after a share of the time. gap: the shares between which the odometry has a gap."""
     log = make_log(localization=preset("demo").localization)
-    stamps = log.localization.stamps
-    half = len(stamps) // 2
-    session = drive(replace(log, localization=Trajectory(stamps[:half], log.localization.poses[:half])))
+    begin, end = log.localization.stamps[[0, -1]]
+    kept = log.localization.stamps <= begin + share * (end - begin)
+    log = replace(log, localization=Trajectory(log.localization.stamps[kept], log.localization.poses[kept]))
+    if gap is None:
+        return log
+    at = (log.odometry.stamps - begin) / (end - begin)
+    kept = (at < gap[0]) | (at > gap[1])
+    return replace(log, odometry=Trajectory(log.odometry.stamps[kept], log.odometry.poses[kept]))
+
+
+def test_keyframes_that_the_localisation_does_not_cover_are_counted():
+    """The odometry does not continue the localisation across its own gap."""
+    log = localised_until(0.4, gap=(0.45, 0.6))
+    session = drive(log)
     result = session.stop()
     dropped = session.counters.dropped()
     lost = dropped["boxes that the localisation does not cover"]
     assert dropped["keyframes that the localisation does not cover"] > 10
     assert lost + result.summary["counts"]["rays"] == len(session._mapper.state.rays)
-    assert result.keyframes.stamps[-1] <= stamps[half - 1]
+    assert log.localization.stamps[-1] < result.keyframes.stamps[-1] <= log.localization.stamps[-1] + 1.6
     assert result.summary["dropped"]["boxes that the localisation does not cover"] == lost
+
+
+@pytest.mark.parametrize("share", [0.7, 0.02])
+def test_the_odometry_continues_a_localisation_that_ends(share):
+    log = localised_until(share)
+    session = drive(log)
+    result = session.stop()
+    assert "boxes that the localisation does not cover" not in session.counters.dropped()
+    assert result.summary["counts"]["rays"] == len(session._mapper.state.rays)
+    found = evaluate(result.map, log.truth, align="none", radius=0.5).objects
+    assert len(found.matches) >= 10
+    assert np.sqrt((found.errors**2).mean()) < 0.15
 
 
 def test_a_session_that_saw_too_little_for_an_object_ends_with_none():

@@ -24,18 +24,19 @@ _MOST = 0.5
 poses, nothing shows the noise of the localisation, and the ellipsoids become too small. A larger share continues shorter
 localisations."""
 
-_LEAST = 0.5
-"""The least share of the boxes with a pose of the odometry that a localisation has to cover, also with continued poses. Else
-the odometry is used alone. With a larger share, fewer maps have the frame of the localisation."""
+_LEAST = 2 / 3
+"""The boxes that a localisation has to cover, also with continued poses, as a share of those that the odometry covers. With
+fewer, the odometry is used alone. With a larger share, fewer maps have the frame of the localisation."""
 
 
-def continued_by_odometry(log: Log, settings: Settings) -> Log:
+def continued_by_odometry(log: Log, settings: Settings, *, whole: bool = False) -> Log:
     """Return the log with a localisation that also has the poses of the odometry outside of its time and in its gaps.
 
     The continued poses join the localised poses at both ends of a gap. A gap of the odometry ends the continuation, because
     somebody may have moved the robot in it. It also ends where the odometry has drifted too far. The log is returned
     unchanged if there is nothing to continue, and if most boxes would lie outside of the localisation's time, or in gaps
-    that the odometry does not bridge (`bridged`).
+    that the odometry does not bridge (`bridged`). whole: whether to continue as far as
+    the odometry goes, because the solve starts at other poses.
     """
     localization, odometry = log.localization, log.odometry
     if localization is None or odometry is None or not len(localization):
@@ -46,7 +47,7 @@ def continued_by_odometry(log: Log, settings: Settings) -> Log:
         return log
     known = localization.stamps[covered]
     map_T_odom = localization.poses[covered] @ inverse(at[covered])
-    sure, times = _near_localization(odometry, known, odometry.stamps, settings)
+    sure, times = _near_localization(odometry, known, odometry.stamps, settings, np.inf if whole else _DRIFT)
     free = sure & ~_between(localization.stamps, odometry.stamps, max_gap)
     if not free.any():
         return log
@@ -58,7 +59,7 @@ def continued_by_odometry(log: Log, settings: Settings) -> Log:
     continued = replace(log, localization=Trajectory(every[order], poses[order]))
     boxes = _stamps_of_boxes(log)
     more = _only_continued(log, continued, boxes, settings) & ~bridged(localization, odometry, boxes, settings)
-    return continued if more.sum() <= _MOST * _on_path(continued, boxes, settings).sum() else log
+    return continued if whole or more.sum() <= _MOST * _on_path(continued, boxes, settings).sum() else log
 
 
 def without_short_localization(log: Log, settings: Settings) -> Log:
@@ -70,7 +71,7 @@ def without_short_localization(log: Log, settings: Settings) -> Log:
         return log
     boxes = _stamps_of_boxes(log)
     driven = _between(log.odometry.stamps, boxes, settings.poses.max_gap)
-    localized = _on_path(continued_by_odometry(log, settings), boxes[driven], settings)
+    localized = _on_path(continued_by_odometry(log, settings), boxes, settings)
     return log if localized.sum() >= _LEAST * driven.sum() else replace(log, localization=None)
 
 
@@ -81,7 +82,7 @@ def bridged(localization: Trajectory, odometry: Trajectory, stamps: Floats, sett
     known = localization.stamps[covered]
     if len(known) < 2 or not len(stamps):
         return np.zeros(len(stamps), dtype=bool)
-    joined, sure, _ = _ends(odometry, known, stamps, settings)
+    joined, sure, _ = _ends(odometry, known, stamps, settings, _DRIFT)
     return joined.all(axis=0) & sure.any(axis=0) & _between(odometry.stamps, stamps, settings.poses.max_gap)
 
 
@@ -119,22 +120,24 @@ def _between(poses: Floats, stamps: Floats, max_gap: float) -> Bools:
     return (next_ == stamps) | ((before <= stamps) & (stamps <= next_) & (next_ - before <= max_gap))
 
 
-def _near_localization(odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings) -> tuple[Bools, Floats]:
+def _near_localization(
+    odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings, drift: float
+) -> tuple[Bools, Floats]:
     """Return at which stamps (Q,), s, the odometry drifted little since, or until, the nearest localised stamp
     (L,), s, without a gap of the odometry in between. Also return the times (Q,), s, at which the offset of the odometry
     from the map holds for them. It is their own time between two localised stamps, unless one of the two lies beyond a gap
-    or does not exist.
+    or does not exist. drift: rad, the largest.
     """
-    joined, sure, at = _ends(odometry, known, stamps, settings)
+    joined, sure, at = _ends(odometry, known, stamps, settings, drift)
     own = np.where(joined[0], known[at[0]], known[at[1]])
     return np.asarray(sure.any(axis=0)), np.where(joined.all(axis=0), stamps, own)
 
 
-def _ends(odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings) -> tuple[Bools, Bools, Ints]:
+def _ends(odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings, most: float) -> tuple[Bools, Bools, Ints]:
     """Compare stamps (Q,), s, with the localised stamps (L,), s, before and after them.
 
-    Returns for each of the two (2, Q): whether it exists without a gap of the odometry in between, whether the odometry
-    drifts little in between, and its index.
+    most: rad, the largest drift. Returns for each of the two (2, Q): whether it exists without a gap of the odometry in
+    between, whether the odometry drifts little in between, and its index.
     """
     drift, at_known = np.split(
         gathered_drift(odometry, np.concatenate([stamps, known]), settings.odometry)[:, 2, 2], [len(stamps)]
@@ -145,4 +148,4 @@ def _ends(odometry: Trajectory, known: Floats, stamps: Floats, settings: Setting
     ends = np.stack([after - 1, after])
     at = np.clip(ends, 0, len(known) - 1)
     joined = (ends == at) & (stretch == of_known[at])
-    return joined, joined & (np.abs(drift - at_known[at]) < _DRIFT**2), at
+    return joined, joined & (np.abs(drift - at_known[at]) < most**2), at

@@ -101,7 +101,7 @@ class Calibrator(Rounds[tuple[Calibration, NoiseFactors] | None, CalibrationMess
         Other noise is not estimated. It stays as in the settings until the end of the session, and so do the errors `_LATE`.
         """
         m = self._mapper.state
-        found = collect(m, self._name, count_dropped=False)
+        found = collect(m, self._name, running=True)
         errors, theta = found.errors, found.theta
         if errors is None or theta is None or not found.association.count:
             return None

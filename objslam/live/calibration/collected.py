@@ -16,6 +16,7 @@ from objslam.frontend.known_errors import shared_errors
 from objslam.frontend.localization.measured_poses import with_measurements
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.frontend.surface_ranges import measured_ranges, range_factors
+from objslam.live.calibration.covered_keyframes import at_the_end, into_frame, while_running
 from objslam.live.mapper.state import MapState
 from objslam.mapping.solution import seen_something
 
@@ -45,41 +46,46 @@ class Collected:
     theta: Floats | None
 
 
-def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
+def collect(m: MapState, name: str, running: bool = False) -> Collected:
     """Collect the keyframes, the rays, the association and the estimate of a session. name: the name of the log.
 
-    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping. count_dropped: whether
-    to count the left out keyframes and their boxes. Tracks with enough rays become objects too.
+    If there is a localisation, keyframes that it does not cover are left out, as in offline mapping. running: whether the
+    session goes on. If not, the left out keyframes and their boxes are counted, and the odometry continues the localisation.
+    Tracks with enough rays become objects too.
     """
     m.graph.refresh()
     k, r = m.keyframes, m.rays
     order = m.time_order()
-    if k.localized.any():
-        off = order[~k.localized[order]]
-        if len(off) and count_dropped:
-            boxes, where = int(np.isin(r.keyframe, k.id[off]).sum()), f"stamp {k.stamp[off[0]]:.3f}"
-            m.counters.drop("keyframes that the localisation does not cover", where, len(off))
-            m.counters.drop(UNCOVERED, where, boxes)
-        order = order[k.localized[order]]
+    covered = while_running(m, order) if running else at_the_end(m, order)
+    off = order[~covered.mask]
+    if len(off) and not running:
+        boxes, where = int(np.isin(r.keyframe, k.id[off]).sum()), f"stamp {k.stamp[off[0]]:.3f}"
+        m.counters.drop("keyframes that the localisation does not cover", where, len(off))
+        m.counters.drop(UNCOVERED, where, boxes)
+    moved = np.eye(4) if running else into_frame(m, order, covered)
+    order = order[covered.mask]
     number = np.full(int(k.id.max(initial=-1)) + 1, -1, dtype=np.int64)
     number[k.id[order]] = np.arange(len(order))
     owner, label, place = _owners(m)
     at = number[r.keyframe]
     rows = np.flatnonzero(at >= 0)
     part = _of_robot_parts(m, rows)
-    if count_dropped and part.any():
+    if not running and part.any():
         m.counters.drop(ROBOT_PARTS, f"stamp {k.stamp[order[at[rows[part]].min()]]:.3f}", int(part.sum()))
     rows = rows[~part]
     rows = rows[np.argsort(at[rows], kind="stable")]
     poses = m.graph.poses(k.id[order])
     kept = np.unique(at[rows])
-    keyframes, rays = seen_something(as_measured(m, order), rays_as_measured(m, rows, at[rows]))
+    measured = replace(as_measured(m, order), map_T_base=covered.map_T_base[covered.mask])
+    keyframes, rays = seen_something(measured, rays_as_measured(m, rows, at[rows]))
     owners, index = np.unique(owner[rows], return_inverse=True)
     objects = owners[owners >= 0]
     association = Association(index - (len(owners) - len(objects)), label[objects])
-    log = recorded_log(m, name, keyframes)
-    if log.localization is not None and k.localized.any():
-        keyframes = with_measurements(keyframes, log, log.localization, m.given)
+    log = replace(recorded_log(m, name, keyframes), localization=covered.localization)
+    localized = m.course.localized.trajectory()
+    if localized is not None and log.localization is not None and (k.localized.any() or not running):
+        same = len(localized) == len(log.localization)  # Then the odometry continues nothing.
+        keyframes = with_measurements(keyframes, log, log.localization if same else localized, m.given)
     errors = _shared_errors(m, log, keyframes, rays)
     held = {n: value for n, value in m.errors.items() if errors is None or n not in errors.names}
     if held and len(rays):
@@ -89,7 +95,7 @@ def collect(m: MapState, name: str, count_dropped: bool = True) -> Collected:
         log = known.corrected_log(values)
         errors = None if errors is None else replace(errors, log=log, keyframes=keyframes, rays=rays)
     theta = None if errors is None else corrections(m, errors)
-    numbers, estimate = r.number[rows], (poses[kept], place[objects])
+    numbers, estimate = r.number[rows], (moved @ poses[kept], place[objects] @ moved[:3, :3].T + moved[:3, 3])
     return Collected(keyframes, k.id[order[kept]], rays, numbers, association, objects, *estimate, log, errors, theta)
 
 

@@ -95,7 +95,7 @@ class NameJudge(Rounds[NamesMessage | None, NamesMessage]):
             return None
         if len(m.rays.owner) > m.settings.live.reassociate or (m.by_label and not contradicted(m).any()):
             return None
-        found = collect(m, self._name, count_dropped=False)
+        found = collect(m, self._name, running=True)
         return NamesRequest(found, tuple(one.camera for one in found.log.cameras), m.given) if len(found.rays) else None
 
     def _correction(self, number: int, answer: NamesMessage | None) -> NamesMessage | None:

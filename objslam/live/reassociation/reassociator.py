@@ -132,7 +132,7 @@ class Reassociator(Rounds[AssociationMessage | None, AssociationMessage]):
         classes = m.kinds.classes(m.rays.label)
         if not classes.any() or not len(m.landmarks) or len(classes) > m.settings.live.reassociate:
             return None
-        found = collect(m, self._name, count_dropped=False)
+        found = collect(m, self._name, running=True)
         at = np.searchsorted(m.rays.number, found.numbers)
         return AssociationRequest(
             found, m.rays.owner[at], classes[at], tuple(one.camera for one in found.log.cameras), m.given

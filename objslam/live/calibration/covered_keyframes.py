@@ -1,0 +1,62 @@
+"""Find the keyframes of a session that its paths cover at its end, as an offline run does."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.arrays import Bools, Floats, Ints
+from objslam.core.geometry import interpolate, inverse
+from objslam.core.types import Log, Trajectory
+from objslam.frontend.localization.continued_localization import continued_by_odometry
+from objslam.live.mapper.state import MapState
+
+
+@dataclass(frozen=True)
+class Covered:
+    """The keyframes that the localisation of a session covers, all of them without a localisation.
+
+    mask: (n,) which they are. map_T_base: (n, 4, 4) the poses that the paths give. localization: the path, also where the
+    odometry continues it.
+    """
+
+    mask: Bools
+    map_T_base: Floats
+    localization: Trajectory | None
+
+
+def while_running(m: MapState, rows: Ints) -> Covered:
+    """Return which keyframes in these rows (n,) the session has localised so far, all of them if it has localised none."""
+    k = m.keyframes
+    mask = k.localized[rows] if k.localized.any() else np.ones(len(rows), dtype=bool)
+    return Covered(mask, k.map_T_base[rows], m.course.localized.trajectory())
+
+
+def at_the_end(m: MapState, rows: Ints) -> Covered:
+    """Return which keyframes in these rows (n,) the localisation covers where the odometry bridges and continues it.
+
+    The odometry continues it over any distance, because the solve starts at the poses of the session.
+    """
+    k, settings, running = m.keyframes, m.given, while_running(m, rows)
+    driven, localized = m.course.driven.trajectory(), running.localization
+    if driven is None or localized is None:
+        return running
+    paths = Log(name="", cameras=(), odometry=driven, localization=localized)
+    path = continued_by_odometry(paths, settings, whole=True).localization
+    assert path is not None
+    poses, on_path = interpolate(path.stamps, path.poses, k.sent[rows], settings.poses.max_gap)
+    known = k.localized[rows]
+    poses[known] = k.map_T_base[rows[known]]
+    return Covered(on_path | known, poses, path)
+
+
+def into_frame(m: MapState, rows: Ints, covered: Covered) -> Floats:
+    """Return the pose (4, 4) of the session's frame in the frame of the keyframes covered at the end.
+
+    It is another frame if the localisation was too rare to localise a keyframe of the session. rows: (n,) as in `covered`.
+    """
+    first = np.flatnonzero(covered.mask)[:1]
+    if covered.localization is None or m.keyframes.localized.any() or not len(first):
+        return np.eye(4)
+    row = rows[first[0]]
+    session_T_camera = m.graph.poses(m.keyframes.id[[row]])[0]
+    return np.asarray(covered.map_T_base[first[0]] @ m.keyframes.base_T_camera[row] @ inverse(session_T_camera))
