@@ -83,7 +83,7 @@ def collect(m: MapState, name: str, running: bool = False) -> Collected:
     association = Association(index - (len(owners) - len(objects)), label[objects])
     log = replace(recorded_log(m, name, keyframes), localization=covered.localization)
     localized = m.course.localized.trajectory()
-    if localized is not None and log.localization is not None and (k.localized.any() or not running):
+    if localized is not None and log.localization is not None:
         same = len(localized) == len(log.localization)  # Then the odometry continues nothing.
         keyframes = with_measurements(keyframes, log, log.localization if same else localized, m.given)
     errors = _shared_errors(m, log, keyframes, rays)

@@ -25,10 +25,12 @@ class Covered:
 
 
 def while_running(m: MapState, rows: Ints) -> Covered:
-    """Return which keyframes in these rows (n,) the session has localised so far, all of them if it has localised none."""
+    """Return which keyframes in these rows (n,) the session has localised so far. If it has localised none, all of them are
+    covered, and the session has no localisation."""
     k = m.keyframes
-    mask = k.localized[rows] if k.localized.any() else np.ones(len(rows), dtype=bool)
-    return Covered(mask, k.map_T_base[rows], m.course.localized.trajectory())
+    if not k.localized.any():
+        return Covered(np.ones(len(rows), dtype=bool), k.map_T_base[rows], None)
+    return Covered(k.localized[rows], k.map_T_base[rows], m.course.localized.trajectory())
 
 
 def at_the_end(m: MapState, rows: Ints) -> Covered:
@@ -36,17 +38,18 @@ def at_the_end(m: MapState, rows: Ints) -> Covered:
 
     The odometry continues it over any distance, because the solve starts at the poses of the session.
     """
-    k, settings, running = m.keyframes, m.given, while_running(m, rows)
-    driven, localized = m.course.driven.trajectory(), running.localization
+    k, settings = m.keyframes, m.given
+    driven, localized = m.course.driven.trajectory(), m.course.localized.trajectory()
     if driven is None or localized is None:
-        return running
+        return while_running(m, rows)
     paths = Log(name="", cameras=(), odometry=driven, localization=localized)
     path = continued_by_odometry(paths, settings, whole=True).localization
     assert path is not None
     poses, on_path = interpolate(path.stamps, path.poses, k.sent[rows], settings.poses.max_gap)
     known = k.localized[rows]
     poses[known] = k.map_T_base[rows[known]]
-    return Covered(on_path | known, poses, path)
+    mask = on_path | known
+    return Covered(mask, poses, path) if mask.any() else while_running(m, rows)
 
 
 def into_frame(m: MapState, rows: Ints, covered: Covered) -> Floats:

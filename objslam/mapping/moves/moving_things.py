@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from objslam.core.geometry import angles_off
+from objslam.core.geometry import angles_off, lengths
 from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
@@ -156,7 +156,9 @@ def _moving(
     pure = np.bincount(owner[told], share, association.count) / np.maximum(many, 1)
     held = np.flatnonzero(owner >= 0)
     origins, directions = rays.in_map(map_T_camera)
-    off = angles_off(origins[held], directions[held], estimate.positions[owner[held]]) / rays.sigma[held]
+    noise = _noise(keyframes, rays, settings)
+    places = estimate.positions[owner[held]]
+    off = angles_off(origins[held], directions[held], places) / noise.at(lengths(places - origins[held]), held)
     number = np.bincount(owner[held], minlength=association.count).astype(np.float64)
     squares = np.bincount(owner[held], np.nan_to_num(off) ** 2, association.count).astype(np.float64)
     label = association.label
@@ -171,13 +173,32 @@ def _moving(
     if rest.sum() >= _USUAL:
         usual = float(np.median(squares[rest] / number[rest]))
         moves |= passed & (all_squares > _SCATTER**2 * usual * all_rays)
-        wander = _wander(keyframes, rays, np.where(long, track, -1), owner, map_T_camera, settings, usual)
+        wander = _wander(keyframes, rays, np.where(long, track, -1), owner, map_T_camera, settings, usual, noise)
         fits = squares <= _SCATTER**2 * usual * number
     # An object without long tracks, such as one whose rays are all rejected, would take up rays of the dropped objects.
     shown = np.flatnonzero(long & (owner >= 0))
     visits = _visits(keyframes.stamps[rays.keyframe[shown]], owner[shown], association.count)
     of_moving = (moves | wander)[label] & ((pure < _PURE) | (visits == 0))
     return np.asarray(of_moving | (wander[label] & ((visits < _VISITS) | ~fits)))
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """The standard deviations of rays. angle: (R,) rad. place: m, of their origins, 0 at solved poses."""
+
+    angle: Floats
+    place: float
+
+    def at(self, distance: Floats, rays: Ints) -> Floats:
+        """Return the standard deviations (n,), rad, of some rays (n,) at things at a distance (n,), m, NaN if unknown."""
+        return np.hypot(self.angle[rays], np.nan_to_num(self.place / np.maximum(distance, 1e-9)))
+
+
+def _noise(keyframes: Keyframes, rays: Rays, settings: Settings) -> _Noise:
+    """Return the noise of rays. At given poses, near things miss their rays by the noise of the poses too."""
+    from objslam.graph.fixed_pose_triangulation import pose_noise
+
+    return _Noise(*(pose_noise(rays, keyframes, settings) if settings.mode == "fixed" else (rays.sigma, 0.0)))
 
 
 def _wander(
@@ -188,6 +209,7 @@ def _wander(
     map_T_camera: Floats,
     settings: Settings,
     usual: float,
+    noise: _Noise,
 ) -> Bools:
     """Return the labels (L,) whose boxes follow things that move.
 
@@ -202,6 +224,7 @@ def _wander(
         map_T_camera: (K, 4, 4).
         settings: of the run.
         usual: the mean square of the residuals of a thing at rest, in variances of a ray.
+        noise: of the rays.
     """
     from objslam.graph.fixed_pose_triangulation import triangulate_at
 
@@ -212,11 +235,12 @@ def _wander(
     mine[held] = inverse.ravel()
     found = triangulate_at(map_T_camera, keyframes, rays, Association(mine, label), settings)
     origins, directions = rays.in_map(map_T_camera)
-    track, origins, directions, sigma = mine[held], origins[held], directions[held], rays.sigma[held]
+    track, origins, directions = mine[held], origins[held], directions[held]
     length = np.bincount(track, minlength=count)
     middle = np.stack([np.bincount(track, way, count) for way in directions.T], axis=1).astype(np.float64)
     point = angles_off(origins, directions, found.positions[track])
     parallel = angles_off(np.zeros_like(origins), directions, middle[track])
+    sigma = noise.at(lengths(found.positions[track] - origins), held)
     squares = np.minimum(*(np.bincount(track, np.nan_to_num(off / sigma) ** 2, count) for off in (point, parallel)))
     explained = np.bincount(track, owner[held] >= 0, count) >= _EXPLAINED * length
     follow = (squares > _APART**2 * usual * length) & ~explained
