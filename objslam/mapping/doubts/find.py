@@ -15,6 +15,7 @@ from objslam.mapping.doubts import disagreeing as apart
 from objslam.mapping.doubts import unsure as wide
 from objslam.mapping.doubts.evidence import Evidence, evidence_of
 from objslam.mapping.doubts.groups import REASONS, BoxGroups, Reason, find_groups
+from objslam.mapping.doubts.overlapping import overlapping
 from objslam.mapping.doubts.pairs import Pairs, find_pairs
 from objslam.mapping.doubts.sizes import mixed_sizes
 from objslam.mapping.doubts.splits import Splits, find_splits
@@ -65,7 +66,8 @@ def with_doubts(result: RunResult) -> RunResult:
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)
-    doubts = tuple(in_words(result, found.pairs, found.splits, found.groups))
+    filling = overlapping(result, found.pairs)
+    doubts = (*filling, *in_words(result, found.pairs, found.splits, found.groups))
     cut = cut_off.cut_things(result)
     unmapped, told = unmapped_labels(result, evidence, cut), {one.label for one in doubts if one.kind == "boxes"}
     disagreeing = [*apart.crossing(result, evidence), *apart.disagreeing(result, apart.misfits_of(result))]
@@ -77,7 +79,7 @@ def with_doubts(result: RunResult) -> RunResult:
     doubts = (*doubts, *of_things, *(one for one in unmapped if one.label not in told))
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
-    doubles = int((found.pairs.probability >= _DOUBLE).sum())
+    doubles = int((found.pairs.probability >= _DOUBLE).sum()) + sum(_of_one_label(one, result) for one in filling)
     if "assessment" in summary:
         lost, named = _of_lost_things(found.groups, result), wide.in_assessment(unsure, result)
         if wide.are_most(unsure, result):
@@ -89,6 +91,11 @@ def with_doubts(result: RunResult) -> RunResult:
         named += [*_of_moved_things(found.groups, result), *in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *named]}
     return replace(result, doubts=doubts, summary=summary)
+
+
+def _of_one_label(doubt: Doubt, result: RunResult) -> bool:
+    """Return whether the objects of a doubt have one label. A thing with another one in it or on it is no double."""
+    return len({one.label for one in result.map.objects if one.id in doubt.objects}) == 1
 
 
 def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -> dict[str, Any]:
