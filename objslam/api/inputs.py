@@ -66,7 +66,7 @@ class Detections(types.Detections):
         cls,
         stamps: ArrayLike,
         boxes: Sequence[ArrayLike],
-        labels: Sequence[Sequence[str]],
+        labels: Sequence[Sequence[str | int]],
         scores: Sequence[ArrayLike] | None = None,
         *,
         depths: Sequence[ArrayLike] | None = None,
@@ -76,11 +76,11 @@ class Detections(types.Detections):
     ) -> Self:
         """Make detections from one list for each of F frames. A frame without a box has empty lists.
 
-        stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names.
-        scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z in m, NaN where unknown.
-        track_ids: for each frame B integers, -1 where unknown. features: for each frame (B, D) appearance vectors, such as
-        the embeddings of a network. D is at least 1. An unknown vector is a row of NaN. whole: True if boxes are not cut off
-        at the image's edge. ValueError names what is wrong.
+        stamps: (F,) s. boxes: for each frame (B, 4) x1, y1, x2, y2 in px of the raw image. labels: for each frame B names
+        or integers. scores: for each frame (B,) in [0, 1], 1 by default. depths: for each frame (B,) z in m, NaN where
+        unknown. track_ids: for each frame B integers, -1 where unknown. features: for each frame (B, D) appearance vectors,
+        such as the embeddings of a network. D is at least 1. An unknown vector is a row of NaN. whole: True if boxes are not
+        cut off at the image's edge. ValueError names what is wrong.
         """
         frames = [as_boxes(one, f"frame {k}") for k, one in enumerate(boxes)]
         counts = [len(one) for one in frames]
@@ -96,7 +96,7 @@ class Detections(types.Detections):
         if max(counts, default=0) > types.MAX_BOXES:
             raise ValueError(f"a frame has more than {types.MAX_BOXES} boxes")
         corners, score = np.concatenate([*frames, np.zeros((0, 4))]), per_box(scores, counts, 1.0, "scores")
-        names, depth = [name for one in labels for name in one], per_box(depths, counts, np.nan, "depths")
+        names, depth = [_name(label) for one in labels for label in one], per_box(depths, counts, np.nan, "depths")
         named = np.array([is_name(name) for name in names], dtype=bool)
         known = np.isnan(depth) | valid_depths(depth)
         frame = np.repeat(np.arange(len(frames)), counts)
@@ -132,6 +132,9 @@ class Log(types.Log):
         """
         lenses = [as_camera(one) for one in ([cameras] if isinstance(cameras, Camera) else cameras)]
         boxes = [detections] if isinstance(detections, types.Detections) else list(detections)
+        names = [one.name for one in lenses]
+        if repeated := sorted({one for one in names if names.count(one) > 1}):
+            raise ValueError(f"each camera needs a name of its own, got {', '.join(map(repr, repeated))} more than once")
         if len(lenses) != len(boxes):
             raise ValueError(f"each camera needs its detections, got {len(lenses)} cameras and {len(boxes)} detections")
         if odometry is None and localization is None:
@@ -157,6 +160,11 @@ class Log(types.Log):
 
     def _paths(self) -> dict[str, types.Trajectory | None]:
         return {"odometry": self.odometry, "localisation": self.localization}
+
+
+def _name(label: str | int) -> str:
+    """Return the name of a label, which may be an integer, as in detections.jsonl. Anything else stays as it is."""
+    return str(int(label)) if isinstance(label, (int, np.integer)) and not isinstance(label, bool) else label  # type: ignore[return-value]
 
 
 def _unit_features(features: Sequence[ArrayLike], counts: list[int]) -> Floats32:

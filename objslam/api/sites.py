@@ -28,8 +28,10 @@ def merge(sessions: Sequence[Given]) -> tuple[Island, ...]:
 
     sessions: in the order of time. Return one island for each group of sessions that share objects, the largest first.
     `Island.objects` is its map, in the frame of its first session, and `MapObject.life` says what became of each object.
-    ValueError without a session. OutputError if a path cannot be read.
+    ValueError without a session, and for one path alone. OutputError if a path cannot be read.
     """
+    if isinstance(sessions, (str, PathLike)):
+        raise ValueError(f"merge needs a sequence of sessions, got the one path {str(sessions)!r}")
     if not sessions:
         raise ValueError("merge needs at least one session")
     found = merge_sessions([_session(one, f"session {number}") for number, one in enumerate(sessions)])

@@ -245,6 +245,12 @@ def in_field(camera: Camera, points: Floats) -> Bools:
     return ahead
 
 
+def same_lens(one: Camera, other: Camera) -> bool:
+    """Return whether two cameras have the same matrix, distortion and image size."""
+    shape = one.distortion_model == other.distortion_model and (one.width, one.height) == (other.width, other.height)
+    return shape and np.array_equal(one.matrix, other.matrix) and np.array_equal(one.distortion, other.distortion)
+
+
 def in_view(camera: Camera, points: Floats, low: Floats | None = None, high: Floats | None = None) -> tuple[Ints, Floats]:
     """Return the indices (n,) and raw pixels (n, 2) of those points (N, 3) that the image shows.
 

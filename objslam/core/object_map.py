@@ -227,7 +227,9 @@ class ObjectMap:
         return None if found is None else objects[found]
 
     def in_radius(self, point: ArrayLike, radius: float, label: str | None = None) -> tuple[MapObject, ...]:
-        """Return the objects at most `radius` m from a point, the nearest first."""
+        """Return the objects at most `radius` m from a point, the nearest first. ValueError for a negative radius."""
+        if not radius >= 0:
+            raise ValueError(f"a radius is 0 m or more, got {radius!r}")
         objects, index = self._placed(label)
         return tuple(objects[i] for i in index.within(place_of(point), radius).tolist())
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from objslam.config import Settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.errors import LogError
 from objslam.frontend.localization.continued_localization import (
@@ -11,11 +12,12 @@ from objslam.frontend.localization.continued_localization import (
     share_on_continuation,
     without_short_localization,
 )
+from objslam.mapping.checks.finding import JUMPS
 
 _BEYOND = 0.1
 """With the mode `auto`, the poses are solved if the odometry continues the localisation for this share of the boxes or more.
 A larger share leaves out more boxes, and spares more logs the time of a solve of the poses."""
-_SHORT = "the localisation"
+_LOCALIZATION = "the localisation"
 """The name of a localisation that is left out, in the warning and in the assessment."""
 
 
@@ -23,8 +25,18 @@ def with_chosen_poses(log: Log, settings: Settings, ledger: Ledger) -> Log:
     """Return the log with its `chosen_poses`. The ledger gets a warning if a short localisation is left out."""
     chosen = chosen_poses(log, settings)
     if settings.poses.use == "auto" and chosen.localization is not log.localization:
-        ledger.do_without(_SHORT, f"{_SHORT} covers too few boxes (--set poses.use=localization keeps it)")
+        without_localization(ledger, "covers too few boxes")
     return chosen
+
+
+def without_localization(ledger: Ledger, reason: str) -> None:
+    """Add the warning that a run does without the localisation."""
+    ledger.do_without(_LOCALIZATION, f"{_LOCALIZATION} {reason} (--set poses.use=localization keeps it)")
+
+
+def lost_localization(result: RunResult) -> bool:
+    """Return whether a localisation spoils a map by its jumps, as one that was lost for a while."""
+    return any(one["name"] == JUMPS and one["spoils_positions"] for one in result.summary["wrong_input"])
 
 
 def chosen_poses(log: Log, settings: Settings) -> Log:

@@ -38,7 +38,13 @@ from objslam.mapping.checks.residuals import check_pose_noise, check_residuals
 from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.upright import lies_on_its_side
 from objslam.mapping.checks.verdict import say, widened
-from objslam.mapping.chosen_poses import chosen_poses, with_chosen_poses, with_mode_of
+from objslam.mapping.chosen_poses import (
+    chosen_poses,
+    lost_localization,
+    with_chosen_poses,
+    with_mode_of,
+    without_localization,
+)
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.far_sides import with_far_sides
@@ -71,7 +77,8 @@ def run(
     it has odometry too, or if the settings leave the noise of the localisation open. A log with odometry is solved once
     more, too, if its localisation errs by more than the settings say (`check_pose_noise`). A log that has odometry, and
     localised poses at which no object has a place, is solved once more, too. So is a log whose map is not good, if the
-    odometry shows that the localisation errs for seconds (`odometry_contradicts`). known: the map of another day. If the
+    odometry shows that the localisation errs for seconds (`odometry_contradicts`). If jumps of the localisation spoil the
+    map, a log with odometry is mapped by it alone. known: the map of another day. If the
     drive is found in it, the result is in its frame, and its objects count as priors. LogError if the log lacks the chosen
     poses, if its stamps have different units, or if no frame lies on the path. SolveError if no box gives a usable ray.
     ConfigError if calibration.file is wrong or does not fit the log.
@@ -86,6 +93,16 @@ def run(
         ledger.restore(before)
         ledger.warn(f"the poses cannot be solved: {error}")
         return _run(log, settings.model_copy(update={"mode": "fixed"}), ledger, progress, known)[0]
+    if settings.mode == settings.poses.use == "auto" and log.odometry is not None and lost_localization(result):
+        at_poses = ledger.copy()
+        ledger.restore(before)
+        by_odometry = settings.model_copy(update={"poses": settings.poses.model_copy(update={"use": "odometry"})})
+        try:
+            without_localization(ledger, "jumps, and the run does not know where it is right")
+            return _run(log, by_odometry, ledger, progress, known)[0]
+        except SolveError:
+            ledger.restore(at_poses)
+            return result
     # Without odometry, the second solve takes the noise of the localisation from the rays.
     untold = lasting is not None and settings.finds_localization_noise
     if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):

@@ -372,3 +372,28 @@ def test_a_result_is_the_map_of_another_day_as_its_folder_is(result: objslam.Res
     assert given.up == loaded.up == "y"
     assert np.allclose(given.objects.positions, loaded.objects.positions, equal_nan=True)
     objslam.Session(map=result).abort()
+
+
+def test_integers_are_labels_of_arrays_too():
+    found = objslam.Detections.from_frames([0.0], [[[0, 0, 5, 5], [1, 1, 4, 4]]], [[3, np.int64(0)]])
+    assert found.labels == ["3", "0"]
+    with pytest.raises(ValueError, match="no printable text"):
+        objslam.Detections.from_frames([0.0], [[[0, 0, 5, 5]]], [[None]])  # type: ignore[list-item]
+
+
+def test_cameras_need_names_of_their_own(log):
+    one = log.cameras[0]
+    with pytest.raises(ValueError, match="a name of its own, got '.*' more than once"):
+        objslam.Log.from_arrays([one.camera, one.camera], [one.detections, one.detections], odometry=log.odometry)
+
+
+def test_a_query_that_can_hold_nothing_is_an_error(result):
+    with pytest.raises(ValueError, match="0 m or more"):
+        result.objects.in_radius([0, 0], -1)
+    with pytest.raises(ValueError, match="must not lie above"):
+        result.objects.in_box([1, 1], [0, 2])
+
+
+def test_one_path_is_no_sequence_of_sessions(tmp_path):
+    with pytest.raises(ValueError, match="got the one path"):
+        objslam.merge(str(tmp_path))

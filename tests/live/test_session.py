@@ -692,3 +692,17 @@ def test_two_things_of_a_label_that_no_frame_shows_together_are_two_before_the_e
     off = [[np.linalg.norm(place - true[name]) for place in balls] for name in ("ball", "vase")]
     assert len(balls) == 2
     assert max(map(min, off)) < 0.15
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_a_camera_that_changes_in_mid_session_is_named(log, changed):
+    pushes = list(events(log))
+    camera = log.cameras[0].camera
+    if changed:
+        camera = replace(camera, width=camera.width // 2, height=camera.height // 2, matrix=camera.matrix / [[2], [2], [1]])
+    middle = len(pushes) // 2
+    again = (*pushes[middle - 1][:2], lambda sink: sink.push_camera(camera))
+    result = drive(log, pushes=[*pushes[:middle], again, *pushes[middle:]]).stop()
+    assert ("changed camera" in [one["name"] for one in result.summary["wrong_input"]]) == changed
+    if changed:
+        assert result.summary["assessment"]["level"] == "check"

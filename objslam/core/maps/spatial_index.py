@@ -83,6 +83,8 @@ def corners_of(low: ArrayLike, high: ArrayLike) -> tuple[Floats, Floats]:
     lower, upper = _coordinates(low), _coordinates(high)
     if lower.shape != upper.shape:
         raise ValueError("both corners must have two coordinates, or both three")
+    if (lower > upper).any():
+        raise ValueError(f"the corner `low` must not lie above the corner `high`, got {lower.tolist()} and {upper.tolist()}")
     return lower, upper
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
-from objslam.core.camera import Camera, box_sizes
+from objslam.core.camera import Camera, box_sizes, same_lens
 from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, parts_of_things, surest
@@ -48,6 +48,8 @@ class BearingExtractor:
         """Add a camera, or replace its calibration."""
         m = self._map
         number = self._camera_number.setdefault(camera.name, len(m.cameras))
+        if m.frames[number] and not same_lens(camera, m.sent_cameras[number]):
+            m.changed_cameras.add(camera.name)
         m.sent_cameras[number : number + 1] = [camera]
         m.cameras[number : number + 1] = [corrected_camera(CameraLog(camera), m.errors).camera] if m.errors else [camera]
 

@@ -105,7 +105,8 @@ class MapState:
 
     errors: the shared errors that are corrected in all measurements, by name. calibration: their last estimate, None without
     one. given: the settings as given. settings: the same, with odometry noise that fits the corrected distances.
-    sent_cameras: the cameras as received. cameras: the same, with the errors corrected.
+    sent_cameras: the cameras as received. cameras: the same, with the errors corrected. changed_cameras: the names of
+    cameras that got another lens or image size after their first boxes.
     """
 
     settings: Settings
@@ -130,6 +131,7 @@ class MapState:
     schedule: MaintenanceSchedule = field(default_factory=MaintenanceSchedule)
     next_id: NextIds = field(default_factory=NextIds)
     sent_cameras: list[Camera] = field(default_factory=list)
+    changed_cameras: set[str] = field(default_factory=set)
     robot_parts: dict[int, RobotPartFinder] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     calibration: Calibration | None = None

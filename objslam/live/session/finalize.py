@@ -64,7 +64,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         warn_of_others(m.calibration, log, settings, ledger)
     cameras = tuple(one.camera for one in log.cameras)
     solution = _solved(found, m.by_label, cameras, settings, ledger)
-    findings: list[Finding] = []
+    findings = [_changed(name) for name in sorted(m.changed_cameras)]
     if solution.errors is not None:
         errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
         if settings.checks.use:
@@ -116,6 +116,16 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         cameras=cameras,
         path=path,
         path_after=_whole_path(log, keyframes.stamps, estimate.map_T_base),
+    )
+
+
+def _changed(camera: str) -> Finding:
+    """Return the finding that a camera changed while the session ran."""
+    return Finding(
+        "changed camera",
+        f"camera {camera!r} got another camera matrix, distortion or image size after its first boxes. The map reads the "
+        "sizes of all its boxes with the last one, so bodies may be wrong. Give the new camera a name of its own",
+        spoils=False,
     )
 
 

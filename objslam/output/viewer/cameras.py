@@ -128,7 +128,7 @@ def _send_objects(
     index = result.association.object[used]
     positions = np.stack([o.position for o in result.map.objects])
     reach = np.zeros(len(positions))
-    np.maximum.at(reach, index, np.linalg.norm(positions[index] - result.origins[used], axis=1))
+    np.fmax.at(reach, index, np.linalg.norm(positions[index] - result.origins[used], axis=1))
     frame, seen, pixels = points_in_frames(camera, poses, positions[resolved], _BEYOND * reach[resolved])
     pixels *= scale
     names = np.array(captions(result.map), dtype=object)[resolved]
