@@ -132,11 +132,11 @@ class Log(types.Log):
         """
         lenses = [as_camera(one) for one in ([cameras] if isinstance(cameras, Camera) else cameras)]
         boxes = [detections] if isinstance(detections, types.Detections) else list(detections)
+        if len(lenses) != len(boxes):
+            raise ValueError(f"each camera needs its detections, got {len(lenses)} cameras and {len(boxes)} detections")
         names = [one.name for one in lenses]
         if repeated := sorted({one for one in names if names.count(one) > 1}):
             raise ValueError(f"each camera needs a name of its own, got {', '.join(map(repr, repeated))} more than once")
-        if len(lenses) != len(boxes):
-            raise ValueError(f"each camera needs its detections, got {len(lenses)} cameras and {len(boxes)} detections")
         if odometry is None and localization is None:
             raise ValueError("a log needs odometry, localization or both")
         views = tuple(types.CameraLog(camera, found) for camera, found in zip(lenses, boxes, strict=True))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from objslam.cli.console import console, put, say
 from objslam.cli.options import CalibrationFile, Config, DetectorModel, Json, Mode, Quiet, Set, settings_of, with_options
+from objslam.errors import OutputError
 from objslam.sources import SourceOptions
 
 if TYPE_CHECKING:
@@ -97,9 +99,14 @@ def fleet(
     from objslam.fleet.job import make_job
     from objslam.fleet.logs import Layout, find_logs
     from objslam.fleet.page import PAGE, fleet_page
-    from objslam.fleet.stores.open_store import open_store
+    from objslam.fleet.stores.open_store import is_remote, open_store
+    from objslam.sources.log_folder import resembles_log
 
     begin = time.monotonic()
+    if not is_remote(out) and resembles_log(Path(out)):
+        raise OutputError(
+            "this is a log, and the results of a fleet need a folder of their own", where=out, hint="name another"
+        )
     settings = settings_of(mode, config, ["output.recording=false", *(set_ or ())], calibration)
     logs = find_logs(sources, Layout(layout, by))
     job = make_job(out, settings, options, detector, report=report)

@@ -383,7 +383,7 @@ def test_integers_are_labels_of_arrays_too():
 
 def test_cameras_need_names_of_their_own(log):
     one = log.cameras[0]
-    with pytest.raises(ValueError, match="a name of its own, got '.*' more than once"):
+    with pytest.raises(ValueError, match="a name of its own"):
         objslam.Log.from_arrays([one.camera, one.camera], [one.detections, one.detections], odometry=log.odometry)
 
 

@@ -143,6 +143,15 @@ def test_bad_logs_are_named_and_the_rest_goes_on(logs, tmp_path):
     assert sum(file.stat().st_mtime_ns != written[file] for file in (tmp_path / "out" / "records").iterdir()) == 2
 
 
+def test_results_never_go_into_a_log(logs):
+    log = next(path for path in sorted(logs.rglob("*")) if (path / "detections.jsonl").is_file())
+    before = sorted(path.name for path in log.iterdir())
+    code, said, error = call(log, "-o", log)
+    assert (code, said) == (1, None)
+    assert "this is a log" in error
+    assert sorted(path.name for path in log.iterdir()) == before
+
+
 def test_a_store_that_throws_a_killed_worker_and_a_killed_driver(fleet, logs, tmp_path):
     out, where = tmp_path / "out", (f"flaky://{logs}", "-o", f"flaky://{tmp_path / 'out'}", "--price", "0.05")
     with start(*where) as driver:

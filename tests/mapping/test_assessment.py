@@ -182,12 +182,25 @@ def test_a_hint_at_the_mode_that_uses_the_odometry_too_is_no_doubt() -> None:
     assert hints(log, poses={"use": "localization"}) == hints(replace(log, localization=None)) == 0
 
 
-@pytest.mark.parametrize("change", [{"several": False}, {"scale": None}, {"odometry": 2.2}])
+@pytest.mark.parametrize("change", [{"several": False}, {"scale": None}, {"odometry": 1.7}])
 def test_noisy_odometry_is_no_flaw_if_labels_or_depths_hold_the_path(change: dict[str, object]) -> None:
     bent = replace(GOOD, odometry=5.2, several=True, scale=0.03)
     assert assess(bent).level == "check"
     assert assess(bent).reasons[0].startswith("The boxes agree only if the odometry is 5.2 times as noisy")
     assert assess(replace(bent, **change)).level == "good"
+
+
+def test_boxes_without_a_pose_of_the_robot_are_told() -> None:
+    assert assess(replace(GOOD, boxes=300, off_path=99)).level == "good"
+    lost = assess(replace(GOOD, boxes=300, off_path=120))
+    assert lost.level == "check"
+    assert lost.reasons[0].startswith("40 % of the boxes have no pose of the robot")
+    log = small_log()
+    path = log.localization
+    assert path is not None
+    half = len(path) // 2
+    short = replace(log, localization=type(path)(path.stamps[:half], path.poses[:half]))
+    assert "have no pose of the robot" in str(objslam.run(short, ALONE, mode="fixed").assessment)
 
 
 def test_noisy_odometry_is_said_beside_other_reasons() -> None:

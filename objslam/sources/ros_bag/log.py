@@ -23,7 +23,7 @@ from objslam.ros.bag.records import Connection, FileReport
 from objslam.ros.messages.decode import DecodeError, make_decoder, read_head
 from objslam.ros.messages.detections import boxes_of_points
 from objslam.ros.messages.images import DEPTH_SCALE, image_file
-from objslam.ros.messages.topic_types import IMAGES, TRANSFORMS, is_tags
+from objslam.ros.messages.topic_types import IMAGES, TRANSFORMS, is_read, is_tags
 from objslam.ros.tf.frames import find_base
 from objslam.ros.tf.tree import TfTree
 from objslam.ros.topics import parse_topics
@@ -41,6 +41,8 @@ _KEPT: list[tempfile.TemporaryDirectory[str]] = []
 
 
 _NO_INFO = "record CameraInfo too, or give --camera-info FILE"  # The advice for images without a CameraInfo.
+_BOX_WORDS = ("detection", "boundingbox", "bounding_box")
+"""Parts of the names of types that have boxes. More words name more topics where boxes may be."""
 _NO_BOXES = """boxes from a file: `objslam convert` makes a log of this bag, put detections.jsonl into it; or record \
 Detection2DArray, AprilTag detections, or images with CameraInfo"""  # The advice for a bag without images and boxes.
 
@@ -136,19 +138,30 @@ def assemble(paths: Path | Sequence[Path], ledger: Ledger, options: BagOptions) 
         images = not cast and any(topic.type in IMAGES for topic in survey.topics.values())
         what = "images, but none with a CameraInfo" if images else "no images and no detections"
         message, where = f"no camera: the recording has {what}", survey.recording.name
+        hint = unread_boxes(survey) or _NO_BOXES
         if found is None or images:
-            problems.append(LogError(message, where=where, hint=_NO_INFO if images else _NO_BOXES))
+            problems.append(LogError(message, where=where, hint=_NO_INFO if images else hint))
         else:
             places = camera_places(tree, base)
             known = {place.frame: place.base_T_frame for place in places if place.base_T_frame is not None}
             logs = tuple(_camera_log(*camera, {}, options, ledger) for camera in cameras)
-            problems.append(NoCamera(message, where, _NO_BOXES, found.odometry, found.localization, known, logs))
+            problems.append(NoCamera(message, where, hint, found.odometry, found.localization, known, logs))
     if not cameras:
         problems += refused
     _warn_of_unset_stamps(survey, found, cast, ledger)
     return Assembly(
         survey, tree, tf_topics, base, found, cast, tuple(cameras), tuple(problems), tuple(refused if cameras else ())
     )
+
+
+def unread_boxes(survey: Survey) -> str:
+    """Return advice for topics that seem to have boxes in messages that objslam does not read, "" if there are none."""
+    found = [
+        f"{topic.name} has {topic.type}"
+        for topic in survey.topics.values()
+        if not is_read(topic.type) and any(word in topic.type.lower() for word in _BOX_WORDS)
+    ]
+    return f"{', '.join(found)}, which is not read: record vision_msgs/Detection2DArray, or {_NO_BOXES}" if found else ""
 
 
 def _warn_of_unset_stamps(survey: Survey, paths: Paths | None, cast: Sequence[CameraTopics], ledger: Ledger) -> None:

@@ -1,5 +1,7 @@
 """Which topic is what: paths, cameras, choices, and what is said where something is missing."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from bag_writer import write_bag
@@ -10,8 +12,9 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, lift_se2, make_pose
 from objslam.errors import ConfigError, LogError
 from objslam.io.camera_yaml import write_camera
+from objslam.ros.messages.topic_types import ODOMETRY
 from objslam.sources.ros_bag.info import describe
-from objslam.sources.ros_bag.log import read_bag
+from objslam.sources.ros_bag.log import read_bag, unread_boxes
 from objslam.sources.ros_bag.options import BagOptions
 
 _S = 10**9
@@ -401,6 +404,17 @@ def test_what_is_missing_is_named(bag, tmp_path, without, message):
     with pytest.raises(LogError, match=message):
         read_bag(path, Ledger())
     assert any(message.split(".*")[0] in line for line in describe(path).missing)
+
+
+def test_topics_with_boxes_of_other_types_are_named():
+    """`yolo_msgs/DetectionArray` is common."""
+    types = {"/yolo": "yolo_msgs/msg/DetectionArray", "/boxes": "vision_msgs/msg/Detection2DArray", "/odom": ODOMETRY}
+    topics = {name: SimpleNamespace(name=name, type=type_) for name, type_ in types.items()}
+    advice = unread_boxes(SimpleNamespace(topics=topics))
+    assert advice.startswith("/yolo has yolo_msgs/msg/DetectionArray, which is not read")
+    assert "/boxes" not in advice
+    topics.pop("/yolo")
+    assert unread_boxes(SimpleNamespace(topics=topics)) == ""
 
 
 def test_a_map_without_odometry_in_tf_is_named_and_the_base_is_still_found(makers, tmp_path):
