@@ -7,7 +7,7 @@ import pytest
 
 from objslam.config import load_settings
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import lift_se2
+from objslam.core.geometry import interpolate, lift_se2
 from objslam.core.statistics import Lasting
 from objslam.core.types import Log, Trajectory
 from objslam.frontend.keyframes import build_keyframes
@@ -162,3 +162,17 @@ def test_a_localisation_of_few_boxes_is_left_out(keep):
 def test_a_localisation_that_the_odometry_completes_is_used(keep):
     log, _ = drive(keep)
     assert without_short_localization(log, SETTINGS) is log
+
+
+def test_a_lone_pose_gives_the_map_its_frame():
+    """As a constant transform from map to odom, which a session gets once."""
+    log, path = drive(lambda t: np.abs(t - 9) < 0.01)
+    continued = continued_by_odometry(log, SETTINGS, whole=True)
+    assert continued.localization.stamps[[0, -1]] == pytest.approx(path.stamps[[0, -1]])
+    frames = build_keyframes(continued, SETTINGS, Ledger(), log.localization)
+    near = np.isfinite(frames.localized_at)
+    np.testing.assert_array_equal(near, np.abs(frames.stamps - 9) <= 1.1)
+    (measured,) = localized(frames)
+    assert frames.stamps[measured] == pytest.approx(9.0, abs=0.03)
+    true, _ = interpolate(path.stamps, path.poses, frames.stamps, 1.0)
+    np.testing.assert_allclose(frames.map_T_base, true, atol=1e-9)

@@ -87,6 +87,18 @@ def bridged(localization: Trajectory, odometry: Trajectory, stamps: Floats, sett
     return joined.all(axis=0) & sure.any(axis=0) & _between(odometry.stamps, stamps, settings.poses.max_gap)
 
 
+def beside(localization: Trajectory, odometry: Trajectory, stamps: Floats, settings: Settings) -> Bools:
+    """Return which stamps (Q,), s, the odometry joins to a pose of a localisation that is at most poses.max_gap away."""
+    max_gap = settings.poses.max_gap
+    _, covered = interpolate(odometry.stamps, odometry.poses, localization.stamps, max_gap)
+    known = localization.stamps[covered]
+    if not len(known) or not len(stamps):
+        return np.zeros(len(stamps), dtype=bool)
+    joined, _, at = _ends(odometry, known, stamps, settings, _DRIFT)
+    near = joined & (np.abs(known[at] - stamps) <= max_gap)
+    return np.asarray(near.any(axis=0)) & _between(odometry.stamps, stamps, max_gap)
+
+
 def share_on_continuation(log: Log, continued: Log, settings: Settings) -> float:
     """Return the share of the boxes that have a pose in `continued`, from `continued_by_odometry`, but not in the log."""
     boxes = _stamps_of_boxes(log)

@@ -17,7 +17,7 @@ from objslam.core.geometry import adjoint, interpolate, inverse
 from objslam.core.rotation import rotation_vector
 from objslam.core.trajectory import poses_near
 from objslam.core.types import Keyframes, Log, Trajectory
-from objslam.frontend.localization.continued_localization import bridged
+from objslam.frontend.localization.continued_localization import beside, bridged
 from objslam.frontend.odometry_drift import gathered_drift
 
 _STEP = 1e-3
@@ -45,6 +45,8 @@ def with_measurements(keyframes: Keyframes, log: Log, measured: Trajectory, sett
         on_path = interpolate(measured.stamps, measured.poses, stamps, max_gap)[1]
         if log.odometry is not None:
             between = bridged(measured, log.odometry, stamps, settings) & ~on_path
+            if not (on_path | between).any():  # A lone pose has no neighbour to which it could be joined.
+                between = beside(measured, log.odometry, stamps, settings)
     used = stamps[on_path | between]
     number = ((measured.stamps >= used[0]) & (measured.stamps <= used[-1])).sum() if len(used) else 0
     keyframes = replace(keyframes, localized_every=max(1.0, len(used) / max(float(number), 1.0)))
@@ -87,7 +89,9 @@ def _measured_at(localization: Trajectory, odometry: Trajectory, keyframes: Keyf
 
 
 def _nearest(known: Floats, stamps: Floats) -> Floats:
-    """Return the nearest of at least two values `known` (L,), in order, to each of the stamps (Q,)."""
+    """Return the nearest of the values `known` (L,), in order, to each of the stamps (Q,)."""
+    if len(known) == 1:
+        return np.full(len(stamps), known[0])
     after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
     return np.where(stamps - known[after - 1] < known[after] - stamps, known[after - 1], known[after])
 
@@ -114,6 +118,8 @@ def carried_by_odometry(
     there is none. on_odometry: returns the poses of the odometry at stamps. max_gap: s, the longest gap of the localisation.
     """
     known, result = np.isfinite(localized_at), map_T_base.copy()
+    if not known.any():
+        return result
     begin = localized_at[known]
     at = on_odometry(np.concatenate([begin, stamps[known]]))
     result[known] = poses_near(localization, begin, max_gap) @ inverse(at[: len(begin)]) @ at[len(begin) :]
