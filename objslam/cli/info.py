@@ -124,6 +124,9 @@ def _show_cameras(cameras: Iterable[Camera]) -> None:
             f"{spoken_name(camera.name)}: {camera.width}x{camera.height}, f {fx:.1f} {fy:.1f} px, "
             f"{camera.distortion_model}, at {_place(camera.base_T_camera)} in base: {view_of(camera)}"
         )
+        if camera.distortion.any():
+            advice = "if they are of rectified images: --rectified (ROS), or no distortion in camera.yaml"
+            say(f"{spoken_name(camera.name)}: its boxes are taken as those of raw images, which are distorted; {advice}")
         for doubt in doubts_of(camera):
             say(f"warning: {doubt}", stderr=True)
 

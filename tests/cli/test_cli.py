@@ -193,6 +193,14 @@ def test_info_of_a_log_folder(objslam, log_folder, variant):
     assert "neither detections nor images" in objslam("info", variant).out
 
 
+def test_info_says_how_boxes_of_a_distorted_camera_are_taken(objslam, variant):
+    assert "raw images" not in objslam("info", variant).out
+    camera = yaml.safe_load((variant / "camera.yaml").read_text())
+    camera["distortion_coefficients"] = [-0.3, 0.1, 0, 0, 0]
+    (variant / "camera.yaml").write_text(yaml.safe_dump(camera))
+    assert "its boxes are taken as those of raw images" in objslam("info", variant).out
+
+
 def test_config_dump_is_what_config_reads(objslam, tmp_path):
     dumped = objslam("config", "dump", "--set", "joint.loss=l1", "--set", "poses.max_gap=3")
     assert dumped.code == 0
