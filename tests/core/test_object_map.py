@@ -65,13 +65,16 @@ def test_queries_at_equal_distances_and_open_boxes() -> None:
     assert nearest.id == 0
     assert [o.id for o in objects.in_radius([0, 0], 1)] == [0, 1, 2, 3]
     assert [o.id for o in objects.in_radius([0, 0], np.inf)] == [0, 1, 2, 3, 4]
-    assert objects.in_radius([0, 0], -1) == ()
     assert [o.id for o in objects.in_box([-np.inf, 0, -np.inf], [np.inf, np.inf, 3])] == [0, 1, 2]
     assert [o.id for o in objects.in_box([0, 1], [0, 1])] == [1]
-    assert objects.in_box([1, 1], [0, 0]) == ()
     assert replace(objects, objects=objects.objects[4:]).nearest([0, 0]) == objects[4]  # A new map has an index of its own.
     with pytest.raises(ValueError, match="finite"):
         objects.nearest([np.inf, 0])
+    for radius in (-1.0, np.nan):
+        with pytest.raises(ValueError, match="0 m or more"):
+            objects.in_radius([0, 0], radius)
+    with pytest.raises(ValueError, match="must not lie above"):
+        objects.in_box([1, 1], [0, 0])
 
 
 @pytest.mark.parametrize("point", [[1.0], [1, 2, 3, 4], [np.nan, 0], "door"])
