@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from live.driving import feed
 from mapping.body_drives import FORWARD
 from mapping.hiding_drives import aisle, along_aisle, hiding_drive
 
@@ -11,6 +12,7 @@ from objslam.config import load_settings
 from objslam.core.calibration import Calibration
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
+from objslam.live.session.session import Session
 from objslam.mapping import pipeline
 from objslam.mapping.moves.near_sides import BACK, moves_back, shift_ahead
 
@@ -78,3 +80,11 @@ def test_a_row_of_lockers_is_doubted_unless_labels_tell_them_apart(named):
     assert found == (not named)
     assert (result.summary["assessment"]["level"] == "good") == named
     assert (np.median(far) > 0.3) == (not named)
+
+
+def test_a_session_doubts_such_a_row_too():
+    log = hiding_drive(0, solids=aisle(np.random.default_rng(0)), plane=along_aisle())
+    session = feed(Session(load_settings(None, ("output.recording=false",)), patient=True).start(), log)
+    result = session.stop()
+    assert BACK in [one["name"] for one in result.summary["wrong_input"]]
+    assert result.summary["assessment"]["level"] == "check"

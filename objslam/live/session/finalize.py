@@ -36,6 +36,7 @@ from objslam.mapping.joint.doubted_labels import doubted_names
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.joint.labels import labels_tell, may_be_by_label
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
+from objslam.mapping.moves.near_sides import check_rows
 from objslam.mapping.moves.phantoms import check_neighbours
 from objslam.mapping.solution import Solution, without_errors
 
@@ -82,7 +83,8 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
     if settings.checks.use:
         near = check_neighbours(solution, found.errors, settings)
         depths = check_depth_axis(objects, estimate.map_T_base @ keyframes.base_T_camera, *used)
-        findings += [finding for finding in (near, depths) if finding is not None]
+        rows = check_rows(solution, tuple(camera.name for camera in cameras), settings)
+        findings += [finding for finding in (near, rows, depths) if finding is not None]
     say(Diagnosis(tuple(findings)), ledger)
     objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
     ids = _kept_ids(found.association, found.ids, solution.association)
