@@ -14,9 +14,10 @@ class Poses(Section):
 
     use: Literal["auto", "odometry", "localization"] = "auto"
     """Poses to use if a log has odometry and localisation. auto uses the localisation. In joint mode, auto also uses the
-    odometry between localised poses."""
+    odometry between localised poses. It uses the odometry alone if the localisation covers too few boxes, or was lost."""
     max_gap: Positive = 1.1
-    """Maximum time in s between two consecutive poses of the path. A frame in a longer gap is dropped and counted."""
+    """Maximum time in s between two consecutive poses of the path. A frame in a longer gap is dropped and counted. In joint
+    mode, the odometry bridges longer gaps of the localisation."""
     jumps: Literal["correct", "keep"] = "correct"
     """What happens to jumps of the localisation that are shorter than 1 m. correct: the path is joined at each jump, unless
     the boxes refute it. The map then says that nobody knows which side was right. keep: the poses stay as they are. With

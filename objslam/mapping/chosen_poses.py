@@ -31,7 +31,7 @@ def with_chosen_poses(log: Log, settings: Settings, ledger: Ledger) -> Log:
 
 def without_localization(ledger: Ledger, reason: str) -> None:
     """Add the warning that a run does without the localisation."""
-    ledger.do_without(_LOCALIZATION, f"{_LOCALIZATION} {reason} (--set poses.use=localization keeps it)")
+    ledger.do_without(_LOCALIZATION, f"{_LOCALIZATION} {reason} (--set poses.use=localization uses it alone)")
 
 
 def lost_localization(result: RunResult) -> bool:

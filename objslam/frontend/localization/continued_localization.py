@@ -36,8 +36,8 @@ def continued_by_odometry(log: Log, settings: Settings, *, whole: bool = False) 
     The continued poses join the localised poses at both ends of a gap. A gap of the odometry ends the continuation, because
     somebody may have moved the robot in it. It also ends where the odometry has drifted too far. The log is returned
     unchanged if there is nothing to continue, and if most boxes would lie outside of the localisation's time, or in gaps
-    that the odometry does not bridge (`bridged`). whole: whether to continue as far as
-    the odometry goes, because the solve starts at other poses.
+    that the odometry does not bridge (`bridged`). whole: whether to continue as far as the odometry goes, because the solve
+    starts at other poses.
     """
     localization, odometry = log.localization, log.odometry
     if localization is None or odometry is None or not len(localization):
@@ -48,7 +48,7 @@ def continued_by_odometry(log: Log, settings: Settings, *, whole: bool = False) 
         return log
     known = localization.stamps[covered]
     map_T_odom = localization.poses[covered] @ inverse(at[covered])
-    sure, times = _near_localization(odometry, known, odometry.stamps, settings, np.inf if whole else _DRIFT)
+    sure, times = _near_localization(odometry, known, settings, np.inf if whole else _DRIFT)
     free = sure & ~_between(localization.stamps, odometry.stamps, max_gap)
     if not free.any():
         return log
@@ -133,17 +133,15 @@ def _between(poses: Floats, stamps: Floats, max_gap: float) -> Bools:
     return (next_ == stamps) | ((before <= stamps) & (stamps <= next_) & (next_ - before <= max_gap))
 
 
-def _near_localization(
-    odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings, drift: float
-) -> tuple[Bools, Floats]:
-    """Return at which stamps (Q,), s, the odometry drifted little since, or until, the nearest localised stamp
-    (L,), s, without a gap of the odometry in between. Also return the times (Q,), s, at which the offset of the odometry
-    from the map holds for them. It is their own time between two localised stamps, unless one of the two lies beyond a gap
-    or does not exist. drift: rad, the largest.
+def _near_localization(odometry: Trajectory, known: Floats, settings: Settings, drift: float) -> tuple[Bools, Floats]:
+    """Return which poses of an odometry (N,) drifted little since, or until, the nearest localised stamp (L,), s, without a
+    gap of the odometry in between. Also return the times (N,), s, at which the offset of the odometry from the map holds for
+    them. It is their own time between two localised stamps, unless one of the two lies beyond a gap or does not exist.
+    drift: rad, the largest.
     """
-    joined, sure, at = _ends(odometry, known, stamps, settings, drift)
+    joined, sure, at = _ends(odometry, known, odometry.stamps, settings, drift)
     own = np.where(joined[0], known[at[0]], known[at[1]])
-    return np.asarray(sure.any(axis=0)), np.where(joined.all(axis=0), stamps, own)
+    return np.asarray(sure.any(axis=0)), np.where(joined.all(axis=0), odometry.stamps, own)
 
 
 def _ends(odometry: Trajectory, known: Floats, stamps: Floats, settings: Settings, most: float) -> tuple[Bools, Bools, Ints]:

@@ -82,10 +82,8 @@ def collect(m: MapState, name: str, running: bool = False) -> Collected:
     objects = owners[owners >= 0]
     association = Association(index - (len(owners) - len(objects)), label[objects])
     log = replace(recorded_log(m, name, keyframes), localization=covered.localization)
-    localized = m.course.localized.trajectory()
-    if localized is not None and log.localization is not None:
-        same = len(localized) == len(log.localization)  # Then the odometry continues nothing.
-        keyframes = with_measurements(keyframes, log, log.localization if same else localized, m.given)
+    if covered.measured is not None:
+        keyframes = with_measurements(keyframes, log, covered.measured, m.given)
     errors = _shared_errors(m, log, keyframes, rays)
     held = {n: value for n, value in m.errors.items() if errors is None or n not in errors.names}
     if held and len(rays):

@@ -15,12 +15,13 @@ from objslam.live.mapper.state import MapState
 class Covered:
     """The keyframes that the localisation of a session covers, all of them without a localisation.
 
-    mask: (n,) which they are. map_T_base: (n, 4, 4) the poses that the paths give. localization: the path, also where the
-    odometry continues it.
+    mask: (n,) which they are. map_T_base: (n, 4, 4) the poses that the paths give. measured: the localisation. localization:
+    the same, also where the odometry continues it.
     """
 
     mask: Bools
     map_T_base: Floats
+    measured: Trajectory | None
     localization: Trajectory | None
 
 
@@ -29,8 +30,9 @@ def while_running(m: MapState, rows: Ints) -> Covered:
     covered, and the session has no localisation."""
     k = m.keyframes
     if not k.localized.any():
-        return Covered(np.ones(len(rows), dtype=bool), k.map_T_base[rows], None)
-    return Covered(k.localized[rows], k.map_T_base[rows], m.course.localized.trajectory())
+        return Covered(np.ones(len(rows), dtype=bool), k.map_T_base[rows], None, None)
+    localized = m.course.localized.trajectory()
+    return Covered(k.localized[rows], k.map_T_base[rows], localized, localized)
 
 
 def at_the_end(m: MapState, rows: Ints) -> Covered:
@@ -49,7 +51,7 @@ def at_the_end(m: MapState, rows: Ints) -> Covered:
     known = k.localized[rows]
     poses[known] = k.map_T_base[rows[known]]
     mask = on_path | known
-    return Covered(mask, poses, path) if mask.any() else while_running(m, rows)
+    return Covered(mask, poses, localized, path) if mask.any() else while_running(m, rows)
 
 
 def into_frame(m: MapState, rows: Ints, covered: Covered) -> Floats:

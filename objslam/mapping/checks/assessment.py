@@ -80,7 +80,7 @@ class Evidence:
     deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log that is a
     part of a recording, as in `Log`.
     malformed: the frames of boxes that were malformed. unused: the paths of the robot that could not be used.
-    off_path: the boxes without a pose of the robot.
+    off_path: the boxes without a pose of the robot or of its camera.
     odometry_unused: whether the mode was left to the log, and a `fixed` run did not use its odometry.
     """
 
@@ -263,10 +263,10 @@ def _check(e: Evidence) -> list[str]:
             "boxes of equal things that hide each other bend the path. Depths would show it."
         )
     found += lost_input(e.unused, e.malformed, e.frames)
-    if e.off_path > _OFF_PATH * e.boxes:
+    if e.boxes and e.off_path > _OFF_PATH * e.boxes:
         found.append(
-            f"{100 * e.off_path / e.boxes:.0f} % of the boxes have no pose of the robot, so the map does without them: the "
-            "warnings say why."
+            f"{100 * e.off_path / e.boxes:.0f} % of the boxes have no pose of the robot or its camera, so the map does "
+            "without them: the warnings say why."
         )
     if _may_be_bent(e):
         found.append(
