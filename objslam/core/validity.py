@@ -28,6 +28,10 @@ MAX_SIDE = 1 << 16
 MAX_DISTORTION = 1e6
 """The bound of a distortion coefficient. A larger bound accepts more wrong numbers. Calibrations that converged are far
 below it."""
+UNITS_OF_TIME = {1e3: "ms", 1e6: "us", 1e9: "ns"}
+"""The name of each unit of time, by the number of units in a second."""
+_DATES = (1e8, 1e10)
+"""Stamps of dates between 1973 and 2286, s. A wider range leaves the unit of fewer stamps open."""
 _RIGID = 1e-3
 """The largest difference between R^T R and the identity in any entry. A larger value accepts worse rotations. Rotations that
 are printed with four decimals are below it."""
@@ -51,6 +55,11 @@ value accepts numbers that were rounded to fewer digits."""
 def valid_stamps(stamps: Floats, bound: float = MAX_STAMP) -> Bools:
     """Return which stamps (...), s, are finite and at most `bound` in absolute value."""
     return np.asarray(np.abs(stamps) <= bound)
+
+
+def unit_of_date(stamp: float) -> str:
+    """Return the unit of a stamp that is above `MAX_LIVE_STAMP`, if it is a date: "ms", "us", "ns" or "another unit"."""
+    return next((unit for factor, unit in UNITS_OF_TIME.items() if _DATES[0] < stamp / factor < _DATES[1]), "another unit")
 
 
 def valid_positions(positions: Floats) -> Bools:

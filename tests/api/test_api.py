@@ -299,7 +299,7 @@ def test_a_session_maps_what_is_pushed(log: Log) -> None:
         assert session.wait(LIMIT)
         now = session.snapshot()
         assert isinstance(now.map, objslam.ObjectMap)
-        assert now.dropped["localization without a rigid pose or a stamp"] == 1
+        assert now.dropped["localization without a rigid pose"] == 1
         assert errors_of(session.result()) < 0.03
 
 

@@ -191,3 +191,22 @@ def test_a_name_that_is_a_list_is_told():
         "dropped 3: frame that is malformed (first: camera of type list, stamp 1.000; camera front, stamp 1.000)",
         "dropped 1: frame without a stamp (first: camera front)",
     ]
+
+
+@pytest.mark.parametrize(
+    ("stamp", "fault"),
+    [
+        (1.7e12, "in ms instead of s"),
+        (1.7e15, "in us instead of s"),
+        (1.7e18, "in ns instead of s"),
+        (1e40, "in another unit instead of s"),
+        (np.inf, "that is no time in s"),
+    ],
+)
+def test_a_stamp_in_another_unit_is_told(stamp, fault):
+    session = Session(SETTINGS)
+    assert session.push_camera(CAMERA)
+    assert not session.push_odometry(stamp, np.eye(4))
+    assert not session.push_mount(stamp, "front", np.eye(4))
+    assert not session.push_detections(stamp, "front", BOX, ["cup"], [1.0])
+    assert list(session.counters.dropped()) == [f"{what} with a stamp {fault}" for what in ("odometry", "mount", "frame")]

@@ -15,6 +15,7 @@ from objslam.core.validity import (
     camera_fault,
     is_name,
     rigid_pose,
+    unit_of_date,
     valid_depths,
     valid_stamps,
 )
@@ -58,6 +59,18 @@ def stamp_of(value: object) -> float | None:
         return value if abs(value) <= MAX_LIVE_STAMP else None
     found = floats(value)
     return float(found) if found is not None and valid_stamps(found, MAX_LIVE_STAMP) else None
+
+
+def stamp_fault(value: object) -> str:
+    """Return what is wrong with a value for which `stamp_of` returns None, in words that follow the name of a message."""
+    found = floats(value)
+    if found is None or not found > MAX_LIVE_STAMP:
+        return "without a stamp"
+    return (
+        "with a stamp that is no time in s"
+        if np.isinf(found)
+        else f"with a stamp in {unit_of_date(float(found))} instead of s"
+    )
 
 
 def label_list(labels: object) -> tuple[object, ...] | None:
@@ -129,7 +142,7 @@ def sound_frame(
     """
     where, given = f"camera {told(camera)}", stamp_of(stamp)
     if given is None:
-        return None, "frame without a stamp", where, {}
+        return None, f"frame {stamp_fault(stamp)}", where, {}
     where = f"{where}, stamp {given:.3f}"
     malformed = None, "frame that is malformed", where, dict[str, int]()
     words = label_list(labels)

@@ -108,7 +108,8 @@ class Intake:
         """Push a mount, as `Sink.push_mount`."""
         pose, given = checks.rigid(base_T_camera), checks.stamp_of(stamp)
         if pose is None or given is None:
-            return self._refuse("mount without a rigid pose or a stamp", f"camera {checks.told(camera)}")
+            fault = "without a rigid pose" if pose is None else checks.stamp_fault(stamp)
+            return self._refuse(f"mount {fault}", f"camera {checks.told(camera)}")
         with self._lock:
             if not checks.is_camera_name(camera) or camera not in self._cameras:
                 return self._refuse("mount of an unknown camera", checks.told(camera))
@@ -176,7 +177,8 @@ class Intake:
     def _push_pose(self, path: PathKind, stamp: float, pose: Floats) -> bool:
         matrix, given = checks.rigid(pose), checks.stamp_of(stamp)
         if matrix is None or given is None:
-            return self._refuse(f"{path} without a rigid pose or a stamp", f"stamp {checks.told(stamp)}")
+            fault = "without a rigid pose" if matrix is None else checks.stamp_fault(stamp)
+            return self._refuse(f"{path} {fault}", f"stamp {checks.told(stamp)}")
         if self._settings.poses.use not in ("auto", path):
             self.counters.accept(f"{path}{NOT_USED}")  # The user chose so (poses.use): nothing is lost.
             return False

@@ -4,15 +4,11 @@ import numpy as np
 
 from objslam.core.arrays import Floats
 from objslam.core.types import Log, Trajectory
-from objslam.core.validity import MAX_LIVE_STAMP
+from objslam.core.validity import MAX_LIVE_STAMP, UNITS_OF_TIME, unit_of_date
 from objslam.mapping.checks.finding import Finding
 
 _OVERLAP = 0.5
 """The least share of frames within the time of the poses. A larger share also reports logs that begin late."""
-_UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
-"""The name of each unit of time, by the number of units in a second."""
-_DATES = (1e8, 1e10)
-"""Stamps of dates between 1973 and 2286, s. A wider range leaves the unit of fewer stamps open."""
 _RARE = 10.0
 """If the median time between two poses or frames is above this, s, their stamps are probably not in s. At 10 s, a robot
 hardly measures its way. A larger value finds fewer stamps in ms, whose usual steps are 10 to 1000."""
@@ -43,13 +39,13 @@ def check_stamps(log: Log) -> Finding | None:
         common = _common_unit(path, stamps)
         said = f"all stamps are probably in {common} instead of s ({span})"
         return None if common is None else Finding("stamps unit", said)
-    for factor, unit in _UNITS.items():
+    for factor, unit in UNITS_OF_TIME.items():
         for by, who in ((factor, "frames"), (1 / factor, "poses")):
             steps = [np.median(np.diff(s)) for s in (stamps if who == "frames" else [path.stamps]) if len(s) > 1]
             if share(by) > max(_OVERLAP, 2 * here) and all(step > factor * _FASTEST for step in steps):
                 return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
     length, whole = float(np.ptp(frames)), float(np.ptp(path.stamps))
-    for factor, unit in _UNITS.items():
+    for factor, unit in UNITS_OF_TIME.items():
         for ratio, who in ((length / max(whole, 1e-9), "frames"), (whole / max(length, 1e-9), "poses")):
             if 0.5 < ratio / factor < 2:
                 return Finding("stamps unit", f"the stamps of the {who} are probably in {unit} instead of s ({span})")
@@ -74,9 +70,9 @@ def _common_unit(path: Trajectory, frames: list[Floats]) -> str | None:
     """
     last = float(path.stamps[-1])
     if last > MAX_LIVE_STAMP:
-        return next((unit for factor, unit in _UNITS.items() if _DATES[0] < last / factor < _DATES[1]), "another unit")
+        return unit_of_date(last)
     usual = min((float(np.median(np.diff(s))) for s in (path.stamps, *frames) if len(s) > 1), default=0.0)
     way = float(np.linalg.norm(np.diff(path.poses[:, :3, 3], axis=0), axis=1).sum())
     if usual < _RARE or not 0 < way < _CRAWL * float(np.ptp(path.stamps)):
         return None
-    return next(unit for factor, unit in reversed(_UNITS.items()) if usual >= _RARE * factor / 1e3)
+    return next(unit for factor, unit in reversed(UNITS_OF_TIME.items()) if usual >= _RARE * factor / 1e3)
