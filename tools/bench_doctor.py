@@ -1,6 +1,6 @@
 """Put each kind of mistake into a log, and print what is said of it.
 
-    python tools/bench_doctor.py [--map] [--modes fixed joint] [--log LOG] [--cases NAME ...]
+    python tools/bench_doctor.py [--map] [--live] [--modes fixed joint] [--log LOG] [--cases NAME ...]
 
 Without --log, the log is simulated. In the mode fixed, the true path is the localisation of a recorded log that has none.
 Without --map, the table has the messages of the checks before the solve. With --map, each log is mapped with the default
@@ -11,6 +11,7 @@ unchanged log does not give. ok: the objects that are called ok. over: how many 
 object of their label (squared Mahalanobis distance above 13.9). squared: the median of the squared distances; 2.4 is honest.
 off: the median error, m. A map in the frame of the odometry is laid on the truth first, and its objects are judged by the
 covariances that this alignment leaves. Without true objects, the map of the unchanged log is the truth.
+With --live, each log is replayed into a session, and the table has the result of its end.
 verdict: right (no more objects over 3 sigmas than in the unchanged log, or a median that is at most 1.5 times larger), named
 (no object is called ok), or WRONG, with or without a word.
 """
@@ -19,16 +20,18 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from live_parts.common import replayed
 from scipy.stats import chi2
 from wrong_inputs import MISTAKES, join
 
 from objslam.config import Odometry, Settings, load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
 from objslam.core.types import Log, Truth, TruthObject
 from objslam.errors import ObjslamError
 from objslam.evaluation.evaluate import evaluate
@@ -37,6 +40,8 @@ from objslam.mapping.checks.diagnosis import diagnose
 from objslam.simulation import DepthNoise, PoseNoise, preset, simulate
 from objslam.sources import SourceOptions, read
 
+Run = Callable[[Log, Settings, Ledger], RunResult]
+"""A function that maps a log."""
 ROOM = {"objects": 10, "classes": 10, "pixel_sigma": 2.0, "missed": 0.1, "false": 0.01, "frames": 300}
 JOINED = ("half the boxes of another day", "half the log of another day")
 """The mistakes that need a second log."""
@@ -77,6 +82,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", help="the names of the mistakes, by default all", metavar="NAME")
     parser.add_argument("--clean", type=int, default=0, metavar="N", help="count false alarms in N logs a mode instead")
     parser.add_argument("--map", action="store_true", help="map each log, and compare errors with sigmas (takes minutes)")
+    parser.add_argument("--live", action="store_true", help="the same, by a session that gets the log message by message")
     options = parser.parse_args()
     if options.clean:
         clean(options.clean, options.modes)
@@ -89,9 +95,9 @@ def main() -> None:
         settings = load_settings(None, (f"mode={mode}", "output.recording=false", "reconstruction.use=false"))
         names = options.cases or [*MISTAKES, *(JOINED if recorded is None else ())]
         logs = ((name, simulated(mode, name) if recorded is None else mistaken(recorded, mode, name)) for name in names)
-        if options.map:
+        if options.map or options.live:
             unchanged = simulated(mode, "none") if recorded is None else mistaken(recorded, mode, "none")
-            table(mode, unchanged, logs, settings)
+            table(mode, unchanged, logs, settings, live_run if options.live else pipeline.run)
         else:
             for name, log in logs:
                 print(f"{mode:5s} | {name:30s} | {told(log, settings)}", flush=True)
@@ -129,15 +135,24 @@ def told(log: Log, settings: Settings) -> str:
         return f"refused: {error}"
 
 
-def table(mode: str, unchanged: Log, logs: Iterator[tuple[str, Log]], settings: Settings) -> None:
+def live_run(log: Log, settings: Settings, ledger: Ledger) -> RunResult:
+    """Replay a log into a session as fast as it follows, and return the session's result."""
+    session = replayed(log, settings)
+    try:
+        return session.stop()
+    finally:
+        ledger.add(session.counters.ledger)
+
+
+def table(mode: str, unchanged: Log, logs: Iterator[tuple[str, Log]], settings: Settings, run: Run) -> None:
     """Map each log, and print its row."""
     print("mode  | case                           | said | ok | over | squared | off | verdict | CPU s")
-    first = mapped(unchanged, unchanged.truth, settings)
+    first = mapped(unchanged, unchanged.truth, settings, run)
     assert not isinstance(first, str)
     print_row(mode, "none", first, Row((), False, first.off, first.squared, None), 0.0)
     for name, log in logs:
         begin = time.process_time()
-        row = mapped(log, first.truth, settings)
+        row = mapped(log, first.truth, settings, run)
         print_row(mode, name, row, first, time.process_time() - begin)
 
 
@@ -155,11 +170,11 @@ def print_row(mode: str, name: str, row: Row | str, unchanged: Row, seconds: flo
     print(f"{mode:5s} | {name:30s} | {cells} | {seconds:.0f}", flush=True)
 
 
-def mapped(log: Log, truth: Truth | None, settings: Settings) -> Row | str:
+def mapped(log: Log, truth: Truth | None, settings: Settings, run: Run) -> Row | str:
     """Map a log. Return its row, or the line of its error."""
     ledger = Ledger()
     try:
-        result = pipeline.run(log, settings, ledger)
+        result = run(log, settings, ledger)
     except ObjslamError as error:
         return str(error).splitlines()[0]
     findings = result.summary["wrong_input"]

@@ -109,6 +109,14 @@ def _mirrored(boxes: Floats, camera: Camera) -> Floats:
     return np.stack([camera.width - 1 - boxes[:, 2], boxes[:, 1], camera.width - 1 - boxes[:, 0], boxes[:, 3]], axis=1)
 
 
+def _bent(boxes: Floats, camera: Camera) -> Floats:
+    """Return the boxes of images with a barrel distortion, of cameras without distortion."""
+    middle, focal = camera.matrix[:2, 2], np.diag(camera.matrix)[:2]
+    points = (boxes.reshape(-1, 2, 2) - middle) / focal
+    radius = np.linalg.norm(points, axis=-1, keepdims=True)
+    return ((points * (1 - 0.25 * radius**2 + 0.06 * radius**4)) * focal + middle).reshape(-1, 4)
+
+
 def _upside_down(boxes: Floats, camera: Camera) -> Floats:
     return np.asarray((np.tile(camera.size - 1, 2) - boxes)[:, [2, 3, 0, 1]])
 
@@ -214,6 +222,8 @@ MISTAKES: dict[str, Mistake] = {
     "base_T_camera pitch +90 deg": _turned(0, 90, 0),
     "base_T_camera roll +90 deg": _turned(90, 0, 0),
     "camera moved in the middle": _camera_moved,
+    "boxes of rectified images": _camera(lambda camera: replace(camera, distortion=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]))),
+    "boxes of raw images": lambda log: with_boxes(log, _bent),
     "image mirrored": lambda log: with_boxes(log, _mirrored),
     "image upside down": lambda log: with_boxes(log, _upside_down),
     "boxes 0..1": lambda log: with_boxes(log, lambda boxes, camera: boxes / np.tile(camera.size, 2)),

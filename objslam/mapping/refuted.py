@@ -22,6 +22,7 @@ from objslam.mapping.alternation import solve
 from objslam.mapping.checks.agreement import agreement, bounded_part
 from objslam.mapping.checks.diagnosis import Diagnosis
 from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.hypotheses.lens import LENS
 from objslam.mapping.checks.hypotheses.trials import clear
 from objslam.mapping.checks.parts.halves import check_halves, seen_in_both
 from objslam.mapping.checks.parts.mixture import find_mixture
@@ -44,6 +45,14 @@ _QUIETER = 0.5
 noise. A larger share refutes fewer findings. Examples are logs of an MRCLAM robot with a fault. If the images were mirrored,
 the corrected log needs 0.17 of the noise, because with the fault the path must turn the other way. If base_T_camera was the
 identity, it needs 0.15 of the noise, which is still 2.9 times the noise in the settings."""
+_USUAL_NOISE = 1.1
+"""With at most this factor on the noise of rays and odometry, a solve shows no other lens. Simulated logs whose boxes have
+another lens have 1.3 to 2.1 or far more, and right logs at most 1.0. A larger factor saves more solves, and finds fewer
+mistakes."""
+_SHARPER, _QUIETER_LENS = 1.0, 0.75
+"""With another lens, rays must have at most the first share of their noise, and the larger of the noise of rays and odometry
+must be at most the second share of what it was. In 18 simulated logs, the right lens has 0.4 to 1.0, and 0.2 to 0.9. A wrong
+lens has 1.1 or more in both. Larger shares accuse more lenses."""
 _IN_BOTH = 0.4
 """The halves of a log agree if at least this share of their rays belongs to common objects. Common objects are seen in both
 halves. The share is among the explained rays of each half (`seen_in_both`). A larger share refutes fewer findings. Clean
@@ -86,6 +95,7 @@ def without_refuted(diagnosis: Diagnosis, solution: Solution, log: Log, settings
     - "halves": the finding is wrong if the solution explains the boxes of both halves, or if both halves have the same
       objects.
     - "frames": the finding is wrong if the solution explains similar shares of the rays in all frames.
+    - "lens": the finding is wrong if a solve with the other lens does not need far less noise of rays.
     - "ranges": the finding is wrong if the ranges fit the odometry once the errors of clocks, turns and mounts that the
       solution has found are taken out of the log.
     """
@@ -115,6 +125,8 @@ def _refuted(
         return quiet and find_mixture(solution.rays.keyframe, _explained(solution)) is None
     if finding.basis == "ranges":
         return quiet and not _ranges_differ(log, solution, settings)
+    if finding.basis == "lens":
+        return not _other_lens(diagnosis, solution, log, settings, progress)
     explained = quiet and _least_explained(solution) >= _EXPLAINED
     if finding.basis == "halves":
         # With rounds of association, an object may be in the map twice, once for each half.
@@ -138,6 +150,19 @@ def _refuted(
     more = _explained(other).mean() >= _explained(solution).mean() + _MORE
     exact = _noise(other, rays_only=True) <= _QUIETER * _noise(solution, rays_only=True)
     return not (more and (exact or quieter or _noise(other) <= _NOISE))
+
+
+def _other_lens(diagnosis: Diagnosis, solution: Solution, log: Log, settings: Settings, progress: Progress) -> bool:
+    """Return whether the boxes of a log have another lens than the log says, as a solve with that lens shows."""
+    named = next(t.hypothesis for t in diagnosis.trials if t.hypothesis is not None and t.hypothesis.name == LENS)
+    if _noise(solution) <= _USUAL_NOISE:
+        return False
+    try:
+        other = _solved(named.put_right(log), settings, progress)
+    except ObjslamError:
+        return False
+    sharper = _noise(other, rays_only=True) <= _SHARPER * _noise(solution, rays_only=True)
+    return sharper and _noise(other) <= _QUIETER_LENS * _noise(solution)
 
 
 def _fits(solution: Solution) -> bool:

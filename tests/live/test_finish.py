@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 from driving import feed
 from mapping.hiding_drives import hiding_drive
+from mapping.test_checks import drive
 from mapping.test_depth_axis import driven, with_power
 from mapping.test_moved_camera import turned
+from wrong_inputs import MISTAKES
 
 from objslam.config import load_settings
+from objslam.errors import SolveError
 from objslam.live.session import finalize
 from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
 
 ODD, TIMES = 1, 4.0
+QUIET = ("output.recording=false",)
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +86,30 @@ def test_the_end_trusts_no_object_of_a_camera_that_somebody_turned():
         result = feed(Session(settings, patient=True).start(), turned(log, 0, degrees)).stop()
         assert [one["name"] for one in result.summary["wrong_input"]] == names
         assert bool(result.map.resolved()) == (not names)
+
+
+@pytest.mark.parametrize(
+    ("mistake", "name"),
+    [("base_T_camera roll +90 deg", "mount turned"), ("image mirrored", "image mirrored"), ("none", None)],
+)
+def test_the_end_names_wrong_input(mistake, name):
+    log = drive("fixed")
+    result = feed(
+        Session(load_settings(None, QUIET), patient=True).start(), MISTAKES.get(mistake, lambda log: log)(log)
+    ).stop()
+    found = [one["name"] for one in result.summary["wrong_input"] if one["spoils_positions"]]
+    assert [one.split(",")[0] for one in found] == ([] if name is None else [name])
+    assert bool(result.map.resolved()) == (name is None)
+
+
+def test_a_session_whose_poses_allow_no_map_says_why(monkeypatch):
+    def fail(*given):
+        raise SolveError("no object has a position")
+
+    monkeypatch.setattr(finalize, "solve", fail)
+    session = feed(
+        Session(load_settings(None, QUIET), patient=True).start(), MISTAKES["x and y of poses swapped"](drive("fixed"))
+    )
+    with pytest.raises(SolveError):
+        session.stop()
+    assert any("x and y of the poses are swapped" in line for line in session.counters.ledger.warnings)

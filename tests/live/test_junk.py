@@ -210,3 +210,10 @@ def test_a_stamp_in_another_unit_is_told(stamp, fault):
     assert not session.push_mount(stamp, "front", np.eye(4))
     assert not session.push_detections(stamp, "front", BOX, ["cup"], [1.0])
     assert list(session.counters.dropped()) == [f"{what} with a stamp {fault}" for what in ("odometry", "mount", "frame")]
+
+
+def test_boxes_that_are_shares_of_the_image_are_told():
+    session = Session(SETTINGS)
+    assert session.push_camera(CAMERA)
+    session.push_detections(1.0, "front", [[0.1, 0.2, 0.3, 0.4], [10.0, 20.0, 30.0, 40.0]], ["cup", "cup"], [1.0, 1.0])
+    assert list(session.counters.dropped()) == ["box between 0 and 1, a share of the image instead of px"]

@@ -228,12 +228,13 @@ def test_the_verdict_says_where_boxes_of_a_thing_are_that_the_map_lacks():
 
 def test_why_an_object_has_no_position_is_one_reason():
     result = mapped(simulate(preset("rooms", false=0.0), 3))
-    o = replace(result.map.objects[0], parallax_deg=8.0, rays=9)
+    o = replace(result.map.objects[0], parallax_deg=8.0, rays=9, position=np.full(3, np.nan))
     for rms, said, other in ((0.2, "sigma exceeds", "disagree"), (5.0, "disagree", "sigma exceeds")):
         objects = [replace(o, rms_deg=rms), *result.map.objects[1:]]
         told = words.why_unresolved(replace(result, map=replace(result.map, objects=tuple(objects))), 0)
         assert said in told
         assert other not in told
+        assert "nan" not in told
 
 
 def test_an_object_whose_boxes_have_two_sizes():

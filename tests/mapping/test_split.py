@@ -133,3 +133,12 @@ def test_two_rays_beyond_a_gap_are_no_object():
     assert split_at_gaps(direction, one, np.ones(10, dtype=bool), 3).count == 1
     none = replace(one, object=np.full(10, -1))
     assert split_at_gaps(direction, none, np.zeros(10, dtype=bool), 3).count == 1
+
+
+def test_a_part_of_a_split_object_has_its_labels_and_its_existence():
+    direction = np.repeat([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], 10, axis=0)
+    one = Association(np.zeros(20, dtype=np.int64), np.array([1]), np.array([[0.2, 0.8]]), np.array([0.9]))
+    found = split_at_gaps(direction, one, np.ones(20, dtype=bool), 3)
+    assert found.count == 2
+    assert found.label_weights.tolist() == [[0.2, 0.8], [0.2, 0.8]]
+    assert found.existence.tolist() == [0.9, 0.9]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import COEFFICIENTS, Camera, RangeNoise
 from objslam.core.types import MAX_BOXES
 from objslam.core.validity import (
@@ -25,6 +25,7 @@ _LONGEST_NAME = 1000  # The most characters of a camera's name. A larger number 
 _LETTERS = 80  # The most characters that a report shows of a text in a message. A larger number makes longer lines.
 _NUMBERS = "iufO"  # The kinds of numpy arrays that may hold numbers: signed and unsigned integers, floats, and objects.
 _MOST_COEFFICIENTS = max(map(max, COEFFICIENTS.values()))  # Above it, a count is not told, so reports of cameras stay few.
+_SHARE = "box between 0 and 1, a share of the image instead of px"  # The reason for which such a box is dropped.
 _EXACT = 2**53  # The bound below which a float represents every whole number exactly.
 
 
@@ -155,7 +156,7 @@ def sound_frame(
     if corners is None or score is None or depth is None or track is None:
         return malformed
     names = np.array([is_name(word) for word in words], dtype=bool)
-    rules = box_rules(corners, score, names)
+    rules = (*box_rules(corners, score, names), (~_are_shares(corners), _SHARE))
     depth = np.where(valid_depths(depth), depth, np.nan)
     good, left_out = np.ones(count, dtype=bool), dict[str, int]()
     for fine, reason in rules:
@@ -165,6 +166,11 @@ def sound_frame(
     kept = np.flatnonzero(good)
     columns = corners[kept], tuple(str(words[i]) for i in kept.tolist()), score[kept], depth[kept], track[kept]
     return FrameMessage(given, camera, *columns, bool(whole)), "", where, left_out
+
+
+def _are_shares(corners: Floats) -> Bools:
+    """Return which boxes (M, 4) lie between 0 and 1. No detector finds boxes of less than a pixel in an image's corner."""
+    return np.asarray(((corners >= 0) & (corners <= 1)).all(axis=1))
 
 
 def _array(values: object, dtype: type | None = None) -> NDArray[Any] | None:

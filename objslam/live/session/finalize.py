@@ -20,6 +20,7 @@ from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
+from objslam.live.session.input_checks import diagnose_session, with_boxes
 from objslam.mapping.alternation import solve
 from objslam.mapping.bodies.boxes_in_front import with_hidden_parts
 from objslam.mapping.bodies.fitting import with_bodies
@@ -38,6 +39,7 @@ from objslam.mapping.joint.labels import labels_tell, may_be_by_label
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.moves.near_sides import check_rows
 from objslam.mapping.moves.phantoms import check_neighbours
+from objslam.mapping.refuted import without_refuted
 from objslam.mapping.solution import Solution, without_errors
 
 
@@ -63,9 +65,23 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         raise SolveError("no box could be mapped", where=name, hint=hint or None)
     if m.calibration is not None:
         warn_of_others(m.calibration, log, settings, ledger)
+    recorded = with_boxes(found)
+    diagnosis = diagnose_session(recorded, settings, ledger) if settings.checks.use else Diagnosis()
     cameras = tuple(one.camera for one in log.cameras)
-    solution = _solved(found, m.by_label, cameras, settings, ledger)
-    findings = [_changed(name) for name in sorted(m.changed_cameras)]
+    try:
+        if diagnosis.spoilt and log.localization is not None:
+            ledger.warn("the poses are not solved, because a solve cannot correct wrong input")
+            settings = settings.model_copy(update={"mode": "fixed"})
+            solution = solve(found.keyframes, found.rays, cameras, settings, ledger, lambda *_: None)
+        else:
+            solution = _solved(found, m.by_label, cameras, settings, ledger)
+    except SolveError:
+        say(diagnosis, ledger)  # Wrong input is the probable reason.
+        raise
+    diagnosis = diagnosis.with_findings([_changed(name) for name in sorted(m.changed_cameras)])
+    if diagnosis.refutable and settings.mode == "joint":
+        diagnosis = without_refuted(diagnosis, solution, recorded, settings, lambda *_: None)
+    findings = list(diagnosis.findings)
     if solution.errors is not None:
         errors, settings = solution.errors, solution.errors.settings  # It may have more errors, and settings for them.
         if settings.checks.use:

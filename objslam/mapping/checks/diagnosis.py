@@ -17,6 +17,7 @@ from objslam.mapping.checks.boxes import check_boxes, refuse_shares
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.hypotheses.disagreement import disagree
 from objslam.mapping.checks.hypotheses.every import later
+from objslam.mapping.checks.hypotheses.lens import check_lens
 from objslam.mapping.checks.hypotheses.trials import Trial, crooked, try_hypotheses, verdict
 from objslam.mapping.checks.jumps import corrected_jumps, taken_out, wrong_jumps
 from objslam.mapping.checks.parts.halves import check_halves
@@ -146,7 +147,11 @@ def _diagnosed(log: Log, settings: Settings, ledger: Ledger, progress: Progress,
         # Where boxes agree only by chance, they say nothing about single frames, about halves, or about how a camera is
         # turned.
         findings += [none_fits] if none_fits else _parts_differ(part, found, settings)
-        if not any(finding.spoils for finding in findings):
+        lens = None if none_fits else check_lens(part, found, settings)
+        if lens is not None:
+            findings.append(lens[0])
+            trials.append(lens[1])
+        elif not any(finding.spoils for finding in findings):
             errors = _small_errors(part, found, settings)
             if errors is not None:
                 cause = f"at the given poses the boxes fit best with {errors.in_words()}: {errors.causes()}"

@@ -16,14 +16,15 @@ class Finding:
     name: short and fixed, for programs. message: one line that names the cause, for people. spoils: whether the fault makes
     the positions of a map unreliable, because the run does not correct it. basis: the evidence. "log": the input itself.
     "boxes": all boxes do not agree at the given poses. "halves": the boxes of the two halves of the log do not agree with
-    each other. "frames": the boxes of single frames do not agree. "ranges": the ranges do not agree with the distances that
-    the odometry measured. A joint solve may refute a finding with any of these, but not with "log".
+    each other. "frames": the boxes of single frames do not agree. "lens": the boxes agree better with another lens.
+    "ranges": the ranges do not agree with the distances that the odometry measured. A joint solve may refute a finding with
+    any of these, but not with "log".
     """
 
     name: str
     message: str
     spoils: bool = True
-    basis: Literal["log", "boxes", "halves", "frames", "ranges"] = "log"
+    basis: Literal["log", "boxes", "halves", "frames", "lens", "ranges"] = "log"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of summary.json."""

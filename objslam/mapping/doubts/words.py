@@ -50,13 +50,14 @@ def why_unresolved(result: RunResult, j: int) -> str:
 
 def _noise_deg(result: RunResult, j: int) -> float:
     """Return the median standard deviation of the rays of an object, deg. At given poses, it includes the noise of the
-    poses."""
+    headings, and that of the places if the object has a position."""
     mine = np.flatnonzero(result.association.object == j)
-    sigma, place = result.rays.sigma, 0.0
+    sigma = result.rays.sigma[mine]
     if result.settings.mode == "fixed":
-        sigma, place = pose_noise(result.rays, result.keyframes, result.settings)
-    away = np.linalg.norm(result.origins[mine] - result.map.objects[j].position, axis=1)
-    return float(np.degrees(np.median(np.hypot(sigma[mine], place / np.maximum(away, MIN_DEPTH)))))
+        every, place = pose_noise(result.rays, result.keyframes, result.settings)
+        away = np.linalg.norm(result.origins[mine] - result.map.objects[j].position, axis=1)
+        sigma = np.hypot(every[mine], np.nan_to_num(place / np.maximum(away, MIN_DEPTH)))
+    return float(np.degrees(np.median(sigma)))
 
 
 def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:

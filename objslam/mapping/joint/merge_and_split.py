@@ -80,6 +80,8 @@ def split_at_gaps(direction: Floats, association: Association, used: Bools, fewe
         association: of the rays. The second bundle of an object becomes a new object of the same label.
         used: (R,) the rays that agree with their objects. The others go with the bundle on their side of the gap.
         fewest: the fewest used rays of a bundle.
+
+    A new object has the labels and the existence of the object that was split.
     """
     held = np.flatnonzero(association.object >= 0)
     owner, count = association.object[held], association.count
@@ -89,4 +91,10 @@ def split_at_gaps(direction: Floats, association: Association, used: Bools, fewe
     second[two] = count + np.arange(len(two))
     found = association.object.copy()
     found[held[beyond]] = second[owner[beyond]]
-    return Association(found, np.append(association.label, association.label[two]))
+    weights, existence = association.label_weights, association.existence
+    return Association(
+        found,
+        np.append(association.label, association.label[two]),
+        label_weights=None if weights is None else np.concatenate([weights, weights[two]]),
+        existence=None if existence is None else np.append(existence, existence[two]),
+    )
