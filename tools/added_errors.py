@@ -13,9 +13,10 @@ from objslam.core.types import Log, Trajectory
 def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
     """Return the log as it would be with shared errors of these values, named as in `core.calibration.Calibration`.
 
-    Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, odometry.turn_slip, odometry.lateral_scale,
-    range_scale, range_offset, and for each CAMERA the names CAMERA.clock, CAMERA.roll, CAMERA.tilt, CAMERA.yaw,
-    CAMERA.focal, CAMERA.cx, CAMERA.cy, CAMERA.x, CAMERA.y and CAMERA.z. The odometry must be planar.
+    Known names: odometry.scale, odometry.turn_scale, odometry.turn_bias, odometry.turn_per_m, odometry.turn_slip,
+    odometry.lateral_scale, range_scale, range_offset, and for each CAMERA the names CAMERA.clock, CAMERA.roll,
+    CAMERA.tilt, CAMERA.yaw, CAMERA.focal, CAMERA.cx, CAMERA.cy, CAMERA.x, CAMERA.y and CAMERA.z. The odometry must be
+    planar.
     """
     odometry = None if log.odometry is None else _wrong_odometry(log.odometry, errors)
     cameras = []
@@ -42,15 +43,15 @@ def add_shared_errors(log: Log, errors: Mapping[str, float]) -> Log:
 def _wrong_odometry(odometry: Trajectory, errors: Mapping[str, float]) -> Trajectory:
     """Return the odometry with wrong distances, turns and turn rates. A correction by the same values restores the true
     odometry."""
-    names = ("scale", "turn_scale", "turn_bias", "turn_slip", "lateral_scale")
-    scale, turn_scale, turn_bias, turn_slip, lateral = (errors.get(f"odometry.{name}", 0.0) for name in names)
+    names = ("scale", "turn_scale", "turn_bias", "turn_per_m", "turn_slip", "lateral_scale")
+    scale, turn_scale, turn_bias, per_m, turn_slip, lateral = (errors.get(f"odometry.{name}", 0.0) for name in names)
     plane, remainder = split_se2(odometry.poses)
     yaw, place = np.unwrap(plane[:, 2]), plane[:, :2]
-    turns = (np.diff(yaw) - turn_bias * np.diff(odometry.stamps)) / (1 + turn_scale)
-    said = yaw[0] + np.append(0.0, np.cumsum(turns))
     # A step is along the mean of the headings at its ends, so errors of these headings turn the step by their mean.
     chord = np.diff(place, axis=0) @ [1, 1j] * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
     chord /= 1 + scale
+    turns = (np.diff(yaw) - turn_bias * np.diff(odometry.stamps) - per_m * chord.real) / (1 + turn_scale)
+    said = yaw[0] + np.append(0.0, np.cumsum(turns))
     moves = np.abs(chord) > 0  # A robot that turns on the spot does not slip.
     chord[moves] *= 1 + turn_slip * np.abs(turns[moves]) / np.abs(chord[moves])
     chord.imag /= 1 + lateral

@@ -34,6 +34,7 @@ means a wrong unit, and a calibration should not hide that."""
 UNITS = {
     "clock": "s",
     "turn_bias": "rad/s",
+    "turn_per_m": "rad/m",
     "turn_slip": "m/rad",
     "range_offset": "m",
     "yaw": "rad",

@@ -1,4 +1,4 @@
-"""Correct known errors of the odometry: its scales ahead and sideways, and the scale, the bias and the slip of its turns."""
+"""Correct known errors of the odometry: its scales ahead and sideways, and the scale, biases and slip of its turns."""
 
 import math
 from collections import deque
@@ -15,7 +15,8 @@ from objslam.frontend.odometry_bridge import OdometryBridge, bridge_of
 from objslam.frontend.odometry_drift import DriftPath, PlanarSteps
 from objslam.frontend.recent_values import RecentValues
 
-ODOMETRY = ("odometry.scale", "odometry.turn_scale", "odometry.turn_bias", "odometry.turn_slip", "odometry.lateral_scale")
+_KINDS = ("scale", "turn_scale", "turn_bias", "turn_per_m", "turn_slip", "lateral_scale")
+ODOMETRY = tuple(f"odometry.{one}" for one in _KINDS)
 """The errors of odometry."""
 _LEVEL = 1e-6
 """The largest tilt (rad) and change of height (m) of a path whose drift is computed in the plane. The drift of any other
@@ -36,8 +37,8 @@ _SIDEWAYS = 0.05
 """A robot drives sideways if the moves in one direction are more than this share of its way. If this way is 20 % too long,
 the path is 1 % too long, which is within the prior of the other scale. With a larger share, robots that seldom drive
 sideways have no lateral scale."""
-_KEPT = 5
-"""For how many turn scales, biases, slips and lateral scales the corrected path is kept. A round of derivatives needs five:
+_KEPT = 6
+"""For how many turn scales, biases, slips and lateral scales the corrected path is kept. A round of derivatives needs six:
 the present path, and one for each of these errors. A larger number takes more memory."""
 
 
@@ -79,6 +80,16 @@ class CorrectablePath:
             for total in (self._turned, way)
         )
         return np.asarray(np.abs(turned) / np.maximum(driven, _STANDS))
+
+    @cached_property
+    def _driven(self) -> Floats:
+        """(N,) m, how far the robot has driven ahead since the first pose. A way backwards counts as negative."""
+        x, y, _ = self._ways
+        left_x, left_y = self._left
+        ahead = left_y * x - left_x * y
+        if self.odometry.travel is not None:
+            ahead = np.copysign(self.odometry.travel[1:, 0], ahead)
+        return np.append(0.0, np.cumsum(ahead))
 
     @cached_property
     def sideways(self) -> Floats:
@@ -126,8 +137,8 @@ class CorrectablePath:
         """Return the corrected path, as `corrected_odometry` does."""
         travel = self.odometry.travel
         if travel is not None:
-            scale, turn_scale, turn_bias, slip, lateral = (error.get(name, 0.0) for name in ODOMETRY)
-            bias = turn_bias * np.diff(self._seconds, prepend=0.0)
+            scale, turn_scale, turn_bias, per_m, slip, lateral = (error.get(name, 0.0) for name in ODOMETRY)
+            bias = np.diff(turn_bias * self._seconds + per_m * self._driven, prepend=0.0)
             turn = (1 + turn_scale) * travel[:, 2] + bias
             longer = (1 + scale) * np.append(1.0, gripping(slip, self._curvature) * self._longer_by(lateral))
             travel = np.stack([longer * travel[:, 0], np.abs(1 + turn_scale) * travel[:, 1], turn], axis=1)
@@ -167,7 +178,7 @@ class CorrectablePath:
         return np.sqrt(1 + (lateral**2 + 2 * lateral) * share)
 
     def _headings_and_places(
-        self, turn_scale: float, turn_bias: float, slip: float, lateral: float
+        self, turn_scale: float, turn_bias: float, per_m: float, slip: float, lateral: float
     ) -> tuple[Floats, Floats]:
         """Return by how much (N,), rad, the errors turn each pose, and the places (3, N), m, seen from the first pose.
 
@@ -176,6 +187,8 @@ class CorrectablePath:
 
         def compute() -> tuple[Floats, Floats]:
             more = turn_scale * self._turned + turn_bias * self._seconds
+            if per_m != 0:
+                more = more + per_m * self._driven
             middle = (more[1:] + more[:-1]) / 2  # The chord of an arc points along the mean of the two headings at its ends.
             cos, sin = np.cos(middle), np.sin(middle)
             x, y, z = self._ways if lateral == 0 else self._ways_with(lateral)
@@ -185,7 +198,7 @@ class CorrectablePath:
             places[0, 1:], places[1, 1:], places[2, 1:] = cos * x - sin * y, sin * x + cos * y, z
             return more, np.cumsum(places, axis=1, out=places)
 
-        return self._moved.get((turn_scale, turn_bias, slip, lateral), compute)
+        return self._moved.get((turn_scale, turn_bias, per_m, slip, lateral), compute)
 
     def _ways_with(self, lateral: float) -> Floats:
         """Return the steps (3, N-1), m, with a lateral scale."""
@@ -218,7 +231,7 @@ class OdometryCorrection:
         said, corrected: the path so far, as the robot sent it and after the correction. None at the start of a path.
         """
         self._scale, *others = (error.get(name, 0.0) for name in ODOMETRY)
-        self._turn_scale, self._turn_bias, self._slip, self._lateral = others
+        self._turn_scale, self._turn_bias, self._per_m, self._slip, self._lateral = others
         self._none = self._scale == 0 and not any(others)
         self._recent: deque[tuple[float, float, float]] = deque([(-math.inf, 0.0, 0.0)])
         self._stamp: float | None = None
@@ -244,10 +257,11 @@ class OdometryCorrection:
         else:
             turn = float(rotation_vector(pose[:3, :3] @ self._before[:3, :3].T)[2])
         more = self._turn_scale * turn + self._turn_bias * (stamp - self._stamp)
+        heading = math.atan2(float(self._before[1, 0]), float(self._before[0, 0])) + turn / 2
+        left_x, left_y = -math.sin(heading), math.cos(heading)
+        more += self._per_m * (left_y * x - left_x * y)
         middle = self._turned + more / 2  # as in `CorrectablePath`
         if self._lateral:
-            heading = math.atan2(float(self._before[1, 0]), float(self._before[0, 0])) + turn / 2
-            left_x, left_y = -math.sin(heading), math.cos(heading)
             longer_left = self._lateral * (left_x * x + left_y * y)
             x, y = x + longer_left * left_x, y + longer_left * left_y
         longer = (1 + self._scale) * self._grip(stamp, turn, math.hypot(x, y))

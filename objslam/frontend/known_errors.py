@@ -38,6 +38,8 @@ COARSE = 0.3
 its clock's error of 0.1 s. A larger value calibrates cameras by worse poses."""
 OF_LENGTHS = ("range_scale", "range_offset", "surface", "tag_scale")
 """The errors of measured lengths."""
+_OF_LONG_WAYS = ("odometry.turn_slip", "odometry.turn_per_m")
+"""The errors of wheels that short ways hardly show."""
 _CAMERA = ("clock", *AXES, *LENS, "x", "y", "z")
 # A run asks for one odometry many times.
 _in_plane = ValuesOfObjects[Trajectory, bool](lambda path: is_planar(path.poses))
@@ -103,7 +105,8 @@ def possible(log: Log, settings: Settings) -> list[str]:
     position have no errors, unless settings.calibration.use is true. Its lens has no errors either, because such poses come
     from images of this lens, or were calibrated with it. Only odometry in the plane slips in curves, or has another scale
     sideways. Odometry in space comes from a camera or a scanner, not from wheels. With a localisation, odometry only leads
-    from one pose to the next. Such short ways hardly show a slip, and a free slip would let wrong associations fit.
+    from one pose to the next. Such short ways hardly show a slip or the difference of two wheels. If these were free,
+    wrong associations would fit.
     """
     asked, place = settings.calibration.use is True, usual_place(log, settings)
     base = {c.camera.name for c in log.cameras if not asked and np.array_equal(c.camera.base_T_camera, np.eye(4))}
@@ -112,7 +115,7 @@ def possible(log: Log, settings: Settings) -> list[str]:
     if log.odometry is not None and not (_in_plane(log.odometry) and _sideways(log.odometry)):
         names = [n for n in names if n != "odometry.lateral_scale"]
     if log.localization is not None or (log.odometry is not None and not _in_plane(log.odometry)):
-        names = [n for n in names if n != "odometry.turn_slip"]
+        names = [n for n in names if n not in _OF_LONG_WAYS]
     return [n for n in names if not ((parts := n.rpartition("."))[0] in base and parts[2] in mounted)]
 
 

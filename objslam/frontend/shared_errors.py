@@ -29,7 +29,7 @@ from objslam.frontend.surface_ranges import (
 )
 from objslam.frontend.unknown_noise import unknown_noise
 
-_STEPS = {"clock": 0.1, "turn_bias": 1e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
+_STEPS = {"clock": 0.1, "turn_bias": 1e-3, "turn_per_m": 5e-3, "yaw": 5e-3, "tilt": 5e-3, "roll": 5e-3}
 """The steps (in the parameter's unit) over which derivatives are taken. The clock's step is long, because velocities are
 noisy and change abruptly. The clocks of the MRCLAM robots converge in half the rounds with 0.1 s instead of 0.01 s."""
 _STEP = 0.01

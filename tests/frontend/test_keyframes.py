@@ -335,7 +335,7 @@ def test_drift_is_the_covariance_propagated_step_by_step(seed):
     assert ten[2, 2] == pytest.approx(10 * 0.01**2)
 
 
-@pytest.mark.parametrize("errors", [(0.0,) * 5, (0.04, 0.0, 0.0, 0.0, 0.0), (-0.03, -0.07, 0.002, 0.04, -0.2)])
+@pytest.mark.parametrize("errors", [(0.0,) * 6, (0.04, *(0.0,) * 5), (-0.03, -0.07, 0.002, 0.03, 0.04, -0.2)])
 def test_the_drift_of_a_corrected_path_is_that_of_its_steps(errors):
     """The path is planar, so its drift comes from sums in the plane. The reference propagates the noise of each step."""
     rng = np.random.default_rng(2)

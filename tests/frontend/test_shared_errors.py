@@ -35,6 +35,7 @@ ERRORS = {
     "odometry.scale": -0.04,
     "odometry.turn_scale": 0.06,
     "odometry.turn_bias": 0.002,
+    "odometry.turn_per_m": 0.01,
     "front.clock": 0.17,
     "front.roll": 0.02,
     "front.tilt": -0.03,
@@ -124,7 +125,7 @@ def test_other_errors_of_one_odometry_share_its_corrected_paths(clean, monkeypat
 
 
 def test_a_second_round_of_derivatives_needs_no_new_path(clean):
-    """The scale only lengthens a path, and a clock only moves stamps. The other four errors give a path each."""
+    """The scale only lengthens a path, and a clock only moves stamps. The other five errors give a path each."""
     path, computed = CorrectablePath(clean.odometry), []
     get = path._moved.get
     path._moved.get = lambda key, compute: get(key, lambda: computed.append(key) or compute())
@@ -132,7 +133,7 @@ def test_a_second_round_of_derivatives_needs_no_new_path(clean):
     for _ in range(2):
         for changed in (None, *ODOMETRY, None):
             path.poses(here if changed is None else {**here, changed: 0.02})
-    assert len(computed) == 5
+    assert len(computed) == 6
 
 
 def test_the_corrected_log_has_the_same_keyframes(clean):

@@ -17,7 +17,10 @@ from objslam.graph.batch_solver import solve_joint
 from objslam.graph.calibration.variance_components import _azimuth_elevation, correlation_time
 from objslam.simulation import DepthNoise, preset, simulate
 
-HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "turn_slip", "clock", "range_scale"))
+HELD = tuple(
+    f"calibration.{name}=0"
+    for name in ("scale", "turn_scale", "turn_bias", "turn_per_m", "turn_slip", "clock", "range_scale")
+)
 
 
 @cache

@@ -15,7 +15,9 @@ from objslam.core.types import Trajectory
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
 
-_HELD = tuple(f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "turn_slip", "range_scale"))
+_HELD = tuple(
+    f"calibration.{name}=0" for name in ("scale", "turn_scale", "turn_bias", "turn_per_m", "turn_slip", "range_scale")
+)
 _ANGLES = ("yaw", "tilt", "roll")
 
 

@@ -42,7 +42,7 @@ estimate. With a correction, each frame would wait longer for its pose, by the o
 larger value maps sooner, but with larger errors."""
 
 
-_LATE = frozenset(("turn_slip", *LENS))
+_LATE = frozenset(("turn_slip", "turn_per_m", *LENS))
 """The kinds of errors that a session estimates only at its end, if no calibration file has them. After a few curves, a slip
 looks like a wrong scale of turns. After a short drive, an error of the lens looks like an error of the clock together with a
 turn of the camera. So the other estimates would become worse.

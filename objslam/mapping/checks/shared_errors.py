@@ -25,6 +25,7 @@ _CAUSES = {
     "turn_scale": "does the robot skid as it turns (tracks, four driven wheels), and is its wheel base right?",
     "turn_slip": "does the robot slip in curves, or does its odometry say what was commanded?",
     "turn_bias": "does the odometry turn while the robot stands?",
+    "turn_per_m": "is one wheel larger than the other?",
     "yaw": "is base_T_camera right?",
     "tilt": "is base_T_camera right?",
     "roll": "is base_T_camera right?",

@@ -121,7 +121,7 @@ def shared(
     """Return the examined errors, as parameters of the measurements. priors: standard deviations (s, rad, share, m)."""
     fixed = dict.fromkeys(
         (
-            *("scale", "lateral_scale", "turn_scale", "turn_bias", "turn_slip"),
+            *("scale", "lateral_scale", "turn_scale", "turn_bias", "turn_per_m", "turn_slip"),
             *("range_scale", "range_offset", "tag_scale", "centre"),
         ),
         0.0,
