@@ -86,17 +86,32 @@ def at_one_clock(log: Log, settings: Settings, ledger: Ledger) -> tuple[Log, Odo
     The localisation keeps its stamps, because the clocks of cameras are estimated against it. The log is returned as it is,
     with None, if the offset is not clearly harmful, or if the settings keep the stamps. The ledger gets a warning else.
     """
-    if log.odometry is None or log.localization is None or not settings.calibration.corrects_odometry_clock:
+    found = _found(log, settings)
+    if found is None or log.odometry is None:
         return log, None
-    found = clock_of_odometry(log.odometry, log.localization, settings.calibration.max_clock, settings.poses.max_gap)
-    if found is None:
-        return log, None
-    late = "early" if found.offset > 0 else "late"
-    ledger.warn(
-        f"the odometry's stamps are {abs(found.offset):.2f} s {late} against those of the localisation (+- "
-        f"{max(found.sigma, 0.005):.2f} s): corrected (--set calibration.odometry_clock=false keeps them)"
-    )
+    ledger.warn(f"{_said(found)}: corrected (--set calibration.odometry_clock=false keeps them)")
     return replace(log, odometry=replace(log.odometry, stamps=log.odometry.stamps + found.offset)), found
+
+
+def warn_of_two_clocks(log: Log, settings: Settings, ledger: Ledger) -> None:
+    """Warn if a run with `at_one_clock` would correct the stamps of the odometry, but this session does not."""
+    found = _found(log, settings)
+    if found is not None:
+        ledger.warn(f"{_said(found)}: a session keeps them, and objslam run on its journal corrects them")
+
+
+def _found(log: Log, settings: Settings) -> OdometryClock | None:
+    if log.odometry is None or log.localization is None or not settings.calibration.corrects_odometry_clock:
+        return None
+    return clock_of_odometry(log.odometry, log.localization, settings.calibration.max_clock, settings.poses.max_gap)
+
+
+def _said(found: OdometryClock) -> str:
+    late = "early" if found.offset > 0 else "late"
+    return (
+        f"the odometry's stamps are {abs(found.offset):.2f} s {late} against those of the localisation "
+        f"(+- {max(found.sigma, 0.005):.2f} s)"
+    )
 
 
 def clock_of_odometry(

@@ -18,6 +18,7 @@ from objslam.core.trajectory import correct_path
 from objslam.core.types import Association, Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
+from objslam.frontend.localization.odometry_clock import warn_of_two_clocks
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.mapping.alternation import solve
@@ -63,6 +64,8 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         raise SolveError("no box could be mapped", where=name, hint=hint or None)
     if m.calibration is not None:
         warn_of_others(m.calibration, log, settings, ledger)
+    paths = Log(name, (), odometry=m.course.driven.trajectory(), localization=m.course.localized.trajectory())
+    warn_of_two_clocks(paths, settings, ledger)
     cameras = tuple(one.camera for one in log.cameras)
     solution = _solved(found, m.by_label, cameras, settings, ledger)
     findings = [_changed(name) for name in sorted(m.changed_cameras)]
