@@ -1,5 +1,7 @@
 """A robot that looks to and fro while it drives, with known errors of its clock or its odometry."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from objslam.config import load_settings
@@ -47,6 +49,27 @@ def drive(seed: int = 1, turns: float = 0.8, clock: float = 0.0, false: float = 
         label_names=tuple(f"thing_{i}" for i in range(labels)),
     )
     return Log("turning", (CameraLog(camera, detections),), odometry=Trajectory(at, lift_se2(path)))
+
+
+def of_two_clocks(offset: float) -> Log:
+    """A drive with a noisy localisation, and an odometry whose stamps lack `offset`, s."""
+    log, rng = drive(), np.random.default_rng(0)
+    path = log.odometry
+    assert path is not None
+    noisy = path.poses[::2] @ lift_se2(rng.normal(size=(len(path.poses[::2]), 3)) * [0.01, 0.01, 0.005])
+    localization = Trajectory(path.stamps[::2], noisy)
+    return replace(_without_late_images(log), odometry=replace(path, stamps=path.stamps - offset), localization=localization)
+
+
+def _without_late_images(log: Log) -> Log:
+    """The log with the first 60 images, so that it is mapped fast."""
+    (first,) = log.cameras
+    boxes = first.detections
+    assert boxes is not None
+    early = boxes.frame < 60
+    columns = ("frame", "boxes", "label", "scores", "depths", "track_ids")
+    kept = {name: getattr(boxes, name)[early] for name in columns}
+    return replace(log, cameras=(replace(first, detections=replace(boxes, frame_stamps=boxes.frame_stamps[:60], **kept)),))
 
 
 def errors_of(log: Log, *overrides: str) -> SharedErrors:

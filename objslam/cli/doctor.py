@@ -38,6 +38,7 @@ def doctor(
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.boxes.robot_parts import without_robot_parts
     from objslam.frontend.known_errors import take_out_expected
+    from objslam.frontend.localization.odometry_clock import at_one_clock
     from objslam.mapping.checks.assessment import lost_input, malformed_frames
     from objslam.mapping.checks.diagnosis import diagnose
     from objslam.mapping.chosen_poses import with_chosen_poses, with_mode_of
@@ -49,7 +50,8 @@ def doctor(
     ledger = Ledger()
     with progress_bar() as show:
         given = read(log, ledger, options)
-        chosen = without_robot_parts(with_chosen_poses(given, settings, ledger), settings, ledger)
+        chosen, _ = at_one_clock(with_chosen_poses(given, settings, ledger), settings, ledger)
+        chosen = without_robot_parts(chosen, settings, ledger)
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
         settings = with_uneven_ground(said, settings, ledger, show)

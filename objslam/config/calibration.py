@@ -36,6 +36,9 @@ class CalibrationSettings(Section):
     """s; the offset of each camera's clock against the clock of the poses."""
     max_clock: Positive = 0.5
     """s; the largest clock offset that is considered."""
+    odometry_clock: bool = True
+    """whether the stamps of the odometry are corrected if they are clearly early or late against those of the localisation.
+    If `use` is false, they are not."""
     yaw: NotNegative = 0.03
     """rad; the rotation of each camera on the base about the vertical axis."""
     tilt: NotNegative = 0.02
@@ -65,3 +68,8 @@ class CalibrationSettings(Section):
     centre: NotNegative = 0.02
     """share of the focal length by which the image centre of each camera is off, along each axis. The
     default is usual for a centre that is assumed in the middle of the image. A calibrated centre errs by less."""
+
+    @property
+    def corrects_odometry_clock(self) -> bool:
+        """Whether the stamps of the odometry may be corrected."""
+        return self.odometry_clock and self.use is not False

@@ -23,6 +23,7 @@ from objslam.frontend.localization.continued_localization import (
     continued_by_odometry,
     share_on_continuation,
 )
+from objslam.frontend.localization.odometry_clock import at_one_clock
 from objslam.frontend.turning_clocks import in_order_of_clocks
 from objslam.graph.least_squares.libraries import load_libraries
 from objslam.mapping.alternation import solve
@@ -130,7 +131,8 @@ def _run(
     The third value is the lasting errors of the poses, None if they are too small for a finding. earlier: the lasting errors
     that an earlier map at the given poses found."""
     recorded = [c.detections for c in log.cameras if c.detections is not None]
-    given = log = without_robot_parts(with_chosen_poses(log, settings, ledger), settings, ledger)
+    log, clock = at_one_clock(with_chosen_poses(log, settings, ledger), settings, ledger)
+    given = log = without_robot_parts(log, settings, ledger)
     both, open_mode = log.localization is not None and log.odometry is not None, settings.mode == "auto"
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)
@@ -280,6 +282,7 @@ def _run(
         summary={
             **summarise(log.name, log.path, counts, settings, ledger, solution, objects, seconds),
             "part": dict(zip(("begin", "end"), log.part, strict=True)),
+            "odometry_clock": None if clock is None else clock.to_dict(),
             "odometry_unused": open_mode and both and settings.mode == "fixed",
             "wrong_input": [finding.to_dict() for finding in diagnosis.findings],
             **({} if where is None else {"localisation": where.told}),

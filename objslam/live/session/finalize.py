@@ -18,6 +18,7 @@ from objslam.core.trajectory import correct_path
 from objslam.core.types import Association, Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.known_errors import warn_of_others
+from objslam.frontend.localization.odometry_clock import warn_of_two_clocks
 from objslam.live.calibration.collected import Collected, collect
 from objslam.live.mapper.state import MapState
 from objslam.live.session.input_checks import diagnose_session, with_boxes
@@ -67,6 +68,8 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         warn_of_others(m.calibration, log, settings, ledger)
     recorded = with_boxes(found)
     diagnosis = diagnose_session(recorded, settings, ledger) if settings.checks.use else Diagnosis()
+    paths = Log(name, (), odometry=m.course.driven.trajectory(), localization=m.course.localized.trajectory())
+    warn_of_two_clocks(paths, settings, ledger)
     cameras = tuple(one.camera for one in log.cameras)
     try:
         if diagnosis.spoilt and log.localization is not None:
