@@ -41,7 +41,7 @@ def ended():
         return replace(found, odd=odd, times=np.where(odd, TIMES, found.times))
 
     find_misfits = finalize.find_misfits
-    session = feed(Session(load_settings(None, ("mode=joint",)), patient=True).start(), hiding_drive(0, frames=100))
+    session = feed(Session(load_settings(None, ("mode=joint",)), patient=True).start(), hiding_drive(0, frames=150))
     with pytest.MonkeyPatch.context() as patch:
         for name in ("with_bodies", "with_box_offsets", "describe"):
             patch.setattr(finalize, name, noted(name))
@@ -93,7 +93,7 @@ def test_the_end_trusts_no_object_of_a_camera_that_somebody_turned():
     [("image mirrored", "image mirrored"), ("none", None)],
 )
 def test_the_end_names_wrong_input(mistake, name):
-    log = drive("fixed", frames=100)
+    log = drive("fixed", frames=150)
     result = feed(
         Session(load_settings(None, QUIET), patient=True).start(), MISTAKES.get(mistake, lambda log: log)(log)
     ).stop()
@@ -109,7 +109,7 @@ def test_a_session_whose_poses_allow_no_map_says_why(monkeypatch):
     monkeypatch.setattr(finalize, "solve", fail)
     session = feed(
         Session(load_settings(None, QUIET), patient=True).start(),
-        MISTAKES["x and y of poses swapped"](drive("fixed", frames=100)),
+        MISTAKES["x and y of poses swapped"](drive("fixed", frames=150)),
     )
     with pytest.raises(SolveError):
         session.stop()
