@@ -26,8 +26,8 @@ def planar_noise(drift: Floats, odom_T_base: Floats, settings: Settings) -> Floa
 def motions_by_shared_errors(errors: CalibratedMeasurements | None, first: Ints, motion: Floats) -> tuple[Floats, Floats]:
     """Return the derivatives (P-1, 3, S) of the motions' yaw, x and y by S shared errors, and the errors' prior sigmas (S,).
 
-    The shared errors are the errors of the odometry without `_LEFT_OUT`, and one clock for all cameras. motion: (P-1, 4, 4) of the base, from
-    keyframe to keyframe of `first` (P,).
+    The shared errors are one clock for all cameras, and the errors of the odometry without `_LEFT_OUT`. motion: (P-1, 4, 4)
+    of the base, from keyframe to keyframe of `first` (P,).
     """
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(errors.names if errors is not None else ()):
