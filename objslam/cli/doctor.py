@@ -37,6 +37,7 @@ def doctor(
     """
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.boxes.robot_parts import without_robot_parts
+    from objslam.frontend.boxes.second_labels import without_second_labels
     from objslam.frontend.known_errors import take_out_expected
     from objslam.mapping.checks.assessment import lost_input, malformed_frames
     from objslam.mapping.checks.diagnosis import diagnose
@@ -50,6 +51,7 @@ def doctor(
     with progress_bar() as show:
         given = read(log, ledger, options)
         chosen = without_robot_parts(with_chosen_poses(given, settings, ledger), settings, ledger)
+        chosen = without_second_labels(chosen, settings, ledger)
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
         settings = with_uneven_ground(said, settings, ledger, show)
