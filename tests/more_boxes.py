@@ -55,3 +55,22 @@ def with_second_boxes(log: Log, some: Ints, second: Callable[[Floats], Floats]) 
     boxes[again] = second(boxes[again])
     scores[again] *= 0.5
     return replace(log, cameras=(replace(log.cameras[0], detections=replace(more, boxes=boxes, scores=scores)),))
+
+
+def nearly_equal(boxes: Floats) -> Floats:
+    """Boxes whose edges differ from those of others (n, 4) by 2 % of their size."""
+    size = np.sqrt((boxes[:, 2:] - boxes[:, :2]).prod(axis=1))
+    return boxes + 0.02 * size[:, None] * np.random.default_rng(0).normal(size=boxes.shape)
+
+
+def with_second_labels(log: Log, some: Ints) -> Log:
+    """The log with a second box for some boxes (n,) of its first camera, nearly equal, with another label and half of the
+    score."""
+    changed = with_second_boxes(log, some, nearly_equal)
+    found = changed.cameras[0].detections
+    assert found is not None
+    names, label = found.label_names, found.label.copy()
+    again = some + np.arange(1, len(some) + 1)
+    label[again] += len(names)
+    more = replace(found, label=label, label_names=(*names, *(f"like {name}" for name in names)))
+    return replace(changed, cameras=(replace(changed.cameras[0], detections=more),))

@@ -37,6 +37,7 @@ def doctor(
     """
     from objslam.core.diagnostics import Ledger
     from objslam.frontend.boxes.robot_parts import without_robot_parts
+    from objslam.frontend.boxes.second_labels import without_second_labels
     from objslam.frontend.known_errors import take_out_expected
     from objslam.frontend.localization.odometry_clock import at_one_clock
     from objslam.mapping.checks.assessment import lost_input, malformed_frames
@@ -52,6 +53,7 @@ def doctor(
         given = read(log, ledger, options)
         chosen, _ = at_one_clock(with_chosen_poses(given, settings, ledger), settings, ledger)
         chosen = without_robot_parts(chosen, settings, ledger)
+        chosen = without_second_labels(chosen, settings, ledger)
         settings = with_mode_of(chosen, settings)
         said = take_out_expected(chosen, settings)
         settings = with_uneven_ground(said, settings, ledger, show)

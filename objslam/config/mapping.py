@@ -45,6 +45,9 @@ class RayNoise(Section):
     Detectors often end a cut box short of the edge."""
     robot_parts: bool = True
     """Drop boxes that stay at one place of the image while the camera turns, such as those of a part of the robot."""
+    second_labels: bool = True
+    """Drop a box that is nearly equal to a surer box of another label in its frame, if most boxes of the two labels that lie
+    on each other are nearly equal. A detector whose suppression works label by label may give a thing two such boxes."""
 
 
 class Depth(Section):

@@ -35,8 +35,7 @@ class Trajectory:
     """Poses of one coordinate frame in another over time.
 
     stamps: (N,) s, finite, strictly increasing. poses: (N, 4, 4) homogeneous, finite. travel: (N, 3) the sum of
-    `trajectory.travel` since the previous pose, over all measured poses. None if no measured pose was left out. Other values
-    raise ValueError.
+    `trajectory.travel` since the previous pose, over all measured poses. None if none was left out. ValueError otherwise.
     """
 
     stamps: Floats
@@ -66,8 +65,9 @@ class Detections:
     the optical axis, m, NaN if unknown. track_ids: (M,) -1 if unknown. whole: True if no box is cut off at the image's edge,
     as with fiducials, because a detector needs all their corners. Then box centres are valid up to the edge. corners:
     (M, 4, 2) px of the raw image, the corners of a square fiducial in its own order, NaN for another box. None if no box has
-    corners. features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box has one. ValueError
-    if a shape, an index or the order is wrong.
+    corners. features: (M, D) unit appearance vectors, a row of NaN for a box without one. None if no box has one. second:
+    (M,) the label of a box that was dropped because it lies on this one, -1 or None without one. ValueError if a shape, an
+    index or the order is wrong.
     """
 
     frame_stamps: Floats
@@ -81,6 +81,7 @@ class Detections:
     whole: bool = False
     corners: Floats | None = None
     features: Floats32 | None = None
+    second: Ints | None = None
 
     def __post_init__(self) -> None:
         m = len(self.frame)
@@ -115,7 +116,8 @@ class Detections:
     def take(self, boxes: Bools | Ints) -> Self:
         """Select boxes by a mask or increasing indices. All frames stay."""
         values: dict[str, Any] = {name: getattr(self, name)[boxes] for name in ("boxes", *_BOX_COLUMNS)}
-        values |= {name: given[boxes] for name in ("corners", "features") if (given := getattr(self, name)) is not None}
+        more = ("corners", "features", "second")
+        values |= {name: given[boxes] for name in more if (given := getattr(self, name)) is not None}
         return replace(self, **values)
 
 
@@ -133,10 +135,8 @@ class Images:
 
 @dataclass(frozen=True)
 class CameraLog:
-    """The data of one camera.
-
-    mount: base_T_camera over time, for example of a camera on an arm. None if camera.base_T_camera is valid all the time.
-    """
+    """The data of one camera. mount: base_T_camera over time, as of a camera on an arm. None if it is always that of the
+    camera."""
 
     camera: Camera
     detections: Detections | None = None
@@ -274,9 +274,9 @@ class Rays:
     object. None if no ray has corners. corner_sigma: (R,) rad, the nominal noise of each corner along each of two axes. cut:
     the cut off boxes of the same images, None if they were not collected. feature: (R,) the row of each ray's appearance
     vector in feature_table, -1 without a vector. feature and feature_table are None if no ray has a vector. surface: (R, 2)
-    two numbers for each range, which was lengthened from a surface to the centre behind it. The first number says
-    by how much, as a share of half the width. The second is the weight of the shared error `surface`, which is added to this
-    share. None means `depth.centre` and 1.
+    two numbers for each range, which was lengthened from a surface to the centre behind it. The first number says by how
+    much, as a share of half the width. The second is the weight of the shared error `surface`, which is added to this share.
+    None means `depth.centre` and 1. second: (R,) as in `Detections`, an index into label_names.
     """
 
     keyframe: Ints
@@ -297,6 +297,7 @@ class Rays:
     feature: Ints | None = None
     feature_table: FeatureTable | None = None
     surface: Floats | None = None
+    second: Ints | None = None
 
     def __len__(self) -> int:
         return len(self.keyframe)
@@ -326,8 +327,7 @@ class Association:
     object: (R,) index of the object, or -1. label: (N,) the label of each object, as an index into label_names of the rays.
     label_weights: (N, L) the share of each label among the boxes of each object, None if unknown. existence: (N,) the
     probability that the object exists, None if unknown. refuted: (R,) whether a ray belonged to an object that was dropped,
-    None if unknown. few_rays: (N,) whether the object was found by the search for objects with few rays, None without this
-    search.
+    None if unknown. few_rays: (N,) whether the search for objects with few rays found the object, None without it.
     """
 
     object: Ints

@@ -51,10 +51,11 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         boxes, directions, angle_sigma = boxes.take(few), directions[few], angle_sigma[few]
         of_rays = (keyframe_of_frame[boxes.frame], directions, angle_sigma)
         corners, corner_sigma = _corner_rays(boxes, camera, settings, ledger)
-        measures = boxes.depths, names[boxes.label], boxes.scores, boxes.boxes, boxes.track_ids
+        second = np.append(names, -1)[np.full(len(boxes), -1) if boxes.second is None else boxes.second]
+        measures = boxes.depths, names[boxes.label], boxes.scores, boxes.boxes, boxes.track_ids, second
         columns.append((*of_rays, *measures, corners, corner_sigma))
         features.append(_features(boxes, features, camera, ledger))
-    keyframe, direction, sigma, depth, label, score, box, track_id, corners, corner_sigma = (
+    keyframe, direction, sigma, depth, label, score, box, track_id, second, corners, corner_sigma = (
         np.concatenate(c) for c in zip(*columns, strict=True)
     )
     seen = np.isfinite(corner_sigma).any()
@@ -83,6 +84,7 @@ def build_rays(log: Log, keyframes: Keyframes, settings: Settings, ledger: Ledge
         cut=CutBoxes(*(np.concatenate(c) for c in zip(*cut, strict=True))),
         feature=None if feature is None else feature[order],
         feature_table=table,
+        second=second[order] if (second >= 0).any() else None,
     )
 
 

@@ -125,7 +125,7 @@ def describe(
                 last_seen=float(stamps.max()),
                 extent=(float(sizes[j, 0]), float(sizes[j, 1])) if np.isfinite(sizes[j]).all() else None,
                 ray=None if known else (origins[middle], directions[middle]),
-                labels=_label_shares(association, j, rays.label_names),
+                labels=_label_shares(association, j, mine, rays),
                 existence=None if association.existence is None else round(float(association.existence[j]), 4),
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
                 body=placed.body if placed is not None and known else None,
@@ -169,10 +169,15 @@ def _cut_off(rays: Rays) -> dict[str, int]:
     return {name: int(n) for name, n in zip(rays.label_names, number, strict=True) if n}
 
 
-def _label_shares(association: Association, j: int, names: tuple[str, ...]) -> dict[str, float] | None:
+def _label_shares(association: Association, j: int, mine: Ints, rays: Rays) -> dict[str, float] | None:
+    """Return the share of each label among the boxes of an object, and the dropped boxes on them. mine: (n,) its rays."""
     if association.label_weights is None:
         return None
-    shares = association.label_weights[j]
+    shares, names = association.label_weights[j], rays.label_names
+    if rays.second is not None:
+        second = rays.second[mine]
+        counts = len(second) * shares + np.bincount(second[second >= 0], minlength=len(names))
+        shares = counts / max(counts.sum(), 1.0)
     return {names[i]: round(float(shares[i]), 4) for i in np.argsort(-shares, kind="stable") if shares[i] > 0}
 
 

@@ -17,6 +17,7 @@ from objslam.core.types import Keyframes, Log, Trajectory
 from objslam.errors import SolveError
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.boxes.robot_parts import without_robot_parts
+from objslam.frontend.boxes.second_labels import without_second_labels
 from objslam.frontend.keyframes import build_keyframes, with_given_stamps
 from objslam.frontend.known_errors import shared_errors, take_out_expected, take_out_known
 from objslam.frontend.localization.continued_localization import (
@@ -132,7 +133,8 @@ def _run(
     that an earlier map at the given poses found."""
     recorded = [c.detections for c in log.cameras if c.detections is not None]
     log, clock = at_one_clock(with_chosen_poses(log, settings, ledger), settings, ledger)
-    given = log = without_robot_parts(log, settings, ledger)
+    log = without_robot_parts(log, settings, ledger)
+    given = log = without_second_labels(log, settings, ledger)
     both, open_mode = log.localization is not None and log.odometry is not None, settings.mode == "auto"
     settings = with_mode_of(log, settings)
     expected = take_out_expected(log, settings)

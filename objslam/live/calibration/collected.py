@@ -10,6 +10,7 @@ from objslam.core.statistics import WHITE
 from objslam.core.types import Association, CameraLog, Keyframes, Log, Rays, Trajectory
 from objslam.errors import ObjslamError
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS
+from objslam.frontend.boxes.second_labels import SECOND_LABELS
 from objslam.frontend.corrected_log import inverse_lens, lens_errors, refocused
 from objslam.frontend.keyframes import UNCOVERED
 from objslam.frontend.known_errors import shared_errors
@@ -73,6 +74,10 @@ def collect(m: MapState, name: str, running: bool = False) -> Collected:
     if not running and part.any():
         m.counters.drop(ROBOT_PARTS, f"stamp {k.stamp[order[at[rows[part]].min()]]:.3f}", int(part.sum()))
     rows = rows[~part]
+    second = _second_labels(m, rows)
+    if not running and second.any():
+        m.counters.drop(SECOND_LABELS, None, int(second.sum()))
+    rows = rows[~second]
     rows = rows[np.argsort(at[rows], kind="stable")]
     poses = m.graph.poses(k.id[order])
     kept = np.unique(at[rows])
@@ -104,6 +109,18 @@ def _of_robot_parts(m: MapState, rows: Ints) -> Bools:
         mine = np.flatnonzero(camera == number)
         part[mine] = finder.are_parts(m.rays.box[rows[mine]], m.rays.label[rows[mine]])
     return part
+
+
+def _second_labels(m: MapState, rows: Ints) -> Bools:
+    """Return which rays in these rows (R,) are of second labels, which the session found only later."""
+    second = np.zeros(len(rows), dtype=bool)
+    if not m.given.rays.second_labels:
+        return second
+    told = np.flatnonzero(np.array([c.sees_size for c in m.cameras], dtype=bool)[m.camera_of_rays(rows)])
+    r, some = m.rays, rows[told]
+    gone, _ = m.second_labels.second_boxes(r.box[some], r.keyframe[some], r.label[some], r.score[some])
+    second[told[gone]] = True
+    return second
 
 
 def _shared_errors(m: MapState, log: Log, keyframes: Keyframes, rays: Rays) -> SharedErrors | None:

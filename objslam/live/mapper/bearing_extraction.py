@@ -4,11 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, box_sizes, same_lens
 from objslam.core.noise import range_noise
 from objslam.core.types import CameraLog
 from objslam.frontend.bearings import box_rays, parts_of_things, surest
+from objslam.frontend.boxes.second_labels import SECOND_LABELS, tells_labels
 from objslam.frontend.corrected_log import corrected_camera, corrected_mount, lens_errors, refocused
 from objslam.frontend.surface_ranges import corrected_ranges, half_widths, range_factors, to_centres
 from objslam.live.mapper.frame_association import FrameRays
@@ -69,7 +70,7 @@ class BearingExtractor:
         base_T_camera = self._map.cameras[number].base_T_camera
         if held is not None:
             base_T_camera = corrected_mount(mount, errors, frame.camera) if errors else mount
-        frame, label = self._without_parts(frame, camera)
+        frame, label = self._without_repeats(frame, camera, number)
         kept, direction, sigma = box_rays(
             frame.boxes, frame.scores, frame.stamp, camera, settings, self._ledger, frame.whole
         )
@@ -93,17 +94,37 @@ class BearingExtractor:
         )
         return FrameView(number, mount, base_T_camera, rays)
 
-    def _without_parts(self, frame: FrameMessage, camera: Camera) -> tuple[FrameMessage, Ints]:
-        """Return the frame without boxes of parts of things, and the numbers of the labels of its boxes."""
+    def _without_repeats(self, frame: FrameMessage, camera: Camera, number: int) -> tuple[FrameMessage, Ints]:
+        """Return the frame without second labels and boxes of parts of things, and the numbers of the labels of its boxes.
+
+        number: of the camera.
+        """
         for name in sorted(set(frame.labels) - self._label_number.keys()):
             self._label_number[name] = len(self._labels)
             self._labels.append(name)
         label = np.array([self._label_number[name] for name in frame.labels], dtype=np.int64)
+        frame, label = _without(self._second_labels(frame, label, camera, number), frame, label)
         measured = frame.boxes, np.zeros(len(frame), dtype=np.int64), label, frame.scores, frame.stamp
-        part = parts_of_things(*measured, camera, self._settings, self._ledger, frame.whole)
-        if not part.any():
-            return frame, label
-        own = np.flatnonzero(~part)
-        labels = tuple(frame.labels[i] for i in own.tolist())
-        columns = {name: getattr(frame, name)[own] for name in ("boxes", "scores", "depths", "track_ids")}
-        return replace(frame, labels=labels, **columns), label[own]
+        return _without(parts_of_things(*measured, camera, self._settings, self._ledger, frame.whole), frame, label)
+
+    def _second_labels(self, frame: FrameMessage, label: Ints, camera: Camera, number: int) -> Bools:
+        """Return which boxes of the frame give the things of other boxes second labels, (n,). Count them."""
+        second = np.zeros(len(frame), dtype=bool)
+        if not self._settings.rays.second_labels or not tells_labels(camera, frame.whole):
+            return second
+        sure = np.flatnonzero(frame.scores >= self._settings.rays.min_score)
+        gone, below = self._map.second_labels.add(number, frame.boxes[sure], label[sure], frame.scores[sure])
+        second[sure[gone]] = True
+        for box, other in zip(sure[gone].tolist(), sure[below].tolist(), strict=True):
+            self._ledger.drop(SECOND_LABELS, 1, f"{frame.labels[box]} on {frame.labels[other]}")
+        return second
+
+
+def _without(gone: Bools, frame: FrameMessage, label: Ints) -> tuple[FrameMessage, Ints]:
+    """Return the frame without some boxes (n,), and the labels (n,) of the others."""
+    if not gone.any():
+        return frame, label
+    own = np.flatnonzero(~gone)
+    labels = tuple(frame.labels[i] for i in own.tolist())
+    columns = {name: getattr(frame, name)[own] for name in ("boxes", "scores", "depths", "track_ids")}
+    return replace(frame, labels=labels, **columns), label[own]

@@ -14,6 +14,7 @@ from objslam.core.noise import NOMINAL, NoiseFactors, range_noise
 from objslam.core.types import Keyframes
 from objslam.errors import SolveError
 from objslam.frontend.boxes.part_finder import RobotPartFinder
+from objslam.frontend.boxes.second_labels import SecondLabelFinder
 from objslam.graph.factors.rays import Bearings
 from objslam.graph.isam2 import IncrementalGraph
 from objslam.live.counters import Counters
@@ -101,7 +102,8 @@ class MapState:
     landmark_of_track: id of the last landmark of each detector track. novelty: share of boxes that match no landmark, as an
     exponential average over about 50 frames. pose_covariance: (6, 6) of the newest keyframe's predicted pose, in its camera
     frame, rad and m, rotation first. NaN if the odometry does not determine it. frames: number of frames of each camera on
-    the course. rng: seeded by the settings. robot_parts: by the numbers of the cameras.
+    the course. rng: seeded by the settings. robot_parts: by the numbers of the cameras. second_labels: of
+    all cameras.
 
     errors: the shared errors that are corrected in all measurements, by name. calibration: their last estimate, None without
     one. given: the settings as given. settings: the same, with odometry noise that fits the corrected distances.
@@ -133,6 +135,7 @@ class MapState:
     sent_cameras: list[Camera] = field(default_factory=list)
     changed_cameras: set[str] = field(default_factory=set)
     robot_parts: dict[int, RobotPartFinder] = field(default_factory=dict)
+    second_labels: SecondLabelFinder = field(default_factory=SecondLabelFinder)
     errors: dict[str, float] = field(default_factory=dict)
     calibration: Calibration | None = None
 
