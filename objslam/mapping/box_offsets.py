@@ -14,8 +14,7 @@ from objslam.core.geometry import evenly_spread, is_planar
 from objslam.core.ground.flattening import noise_of_ground
 from objslam.graph.fixed_pose_triangulation import pose_noise
 from objslam.graph.robust_cost import ray_information
-from objslam.mapping.bodies.centre_bearings import as_centres
-from objslam.mapping.solution import Solution
+from objslam.mapping.solution import Solution, as_centres
 from objslam.triangulation.bodies.shared import SIDES, WITHIN
 
 _SHARES = 81

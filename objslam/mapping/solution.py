@@ -116,6 +116,22 @@ class Solution:
     errors: SharedErrors | None = None
 
 
+def as_centres(solution: Solution) -> Solution:
+    """Return a solution with bodies at given poses as if its boxes had been around their centres. The covariances do not
+    change.
+
+    Objects whose position is the point where rays meet keep their rays."""
+    bodies = solution.bodies or ()
+    centres = {j: body.centre for j, body in enumerate(bodies) if body is not None and body.centre is not None}
+    if solution.to_centre is None or not centres:
+        return solution
+    estimate, turned = solution.estimate, list(centres)
+    positions = estimate.positions.copy()
+    positions[turned] = list(centres.values())
+    shift = solution.to_centre.only((estimate.weight > 0) & np.isin(solution.association.object, turned))
+    return replace(solution, rays=shift.apply(solution.rays), estimate=replace(estimate, positions=positions))
+
+
 def without_errors(errors: SharedErrors, estimate: Estimate) -> tuple[Keyframes, Rays]:
     """Return the keyframes and rays with the shared errors of an estimate removed, and with the noise of the estimate."""
     values = errors.mean if estimate.calibration is None else estimate.calibration.values

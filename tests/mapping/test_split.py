@@ -112,6 +112,21 @@ def test_a_thing_that_shows_to_both_sides_stays_one_object():
     assert state.split().association.count == state.association.count
 
 
+def test_bundles_merge_again_though_the_boxes_of_each_side_have_an_error_of_their_own():
+    """Seen from one side, the boxes of each sign on the wall are 30 % of their size too high or too low."""
+    log = drive(0.0, through=True)
+    found, path = log.cameras[0].detections, log.odometry
+    left = np.interp(found.stamps, path.stamps, path.poses[:, 1, 3]) > 2.0
+    found = found.take(np.flatnonzero((left == (found.track_ids >= 10)) | (found.label == 0)))
+    odd = found.track_ids % 2 == 1
+    high = np.where(odd, 0.3, -0.3) * ((found.track_ids >= 5) & (found.track_ids < 10))
+    boxes = found.boxes + (high * (found.boxes[:, 3] - found.boxes[:, 1]))[:, None] * np.array([0.0, 1.0, 0.0, 1.0])
+    log = replace(log, cameras=(replace(log.cameras[0], detections=replace(found, boxes=boxes)),))
+    two = solved(log, np.arange(20))
+    assert two.merged().association.count > 15
+    assert two.merged(bundles=True).association.count == 15
+
+
 @pytest.mark.parametrize(("gap", "objects"), [(5.0, 1), (25.0, 2), (170.0, 2)])
 def test_rays_are_split_at_a_gap_in_their_directions(gap, objects):
     angle = np.radians(np.concatenate([np.linspace(0, 40, 30), 40 + gap + np.linspace(0, 10, 12)]))

@@ -76,22 +76,6 @@ def solve_to_centres(state: JointState, association: Association, estimate: Esti
     return solved, shift.only(solved.weight > 0)
 
 
-def as_centres(solution: Solution) -> Solution:
-    """Return a solution with bodies at given poses as if its boxes had been around their centres. The covariances do not
-    change.
-
-    Objects whose position is the point where rays meet keep their rays."""
-    bodies = solution.bodies or ()
-    centres = {j: body.centre for j, body in enumerate(bodies) if body is not None and body.centre is not None}
-    if solution.to_centre is None or not centres:
-        return solution
-    estimate, turned = solution.estimate, list(centres)
-    positions = estimate.positions.copy()
-    positions[turned] = list(centres.values())
-    shift = solution.to_centre.only((estimate.weight > 0) & np.isin(solution.association.object, turned))
-    return replace(solution, rays=shift.apply(solution.rays), estimate=replace(estimate, positions=positions))
-
-
 def _solve(
     state: JointState, keyframes: Keyframes, rays: Rays, association: Association, estimate: Estimate, shift: CentreShift
 ) -> Estimate:

@@ -20,11 +20,10 @@ from objslam.core.types import Log
 from objslam.frontend.up import upright
 from objslam.graph.fixed_pose_triangulation import flat_noise, noise_of_poses, noise_up
 from objslam.graph.robust_cost import ray_information
-from objslam.mapping.bodies.centre_bearings import as_centres
 from objslam.mapping.checks.finding import Finding
 from objslam.mapping.fixed.lasting_noise import TIMES, Cells, LastingNoise, lasting_variances
 from objslam.mapping.moves.odometry_witness import odometry_contradicts
-from objslam.mapping.solution import Solution
+from objslam.mapping.solution import Solution, as_centres
 
 _CELL = 1.0
 """The length (s) of the shortest cell. The rays of an object in one cell count as one ray. A longer time is faster, and sees

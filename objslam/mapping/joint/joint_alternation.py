@@ -20,7 +20,7 @@ from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.joint.merge_and_split import merge_unseen_together, split_at_gaps
 from objslam.mapping.progress import Progress
-from objslam.mapping.solution import objects_changed, rays_moved, without_errors
+from objslam.mapping.solution import Solution, objects_changed, rays_moved, without_errors
 
 if TYPE_CHECKING:
     from objslam.core.estimate import Estimate
@@ -120,14 +120,19 @@ class JointState:
         """Whether the search has taken all the solves that it may take."""
         return self.effort.solves >= self.settings.joint.max_solves
 
-    def merged(self) -> Self:
-        """Return the state after objects that appear twice were merged and solved again."""
+    def merged(self, bundles: bool = False) -> Self:
+        """Return the state after objects that appear twice were merged and solved again.
+
+        bundles: whether objects may be bundles of rays to one thing from different sides. The boxes of each side have an
+        error of their own (`box_offsets`), so such bundles lie farther apart than their covariances say.
+        """
         state = self
         for _ in range(self.settings.joint.max_rounds):
             assert state.association is not None
             assert state.estimate is not None
             distance = self.settings.association.duplicate_distance
-            found = merge_unseen_together(state.rays, state.association, state.estimate, distance)
+            estimate = state._with_box_offsets() if bundles else state.estimate
+            found = merge_unseen_together(state.rays, state.association, estimate, distance)
             if found.count == state.association.count:
                 break
             state = state.counted(found).solve("merge", found, state.solved_poses)
@@ -219,13 +224,25 @@ class JointState:
             return self
         # Bundles of one thing usually merge again if the shared errors are held, which takes half the time.
         for hold in dict.fromkeys((True, self.hold)):
-            attempt = replace(self.attempt(), hold=hold).counted(found).solve("split", found, self.solved_poses).merged()
+            attempt = replace(self.attempt(), hold=hold).counted(found).solve("split", found, self.solved_poses)
+            attempt = attempt.merged(bundles=True)
             if self._has_rays_of(attempt):
                 return self
         assert attempt.association is not None
         assert attempt.estimate is not None
         attempt = attempt.alternated(attempt.estimate.map_T_base, (attempt.association, attempt.estimate.positions))
         return self if self._has_rays_of(attempt) else self.better(attempt)
+
+    def _with_box_offsets(self) -> Estimate:
+        """Return the estimate with the errors that boxes share added to its covariances, as large as the settings say. Rays
+        from one side do not show them."""
+        from objslam.mapping.box_offsets import with_box_offsets
+
+        assert self.association is not None
+        assert self.estimate is not None
+        noise = self.settings.noise.model_copy(update={"rays": False})
+        solution = Solution(self.keyframes, self.rays, self.association, self.estimate, ())
+        return with_box_offsets(solution, self.cameras, self.settings.model_copy(update={"noise": noise})).estimate
 
     def _has_rays_of(self, other: Self) -> bool:
         """Return whether the objects have the same rays as in another state."""
