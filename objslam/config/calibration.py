@@ -25,9 +25,9 @@ class CalibrationSettings(Section):
     """share by which all turns of the odometry are too large or too small."""
     turn_bias: NotNegative = 0.003
     """rad/s; the turn rate that the odometry adds at all times, as a gyroscope without calibration does."""
-    turn_per_m: NotNegative = 0.02
-    """rad/m; the turn that the odometry adds for each metre ahead. If the wheels are 0.3 m apart, and one is 0.6 % larger
-    than the other, it is 0.02."""
+    turn_per_m: Literal["auto"] | NotNegative = "auto"
+    """rad/m; the turn that the odometry adds for each metre ahead. If the wheels are 0.3 m apart, and one is 0.3 % larger
+    than the other, it is 0.01. auto: 0, unless the map shows a gross error."""
     turn_slip: NotNegative = 0.02
     """m per rad; the distance by which the odometry is too long for each radian of turning. A robot with tracks or four
     driven wheels slips in curves, and an odometry that takes the speed of the outer wheel is too long by half the track. In

@@ -75,6 +75,8 @@ def prior_sigma(name: str, settings: Settings, place: float) -> float:
         return 0.0
     setting = {"x": "translation", "y": "translation", "z": "translation", "cx": "centre", "cy": "centre"}.get(what, what)
     sigma = getattr(settings.calibration, setting)
+    if sigma == "auto" and name in ODOMETRY:
+        return 0.0
     if sigma == "auto":
         return place if setting == "translation" else USUAL_FOCAL * (place > 0)
     return float(sigma)

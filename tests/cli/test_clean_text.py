@@ -145,7 +145,7 @@ def test_every_other_command(
 ) -> None:
     made = tmp_path / "[b]\x1b[2J\u202emade"
     words = [word.format(log=log, out=out, made=made) for word in COMMANDS[name]]
-    objslam(*words, code=int(name == "doctor"))  # It says that the boxes spoil the map.
+    objslam(*words)
 
 
 def test_a_log_is_converted_and_a_journal_read(objslam: Callable[..., tuple[str, str]], log: Path, tmp_path: Path) -> None:

@@ -29,7 +29,14 @@ from objslam.io.calibration_yaml import dump_calibration
 from objslam.simulation import DepthNoise, make_camera, preset, simulate
 
 SETTINGS = load_settings(
-    None, ("mode=joint", "calibration.focal=0.01", "calibration.translation=0.01", "calibration.centre=0.01")
+    None,
+    (
+        "mode=joint",
+        "calibration.turn_per_m=0.01",
+        "calibration.focal=0.01",
+        "calibration.translation=0.01",
+        "calibration.centre=0.01",
+    ),
 )
 ERRORS = {
     "odometry.scale": -0.04,
@@ -294,7 +301,9 @@ def test_known_errors_are_taken_out_where_none_is_estimated(clean, tmp_path, ove
 
 
 def test_an_error_that_the_settings_hold_is_held_at_the_known_value(clean, tmp_path):
-    settings = load_settings(None, ("mode=joint", "calibration.yaw=0", write_known(tmp_path, ERRORS)))
+    settings = load_settings(
+        None, ("mode=joint", "calibration.yaw=0", "calibration.turn_per_m=0.01", write_known(tmp_path, ERRORS))
+    )
     log = take_out_known(clean, settings, Ledger())
     turn = log.cameras[0].camera.base_T_camera[:3, :3] @ clean.cameras[0].camera.base_T_camera[:3, :3].T
     assert_allclose(Rotation.from_matrix(turn).as_rotvec(), [0, 0, ERRORS["front.yaw"]], atol=1e-12)

@@ -51,7 +51,7 @@ def plain(*more: str):
     return run(drive(0), *more)
 
 
-GROSS = [("front.y", -0.2), ("front.x", 0.25), ("front.focal", 0.1), ("front.focal", -0.1)]
+GROSS = [("front.y", -0.2), ("front.x", 0.25), ("front.focal", 0.1), ("front.focal", -0.1), ("odometry.turn_per_m", 0.05)]
 
 
 @pytest.mark.parametrize(("name", "value"), GROSS)
@@ -68,10 +68,13 @@ def test_a_gross_error_is_estimated_and_named(name, value):
     assert max(match.squared_3d for match in matches) < 13.9
 
 
-@pytest.mark.parametrize("errors", [{}, {"front.y": 0.05, "front.x": -0.05}, {"front.focal": 0.02, "front.cx": 0.04}])
+@pytest.mark.parametrize(
+    "errors",
+    [{}, {"front.y": 0.05, "front.x": -0.05}, {"front.focal": 0.02, "front.cx": 0.04}, {"odometry.turn_per_m": 0.01}],
+)
 def test_usual_errors_stay_held(errors):
     result, ledger = run(add_shared_errors(drive(0), errors)) if errors else plain()
-    assert {"front.x", "front.y", "front.focal"}.isdisjoint(result.calibration.names)
+    assert {"front.x", "front.y", "front.focal", "odometry.turn_per_m"}.isdisjoint(result.calibration.names)
     assert not any("moved the camera" in warning for warning in ledger.warnings)
 
 

@@ -25,9 +25,9 @@ def test_boxes_of_the_right_distortion_are_not(distortion):
     assert not findings(drive.__wrapped__("fixed", cameras=(make_camera(distortion=distortion),)), "fixed")
 
 
-@pytest.mark.parametrize(("name", "seed"), [("boxes of rectified images", 1), ("boxes of raw images", 2), (None, 1)])
-def test_with_odometry_alone_a_solve_with_the_other_lens_decides(name, seed):
-    log = drive("joint", seed=seed)
+@pytest.mark.parametrize("name", ["boxes of rectified images", None])
+def test_with_odometry_alone_a_solve_with_the_other_lens_decides(name):
+    log = drive("joint", seed=1)
     result = pipeline.run(
         log if name is None else MISTAKES[name](log), load_settings(None, ("mode=joint", "output.recording=false")), Ledger()
     )

@@ -3,7 +3,8 @@
 Detectors often work on rectified images, whose boxes have no distortion. If `camera.yaml` has the distortion of the raw
 images, each ray is bent once too often, by degrees near the image's edge. The reverse mistake is a `camera.yaml` of zeros
 beside boxes of raw images. With odometry alone, short windows hardly show the mistake, because few rays cross there. So a
-solve with the other lens decides (`refuted.without_refuted`).
+solve with the other lens decides (`refuted.without_refuted`). The reverse mistake is tested only at a localisation, because
+errors of the odometry look like a lens in windows.
 """
 
 from collections.abc import Iterator
@@ -37,17 +38,16 @@ _MORE_BOXES = 15
 _DOUBTED = 0.7
 """A camera without distortion is tested at poses of a localisation only if the score of the log is below this. Right logs
 have 0.75 in simulation. A larger value tests more right logs, which takes time."""
-_IN_WINDOWS = {True: -0.015, False: 0.015}
-"""In windows of odometry, another lens must raise the score by more than this, to be tested by a solve. The first value is
-for cameras with distortion, and the second for cameras without. In 15 simulated logs, mistakes raise it by -0.01 to 0.03,
-and by 0.02 to 0.07. Right logs have at most -0.02 if their distortion is strong, and at most 0.02. Larger values save solves
-and find fewer mistakes."""
+_IN_WINDOWS = -0.015
+"""In windows of odometry, a log without the distortion of its cameras must have more than the score with it, plus this, to be
+tested by a solve. In simulated logs, the mistake changes the score by -0.01 to 0.03. Right logs have at most -0.02 if their
+distortion is strong. A larger value saves solves and finds fewer mistakes."""
 
 
 def check_lens(part: Part, found: Agreement, settings: Settings) -> tuple[Finding, Trial] | None:
     """Return a finding and its trial if boxes fit better with another distortion, None if not. found: of the part's log."""
     distorted = any(_bends(one.camera) for one in part.log.cameras if one.camera.sees_size)
-    if not distorted and not part.drifts and found.score > _DOUBTED:
+    if not distorted and (part.drifts or found.score > _DOUBTED):
         return None
     tried = list(_lenses(part.log, distorted))
     logs = (one.put_right(part.log) for one in tried)
@@ -60,7 +60,7 @@ def check_lens(part: Part, found: Agreement, settings: Settings) -> tuple[Findin
     if best is None or best.hypothesis is None:
         return None
     gain = best.score - found.score
-    if gain <= (_IN_WINDOWS[distorted] if part.drifts else _MORE) or (not part.drifts and gain * found.boxes < _MORE_BOXES):
+    if gain <= (_IN_WINDOWS if part.drifts else _MORE) or (not part.drifts and gain * found.boxes < _MORE_BOXES):
         return None
     message = f"the boxes fit better {best.hypothesis.what}: {best.hypothesis.cause}"
     return Finding(LENS, message, spoils=False, basis="lens"), best
