@@ -1,8 +1,8 @@
 """Errors that joint mode holds, and that are so large that the map shows them.
 
 With odometry alone, the place and the focal length of a camera are held: they are not estimated, because a path that is free
-to bend fits their usual errors too. So is the difference of two wheels, because a drive without names hardly tells it from the
-bias of a gyroscope. But a gross error bends the path so much that the objects move by many of their sigmas.
+to bend fits their usual errors too. So is the difference of two wheels, because a drive without names hardly tells it from
+the bias of a gyroscope. But a gross error bends the path so much that the objects move by many of their sigmas.
 Such an error is estimated after all. A usual error of a focal length stays, and the sigmas contain its effect. A camera that
 somebody turned during the drive cannot be corrected, because no box shows when that was.
 """
@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 _SETTING = {"x": "translation", "y": "translation", "focal": "focal", "turn_per_m": "turn_per_m"}
 """The setting of each kind of held error. The height of a camera is no held error, because it only lifts the map."""
 _USUAL = {"translation": USUAL_PLACE, "focal": USUAL_FOCAL, "turn_per_m": 0.01}
-"""The standard deviation of each held error of usual robots (m, share, rad/m). One wheel of usual robots is up to 0.3 % larger
-than the other, on a base of 0.3 m. Larger values leave larger errors in the path."""
+"""The standard deviation of each held error of usual robots (m, share, rad/m). One wheel of a usual robot is up to 0.3 %
+larger than the other, on a base of 0.3 m. Larger values leave larger errors in the path."""
 _BENDS = "focal"
 """The setting of the held errors that the covariances contain. In ten recorded drives with focal lengths 4 % too long, 135
 of 150 objects were inside their 95 % ellipsoids without it, and 147 with it. The sigmas of right cameras grow by 1 %. Places

@@ -39,9 +39,9 @@ _DOUBTED = 0.7
 """A camera without distortion is tested at poses of a localisation only if the score of the log is below this. Right logs
 have 0.75 in simulation. A larger value tests more right logs, which takes time."""
 _IN_WINDOWS = -0.015
-"""In windows of odometry, a log without the distortion of its cameras must have more than the score with it, plus this, to be
-tested by a solve. In simulated logs, the mistake changes the score by -0.01 to 0.03. Right logs have at most -0.02 if their
-distortion is strong. A larger value saves solves and finds fewer mistakes."""
+"""In windows of odometry, a log without the distortion of its cameras must have more than its score with it, plus this, to
+be tested by a solve. In simulated logs, the mistake changes the score by -0.01 to 0.03. In right logs with a strong
+distortion, the change is at most -0.02. A larger value saves solves and finds fewer mistakes."""
 
 
 def check_lens(part: Part, found: Agreement, settings: Settings) -> tuple[Finding, Trial] | None:
