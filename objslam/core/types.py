@@ -326,7 +326,7 @@ class Association:
 
     object: (R,) index of the object, or -1. label: (N,) the label of each object, as an index into label_names of the rays.
     label_weights: (N, L) the share of each label among the boxes of each object, None if unknown. existence: (N,) the
-    probability that the object exists, None if unknown. refuted: (R,) whether a ray belonged to an object that was dropped,
+    probability that the object exists, NaN or None if unknown. refuted: (R,) whether a ray is of an object that was dropped,
     None if unknown. few_rays: (N,) whether the search for objects with few rays found the object, None without it.
     """
 

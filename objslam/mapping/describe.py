@@ -126,7 +126,7 @@ def describe(
                 extent=(float(sizes[j, 0]), float(sizes[j, 1])) if np.isfinite(sizes[j]).all() else None,
                 ray=None if known else (origins[middle], directions[middle]),
                 labels=_label_shares(association, j, mine, rays),
-                existence=None if association.existence is None else round(float(association.existence[j]), 4),
+                existence=_existence(association, j),
                 seen_from=seen_from(estimate.positions[j], origins[kept]) if known else None,
                 body=placed.body if placed is not None and known else None,
                 ray_point=None if placed is None or placed.centre is None or not known else estimate.positions[j],
@@ -179,6 +179,12 @@ def _label_shares(association: Association, j: int, mine: Ints, rays: Rays) -> d
         counts = len(second) * shares + np.bincount(second[second >= 0], minlength=len(names))
         shares = counts / max(counts.sum(), 1.0)
     return {names[i]: round(float(shares[i]), 4) for i in np.argsort(-shares, kind="stable") if shares[i] > 0}
+
+
+def _existence(association: Association, j: int) -> float | None:
+    if association.existence is None or np.isnan(association.existence[j]):
+        return None
+    return round(float(association.existence[j]), 4)
 
 
 def summarise(

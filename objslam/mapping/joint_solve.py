@@ -12,7 +12,7 @@ from objslam.frontend.turning_clocks import clocks_of_turns
 from objslam.mapping.exploration.second_exploration import finds_same_objects
 from objslam.mapping.fixed.camera_calibration import associate_at_poses
 from objslam.mapping.fixed.fixed_poses import FixedPoses
-from objslam.mapping.joint.by_label import at_other_labels, by_label
+from objslam.mapping.joint.by_label import Named, at_other_labels, by_label
 from objslam.mapping.joint.diverging_rays import labels_diverge
 from objslam.mapping.joint.doubted_labels import (
     CLEAR_ODDS,
@@ -48,18 +48,17 @@ def solve_joint(begin: JointState, start: InitialEstimate | None) -> JointState:
     named = by_label(state)
     if not named.agree:  # What a solve warned of does not matter if its map is not used.
         state.ledger.restore(before)
-    wider, solved = _with_gross_errors(begin, named.state if named.others is None else named.others)
-    named = replace(named, state=solved) if named.others is None else replace(named, others=solved)
+    wider, named = _named_with_gross_errors(begin, named)
     if wider is not None:
         other = _begun(wider.attempt())
         again = by_label(other)
-        if again.agree or again.others is not None:
+        if again.agree or again.others is not None or again.doubtful is not None:
             begin, state, named = wider, state.replaced(other), replace(again, state=state.replaced(again.state))
     if named.agree:
         doubted = state.settings.association.method != "by_label" and bool(doubted_names(named.state))
         return _with_several_a_label(state, named.state) if doubted else named.state
-    if named.others is not None and (found := at_other_labels(state, named.others)) is not None:
-        return _settled(found)
+    if (found := _of_agreeing_labels(state, named)) is not None:
+        return found
     # The noise and the shared errors of a map that is wrong would bend the path again. So the search begins without them.
     return _associated_again(begin, state, None, named.state)
 
@@ -106,6 +105,18 @@ def _begun(state: JointState) -> JointState:
     return _with_noise_of_poses(_with_clocks(state))
 
 
+def _named_with_gross_errors(begin: JointState, named: Named) -> tuple[JointState | None, Named]:
+    """Return what `_with_gross_errors` returns, for the surest map of the labels."""
+    if named.others is not None:
+        wider, solved = _with_gross_errors(begin, named.others)
+        return wider, replace(named, others=solved)
+    if named.doubtful is not None:
+        wider, solved = _with_gross_errors(begin, named.doubtful)
+        return wider, replace(named, doubtful=solved)
+    wider, solved = _with_gross_errors(begin, named.state)
+    return wider, replace(named, state=solved)
+
+
 def _with_gross_errors(begin: JointState, found: JointState) -> tuple[JointState | None, JointState]:
     """Return the start of a solve that also estimates those held errors that the map of `found` shows. None if it shows
     none. Also return `found`, whose estimate may now tell what the held errors do to it."""
@@ -117,22 +128,36 @@ def _with_gross_errors(begin: JointState, found: JointState) -> tuple[JointState
     return other, replace(found, estimate=estimate)
 
 
-def _with_several_a_label(state: JointState, named: JointState) -> JointState:
+def _of_agreeing_labels(state: JointState, named: Named) -> JointState | None:
+    """Return the state in which the labels that agree are names, with the objects of the other labels. None if no such
+    labels show the path. state: before the solve by labels.
+
+    Doubted labels of these are names too, unless there is clear evidence against it.
+    """
+    aside = state if named.doubtful is None else state.attempt()
+    found = None if named.others is None else at_other_labels(aside, named.others)
+    found = None if found is None else _settled(found)
+    kept = None if named.doubtful is None else at_other_labels(state, named.doubtful)
+    return found if kept is None else _with_several_a_label(state, _settled(kept), found)
+
+
+def _with_several_a_label(state: JointState, named: JointState, other: JointState | None = None) -> JointState:
     """Return the state with several objects per label if there is clear evidence for it, else the state `named`, which has
-    one object for each label. state: before the solve by labels.
+    one object for each label that agrees. state: before the solve by labels. other: a state without this, if there is one.
 
     A short drive may show too little for an exploration, which then finds fewer objects than there are labels, or parts of
     one object. So labels count as names unless the other map has objects for all of them, and is far more likely.
     """
     doubted = doubted_names(named)
     try:
-        other = _associated(state.attempt(), None, named)
-        odds = evidence_against(named, other) if has_several(other) else -np.inf
+        other = _associated(state.attempt(), None, named) if other is None else other
+        several = has_several(other, named)
+        odds = evidence_against(named, other) if several else -np.inf
     except SolveError:  # The map by labels is there, whatever is wrong with the other one.
         return replace(named, doubted=doubted)
     if odds > CLEAR_ODDS and has_labels_of(other, named):
         return named.replaced(other)
-    unclear = odds > -CLEAR_ODDS or (has_several(other) and needs_noisy_boxes(named, other))
+    unclear = odds > -CLEAR_ODDS or (several and needs_noisy_boxes(named, other))
     return replace(named, doubted=doubted) if unclear else named
 
 

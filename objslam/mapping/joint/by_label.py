@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from objslam.association.nearest_neighbour import associate_by_label
+from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.mapping.joint.doubted_labels import doubted_labels, unchecked_labels
@@ -17,6 +18,7 @@ from objslam.mapping.joint.labels import (
     OTHERS,
     angles_to_objects,
     clock_explains,
+    known_names,
     labels_tell,
     noise_explains,
     rays_beyond,
@@ -25,9 +27,10 @@ from objslam.mapping.joint.labels import (
     shows_second_object,
     warn_of_noise,
 )
+from objslam.mapping.solution import seen_something
 
 if TYPE_CHECKING:
-    from objslam.core.arrays import Ints
+    from objslam.core.arrays import Floats, Ints
     from objslam.frontend.shared_errors import SharedErrors
     from objslam.mapping.joint.joint_alternation import JointState
 
@@ -41,12 +44,14 @@ class Named:
     """A map with one object for each label.
 
     state: the solved map. agree: whether the rays agree with it. others: the map of the labels that agree, if the others
-    scatter alone. None if there is no such map, or if it is not sure.
+    scatter alone. None if there is no such map, or if it is not sure. doubtful: the map of the labels that agree, if some of
+    them may name several objects. `others` is without these. None if no label is doubted.
     """
 
     state: JointState
     agree: bool
     others: JointState | None = None
+    doubtful: JointState | None = None
 
 
 def by_label(state: JointState) -> Named:
@@ -63,9 +68,10 @@ def by_label(state: JointState) -> Named:
     # If the settings have too little noise, true rays are rejected. So more noise is tried before labels are left out.
     if not told and not (association.object < 0).any() and _has_fixed_noise(solved):
         found = Named(*_with_other_start(state, solved))
-        return found if found.agree else replace(found, others=_of_labels_that_agree(state, solved))
-    if (others := _of_labels_that_agree(state, solved)) is not None:
-        return Named(solved, False, others)
+        return found if found.agree else Named(found.state, False, *_of_labels_that_agree(state, solved))
+    others, doubtful = _of_labels_that_agree(state, solved)
+    if others is not None or doubtful is not None:
+        return Named(solved, False, others, doubtful)
     if told or (association.object < 0).any():
         return Named(solved, False)
     return Named(*_with_other_start(state, solved))
@@ -75,12 +81,14 @@ def at_other_labels(state: JointState, others: JointState) -> JointState | None:
     """Return the state after rounds at the path that the labels show which agree. None if no solve is possible.
 
     At this path, the rounds find the objects of the labels that scatter, if they have any. So the log need not be explored,
-    which takes longer. The noise stays as it is: with more noise, the path would bend to things that move. state: before the
-    solve by labels. others: the map of the labels that agree.
+    which takes longer. The labels that agree stay names, unless their boxes show a second object. The noise stays as it is:
+    with more noise, the path would bend to things that move. state: before the solve by labels. others: the map of the
+    labels that agree.
     """
     assert others.association is not None
     assert others.estimate is not None
-    known = replace(others, errors=None if others.errors is None else _with_known_noise(others.errors))
+    errors = None if others.errors is None else _with_known_noise(others.errors)
+    known = replace(others, errors=errors, names=known_names(others))
     try:
         return state.replaced(known.alternated(others.estimate.map_T_base, (others.association, others.estimate.positions)))
     except SolveError:
@@ -140,16 +148,17 @@ def _with_doubles(state: JointState) -> tuple[JointState, bool]:
     return state, not shows_second_object(*solved, state.settings)
 
 
-def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | None:
-    """Return the map of the labels that agree with each other, without the labels that scatter.
+def _of_labels_that_agree(state: JointState, named: JointState) -> tuple[JointState | None, JointState | None]:
+    """Return the map of the labels that agree with each other, without doubted ones, and the map that has the doubted too.
 
     Rays of a thing that moves bend the path, and then rays of other labels are rejected as well. So a label may scatter only
     at the path without the first ones, and a label that scattered may agree there. These labels are tried once more, one
     after another, and first the one that fits best, because each label that agrees improves the path. Labels that are
-    doubted at last are left out as well. None if the remaining labels do not show the path (`_show_path`). state: before the
+    doubted at last are left out as well. The first map is None if the remaining labels do not show the path (`_show_path`).
+    The second map has the labels before any was left out because of a doubt, None if there was no doubt. state: before the
     solve by labels. named: after it.
     """
-    solved, best = named, None
+    solved, best, doubtful = named, None, None
     tried, failed = np.zeros(0, dtype=np.int64), 0
     while True:
         assert solved.association is not None
@@ -159,7 +168,7 @@ def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | 
         if scatter.any():
             failed += 1
         elif solved is named:
-            return None
+            return None, None
         else:
             best, failed = solved, 0
         if best is not None:
@@ -172,15 +181,41 @@ def _of_labels_that_agree(state: JointState, named: JointState) -> JointState | 
                 assert best.estimate is not None
                 doubted = doubted_labels(best.rays, best.association, best.keyframes, best.estimate)
                 if not len(doubted):
-                    return best
+                    return best, doubtful
+                doubtful = best if doubtful is None else doubtful
                 tried, labels, best = np.union1d(tried, doubted), np.setdiff1d(best.association.label, doubted), None
         if not _show_path(named, labels):
-            return None
-        begin, start = (state, None) if best is None else (best, best.solved_poses)
+            return None, doubtful
+        some = _of_labels(named, labels)
         try:
-            solved = begin.attempt().solve("labels", _of_labels(named, labels), start)
+            begin, start = (state, _path_of(state, some)) if best is None else (best, best.solved_poses)
+            solved = begin.attempt().solve("labels", some, start)
         except SolveError:
-            return None
+            return None, doubtful
+
+
+def _path_of(state: JointState, some: Association) -> Floats | None:
+    """Return the camera poses (K, 4, 4) after a solve of the keyframes that show objects of an association. None if all
+    keyframes do, or if there is a localisation.
+
+    A solve without a localisation begins at a graph that grows by a number of keyframes at a time. Keyframes that show only
+    a thing that moves would count too. Then the graph may end in a wrong minimum, in which no solve without them ends.
+    state: before the first solve.
+    """
+    shown = some.object >= 0
+    if state.keyframes.localized_every or len(np.unique(state.rays.keyframe[shown])) == len(state.keyframes):
+        return None
+    errors = state.errors
+    if errors is None:
+        keyframes, rays = seen_something(state.keyframes, state.rays.take(shown))
+    else:
+        errors = errors.take(*seen_something(errors.keyframes, errors.rays.take(shown)))
+        keyframes, rays, _ = errors.at(errors.mean if state.theta is None else state.theta)
+    fewer = replace(state.attempt(), keyframes=keyframes, rays=rays, errors=errors)
+    estimate = fewer.solve_once(Association(some.object[shown], some.label), errors)
+    every, mine = state.keyframes, fewer.keyframes
+    at = correct_poses(every.stamps, every.map_T_base, mine.stamps, mine.map_T_base, estimate.map_T_base)
+    return np.asarray(at @ every.base_T_camera)
 
 
 def _by_fit(solved: JointState) -> Ints:

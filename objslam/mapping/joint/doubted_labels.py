@@ -61,10 +61,13 @@ def doubted_names(state: JointState | Solution) -> tuple[str, ...]:
     return tuple(state.rays.label_names[i] for i in doubted.tolist())
 
 
-def has_several(state: JointState) -> bool:
-    """Return whether a label has several objects in a map."""
-    assert state.association is not None
-    return len(np.unique(state.association.label)) < state.association.count
+def has_several(other: JointState, named: JointState) -> bool:
+    """Return whether a label has several objects in the map `other`, and one in the map `named`."""
+    assert other.association is not None
+    assert named.association is not None
+    most = len(named.rays.label_names)
+    several, one = (np.bincount(found.label, minlength=most) for found in (other.association, named.association))
+    return bool(((several > 1) & (one == 1)).any())
 
 
 def has_labels_of(one: JointState, other: JointState) -> bool:

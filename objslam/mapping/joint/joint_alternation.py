@@ -19,6 +19,7 @@ from objslam.core.trajectory import correct_poses
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.joint.merge_and_split import merge_unseen_together, split_at_gaps
+from objslam.mapping.joint.names import beside_names
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, objects_changed, rays_moved, without_errors
 
@@ -52,7 +53,8 @@ class JointState:
     ray, and their rays, corrected by the present shared errors. errors: the shared errors of `keyframes` and `rays`. theta:
     (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
     until the last solve. unsettled, unfinished: as in `Solution`. effort: of the search that the state is a part of.
-    doubted: the labels that may name one object or several.
+    doubted: the labels that may name one object or several. names: the objects of labels that are known to be names. The
+    rounds of association leave these objects their rays, and look for objects of the other labels only.
     """
 
     frames: Keyframes
@@ -71,6 +73,7 @@ class JointState:
     unfinished: bool = False
     effort: Effort = field(default_factory=Effort)
     doubted: tuple[str, ...] = ()
+    names: Association | None = None
     rounds: tuple[dict[str, int], ...] = ()
     association: Association | None = None
     estimate: Estimate | None = None
@@ -329,7 +332,7 @@ class JointState:
         sigma, flat = np.hypot(rays.sigma, yaw), LEVEL
         if rough and mine.localized_every:  # A solve corrects tilt and height of the poses. Before it, rays have both.
             flat = flat_scale(rays, (yaw, place), self.settings) if any(noise_up(mine, self.settings)) else LEVEL
-        return associate_globally(
+        found = associate_globally(
             PosedRays(rays, frames, self.cameras, map_T_camera, sigma, place, flat),
             self.settings,
             seed=self.settings.seed,
@@ -338,3 +341,4 @@ class JointState:
             drifts=rough and frames.odom_T_base is not None and not frames.localized_every,
             solved=not rough,
         )
+        return found if self.names is None else beside_names(self.names, found, rays)

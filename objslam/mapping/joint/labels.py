@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from objslam.association.nearest_neighbour import associate_by_label
 from objslam.core.calibration import kind
 from objslam.core.geometry import angles_off
 from objslam.core.noise import NOMINAL
@@ -158,6 +159,28 @@ def scatter_alone(named: JointState | Solution) -> Bools:
     assert estimate is not None
     beyond, number = rays_beyond(named, association, estimate.positions)
     return np.asarray((beyond >= MANY) & (beyond > SECOND * number))
+
+
+def known_names(solved: JointState) -> Association | None:
+    """Return the objects of the labels of a map with one object for each of its labels, with the nearest box in each frame.
+
+    A label needs `MANY` rays that agree. With fewer, a misread box among them would hardly be noticed. None if other boxes
+    show a second object of any label. solved: the map. The log may have more labels.
+    """
+    before = solved.association
+    assert before is not None
+    assert solved.estimate is not None
+    mine = np.flatnonzero(np.isin(solved.rays.label, before.label))
+    rays = solved.rays.take(mine)
+    nearest = associate_by_label(rays, angles_to_objects(rays, solved.estimate, solved.solved_poses))
+    given = solved.estimate, solved.keyframes, solved.solved_poses, solved.settings
+    if (nearest.object < 0).any() and shows_second_object(rays, nearest, *given):
+        return None
+    clear = np.bincount(before.object[solved.agree], minlength=before.count) >= MANY
+    number = np.append(np.where(clear, np.cumsum(clear) - 1, -1), -1)
+    object_ = np.full(len(solved.rays), -1)
+    object_[mine] = number[nearest.object]
+    return Association(object_, nearest.label[clear])
 
 
 def rays_beyond(named: JointState | Solution, association: Association, positions: Floats) -> tuple[Ints, Ints]:

@@ -95,7 +95,7 @@ def _dropped(state: JointState, known: Ints) -> tuple[JointState, Ints]:
     assert state.estimate is not None
     before = state.association
     given = state.keyframes, state.rays, before, state.estimate, state.solved_poses, state.settings
-    left = things_at_rest(*given, known)
+    left = things_at_rest(*given, known, None if state.names is None else state.names.label)
     if left is before:
         return state, known
     gone = (before.object >= 0) & (left.object < 0)
@@ -110,6 +110,7 @@ def things_at_rest(
     map_T_camera: Floats,
     settings: Settings,
     known: Ints | None = None,
+    names: Ints | None = None,
 ) -> Association:
     """Return the association without objects of things that move, else the association itself.
 
@@ -118,9 +119,12 @@ def things_at_rest(
     passes through the object, and the rays before and after belong to no object or to another one. Labels are judged,
     because tracks of a few things at rest also pass on to equal things beside them. Of a label that moves, objects stay only
     if long tracks show that they are at rest. If all things have one label, the usual scatter is unknown, and all objects
-    stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses. known: labels that are known to move.
+    stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses. known: labels that are known to move. names: the
+    labels that are known to be names of things at rest, whose objects stay.
     """
     moving = _moving(keyframes, rays, association, estimate, map_T_camera, settings, known)
+    if names is not None:
+        moving &= ~np.isin(association.label, names)
     if not moving.any():
         return association
     number = np.append(np.where(moving, -1, np.cumsum(~moving) - 1), -1)
