@@ -125,7 +125,16 @@ def test_a_scale_that_the_log_does_not_tell_is_no_flaw_but_said() -> None:
         "The log does not show the scale of the odometry: all distances may be too long or too"
     )
     assert "with a sigma of 3 %." in found.reasons[-1]
+    assert found.reasons[-1].endswith("Depths or fiducials of known size would show it.")
     assert len(assess(replace(GOOD, scale=0.03, spoilt=True)).reasons) == 1
+
+
+def test_depths_that_do_not_tell_the_scale_are_not_asked_for() -> None:
+    assert (
+        assess(replace(GOOD, scale=0.02, depths=True))
+        .reasons[-1]
+        .endswith("The depths tell it no better. Fiducials of known size would.")
+    )
 
 
 @pytest.mark.parametrize("depth", [False, True])

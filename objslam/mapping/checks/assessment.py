@@ -77,8 +77,8 @@ class Evidence:
     copied: the objects in the largest part of the map that shows the same things as another part. several: whether a
     label has several objects. uncalibrated: whether the estimation of the shared errors failed. odometry: the largest
     factor on a noise of the odometry that the log shows. poses: the same for the localisation. scale: the standard
-    deviation of the scale of the odometry, as a share. None if the log shows the scale. part: the limits of a log that is a
-    part of a recording, as in `Log`.
+    deviation of the scale of the odometry, as a share. None if the log shows the scale. depths: whether boxes have depths.
+    part: the limits of a log that is a part of a recording, as in `Log`.
     malformed: the frames of boxes that were malformed. unused: the paths of the robot that could not be used.
     off_path: the boxes without a pose of the robot or of its camera.
     odometry_unused: whether the mode was left to the log, and a `fixed` run did not use its odometry.
@@ -108,6 +108,7 @@ class Evidence:
     odometry: float = 1.0
     poses: float = 1.0
     scale: float | None = None
+    depths: bool = False
     part: tuple[float | None, float | None] = (None, None)
     odometry_unused: bool = False
     malformed: int = 0
@@ -161,6 +162,7 @@ def evidence_of(summary: dict[str, Any], misses: float) -> Evidence:
         odometry=max((summary.get("noise") or {}).get(name, 1.0) for name in ("along", "across", "turning")),
         poses=max((summary.get("noise") or {}).get(name, 1.0) for name in ("heading", "place")),
         scale=_untold_scale(summary),
+        depths="range_scale" in (summary.get("calibration") or {}).get("parameters", {}),
         part=(summary["part"]["begin"], summary["part"]["end"]) if "part" in summary else (None, None),
         odometry_unused=summary.get("odometry_unused", False),
         malformed=malformed_frames(summary["dropped"]),
@@ -217,9 +219,11 @@ def _about(e: Evidence) -> list[str]:
             "bent to make one object of two things."
         )
     if e.scale is not None:
+        without = "Depths or fiducials of known size would show it."
         found.append(
             "The log does not show the scale of the odometry: all distances may be too long or too short by one factor, "
-            f"with a sigma of {100 * e.scale:.2g} %. Depths or fiducials of known size would show it."
+            f"with a sigma of {100 * e.scale:.2g} %. "
+            + ("The depths tell it no better. Fiducials of known size would." if e.depths else without)
         )
     return found
 
