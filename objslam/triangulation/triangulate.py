@@ -20,6 +20,7 @@ from objslam.triangulation import covariance as spread_of
 from objslam.triangulation.bundle import Bundle
 from objslam.triangulation.lines import Lines
 from objslam.triangulation.point_to_lines import least_squares, minimise_distances
+from objslam.triangulation.range_consensus import agreeing_with_ranges, contradicted
 
 _LARGE = 200_000
 """With at least this number of rays, CUDA does the work, if there is a card. With fewer, numpy on one core is as fast,
@@ -103,7 +104,56 @@ def triangulate(
             raise ValueError("range_bias must be at least 0")
     with array_backend(settings.device, len(m) >= _LARGE) as backend:
         given = known, spread, shared, np.broadcast_to(False if judged is None else np.asarray(judged, dtype=bool), count)
-        return _triangulate(m, n, index, count, noise, position_sigma, settings, seed, *given, backend)
+        found = _triangulate(m, n, index, count, noise, position_sigma, settings, seed, *given, backend)
+        if known is None or spread is None or shared is None or not settings.consensus:
+            return found
+        left = _left(found, m, n, index, noise, position_sigma, known, np.hypot(spread, shared))
+        if not (left >= 0).any():
+            return found
+        again = _triangulate(m, n, left, count, noise, position_sigma, settings, seed, *given, backend)
+        return _changed(found, again, left, index)
+
+
+def _left(
+    found: Triangulation,
+    m: Floats,
+    n: Floats,
+    index: Ints,
+    noise: Floats,
+    position_sigma: float,
+    ranges: Floats,
+    sigma: Floats,
+) -> Ints:
+    """Return the object (R,) of the rays of objects whose bearings lead away from their ranges, -1 for all other rays.
+
+    The rays that cause this are left out. sigma: (R,) m, of the ranges. Other arguments are as in `triangulate`.
+    """
+    left = np.full(len(index), -1)
+    away = np.full(len(index), np.nan)
+    away[index >= 0] = np.linalg.norm(found.positions[index[index >= 0]] - m[index >= 0], axis=1)
+    for j in contradicted(index, found.weight > 0, away, ranges, sigma, len(found.ok)).tolist():
+        mine = np.flatnonzero(index == j)
+        agree = agreeing_with_ranges(m[mine], n[mine], noise[mine], ranges[mine], sigma[mine], position_sigma)
+        left[mine if agree is None else mine[agree]] = -1 if agree is None else j
+    return left
+
+
+def _changed(found: Triangulation, again: Triangulation, left: Ints, index: Ints) -> Triangulation:
+    """Return the triangulation `found` with those objects from `again` that have rays in `left` (R,)."""
+    mine = np.isin(np.arange(len(found.ok)), left)
+    rays = np.append(mine, False)[index]
+    return Triangulation(
+        positions=np.where(mine[:, None], again.positions, found.positions),
+        covariance=np.where(mine[:, None, None], again.covariance, found.covariance),
+        ok=np.where(mine, again.ok, found.ok),
+        parallax=np.where(mine, again.parallax, found.parallax),
+        rms=np.where(mine, again.rms, found.rms),
+        distance=np.where(rays, again.distance, found.distance),
+        weight=np.where(rays, again.weight, found.weight),
+        counts=np.where(mine, again.counts, found.counts),
+        iterations=found.iterations + again.iterations,
+        gradient=np.where(mine, again.gradient, found.gradient),
+    )
 
 
 def _triangulate(
