@@ -195,21 +195,17 @@ def misfit(map_T_camera: Floats, positions: Floats, measured: Measurements, asso
 def second_opinion(
     measured: Measurements, map_T_camera: Floats, association: Association, positions: Floats, used: Bools, enough: Ints
 ) -> tuple[Floats, Bools, Ints]:
-    """Triangulate undetermined objects and objects with outliers again. Keep a new position if more measurements agree.
-
-    A measured range counts beside the bearing of its ray. Otherwise a box with another thing's label may draw an object away
-    from all its ranges, to where its bearing crosses a bundle of other bearings.
+    """Triangulate undetermined objects and objects with outliers again. Keep a new position if more rays agree with it.
 
     Corners of fiducials keep their positions, because four corners of one square are better known than four separate points.
-    An object also keeps its position if at least `enough` (N,) of its bearings and ranges agree. `enough` is the number of
-    those at which an earlier new position was not better. Return the positions (N, 3) m, whether each ray (R,) agrees with
-    its object, and `enough` for the next call.
+    An object also keeps its position if at least `enough` (N,) of its rays agree. `enough` is the number of agreeing rays at
+    which an earlier new position was not better. Return the positions (N, 3) m, whether each ray (R,) agrees with its
+    object, and `enough` for the next call.
     """
     keyframes, rays = measured.keyframes, measured.rays
-    held = association.object >= 0
-    number = np.bincount(association.object[held], 1.0 + np.isfinite(rays.range[held]), association.count)
+    number = np.bincount(association.object[association.object >= 0], minlength=association.count)
     agreeing = supported(rays, association, map_T_camera, positions, used)
-    support = _support(rays, association, map_T_camera, positions, agreeing)
+    support = np.bincount(association.object[agreeing], minlength=association.count)
     doubtful = (support < _SURE * number) & (support < enough)
     if measured.tags is not None:
         doubtful &= ~measured.tags.is_corner()
@@ -224,20 +220,10 @@ def second_opinion(
     other = positions.copy()
     other[objects[placed.ok]] = placed.positions[placed.ok]
     agreeing = supported(rays, association, map_T_camera, other, used)
-    better = _support(rays, association, map_T_camera, other, agreeing) > support
+    better = np.bincount(association.object[agreeing], minlength=len(support)) > support
     positions = np.where(better[:, None], other, positions)
     enough = np.where(doubtful & ~better & (support > 0), support, enough)
     return positions, supported(rays, association, map_T_camera, positions, used), enough
-
-
-def _support(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, agreeing: Bools) -> Ints:
-    """Return how many bearings and ranges agree with each object (N,). agreeing: (R,) as `supported` returns it."""
-    ranged = np.flatnonzero(agreeing & np.isfinite(rays.range))
-    some, landmark = rays.take(ranged), association.object[ranged]
-    origins, _ = some.in_map(map_T_camera)
-    off = np.abs(np.linalg.norm(positions[landmark] - origins, axis=1) - some.range) / some.range_sigma
-    both = np.concatenate([association.object[agreeing], landmark[off <= OUTLIER_RAY]])
-    return np.bincount(both, minlength=association.count)
 
 
 def supported(rays: Rays, association: Association, map_T_camera: Floats, positions: Floats, used: Bools) -> Bools:
