@@ -23,6 +23,7 @@ from objslam.mapping.doubts.twice import find_twice
 from objslam.mapping.doubts.unmapped import in_assessment, unmapped_labels
 from objslam.mapping.doubts.words import in_place, in_words
 from objslam.mapping.moves import driven_through as passed
+from objslam.mapping.moves import other_places as moved
 
 _DOUBLE = 0.5
 """A pair of objects counts in the assessment if it is one object with at least this probability. With a larger value, more
@@ -59,9 +60,10 @@ def find_doubts(result: RunResult, evidence: Evidence) -> Doubts:
 def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
-    A map is not called good in seven cases: some objects are more likely doubles than not, a place is in the map twice, the
-    rays of an object do not agree on one thing, the robot drove through an object, an object has many sizes, most objects
-    have a wide sigma, or many boxes of a label meet where the map has no object. The assessment also names labels without an
+    A map is not called good in eight cases: some objects are more likely doubles than not, a place is in the map twice, the
+    rays of an object do not agree on one thing, the robot drove through an object, two objects are likely one thing that
+    moved, an object has many sizes, most objects have a wide sigma, or many boxes of a label meet where the map has no
+    object. The assessment also names labels without an
     object, things that have only cut off boxes, and things that seem to move. They do not change the level of the
     assessment, because their boxes may be false, and because no map contains things that move.
     """
@@ -73,11 +75,12 @@ def with_doubts(result: RunResult) -> RunResult:
     unmapped, told = unmapped_labels(result, evidence, cut), {one.label for one in doubts if one.kind == "boxes"}
     disagreeing = [*apart.crossing(result, evidence), *apart.disagreeing(result, apart.misfits_of(result))]
     through = passed.driven_through(result)
+    elsewhere = moved.at_other_places(result, evidence.state.history, evidence.object)
     mixed, unsure = mixed_sizes(result), wide.unsure_objects(result)
     # If a whole label has no object, its doubt is enough. Its things get no doubts of their own.
     lacking = {one.label for one in unmapped}
     cut = [thing for thing in cut if result.rays.label_names[thing.label] not in lacking]
-    of_things = [*unsure, *cut_off.in_doubts(cut, result), *_unnamed(disagreeing, doubts), *through, *mixed]
+    of_things = [*unsure, *cut_off.in_doubts(cut, result), *_unnamed(disagreeing, doubts), *through, *elsewhere, *mixed]
     doubts = (*doubts, *of_things, *(one for one in unmapped if one.label not in told))
     counts: dict[str, int] = {kind: sum(one.kind == kind for one in doubts) for kind in DOUBT_KINDS}
     summary = {**result.summary, "doubts": counts}
@@ -88,7 +91,7 @@ def with_doubts(result: RunResult) -> RunResult:
             lost, named = [*named, *lost], []
         twice = find_twice(result.map)
         doubled = [*([twice.in_words()] if twice else []), *apart.in_assessment(disagreeing), *passed.in_assessment(through)]
-        doubled += [*_of_mixed(len(mixed)), *_of_doubles(doubles)]
+        doubled += [*moved.in_assessment(elsewhere), *_of_mixed(len(mixed)), *_of_doubles(doubles)]
         assessment = _assessed(summary["assessment"], doubled, lost)
         named += [*_of_moved_things(found.groups, result), *in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *named]}
