@@ -55,6 +55,7 @@ from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
+from objslam.mapping.joint.path_against_localization import check_bent_path
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
 from objslam.mapping.moves.near_sides import check_rows
 from objslam.mapping.moves.odometry_witness import odometry_contradicts
@@ -239,6 +240,9 @@ def _run(
         and (near := check_neighbours(solution, before, settings, told)) is not None
     ):
         diagnosis = diagnosis.with_findings([near])
+        say(diagnosis, ledger)
+    if settings.checks.use and settings.mode == "joint" and (bent := check_bent_path(solution, before, settings)):
+        diagnosis = diagnosis.with_findings([bent])
         say(diagnosis, ledger)
     names = tuple(camera.name for camera in cameras)
     if settings.checks.use and settings.mode == "joint" and (rows := check_rows(solution, names, settings)) is not None:

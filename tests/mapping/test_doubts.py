@@ -16,6 +16,7 @@ from objslam.config import Settings
 from objslam.core.result import Doubt, RunResult
 from objslam.core.types import Log
 from objslam.mapping.doubts import words
+from objslam.mapping.doubts.find import _praised
 from objslam.mapping.doubts.groups import REASONS
 from objslam.mapping.doubts.sizes import _alike, mixed_sizes
 from objslam.simulation import pair, preset, simulate
@@ -224,6 +225,35 @@ def test_the_verdict_says_where_boxes_of_a_thing_are_that_the_map_lacks():
     assert assessment["level"] == "check"
     x, y, z = (float(v) for v in reason.split("(")[1].split(")")[0].split(","))
     assert np.linalg.norm(np.array([x, y, z]) - result.map.objects[j].position) < 0.05
+
+
+@pytest.mark.parametrize(("lost", "level"), [(1, "good"), (2, "check")])
+def test_a_lost_thing_of_many_is_named_but_does_not_make_the_verdict(lost, level):
+    """Of 14 things, one is 7 % and two are 14 %."""
+    places = [(x, y, 0.4) for y in (1.2, -1.2) for x in (-2.4, -1.6, -0.8, 0.0, 0.8, 1.6, 2.4)]
+    placed = tuple((("mug", "bottle")[k % 2], place) for k, place in enumerate(places))
+    log = simulate(preset("rooms", objects=0, placed=placed, false=0.0, missed=0.1), 0)
+    result = mapped(log)
+    assert len(result.map) == 14
+    assert result.summary["assessment"]["level"] == "good"
+    mine = result.association.object
+    number = np.bincount(mine[mine >= 0])
+    kept = np.full(14, -1)
+    kept[np.sort(np.argsort(-number)[lost:])] = np.arange(14 - lost)
+    lacking = reassociated(result, np.where(mine < 0, -1, kept[mine])).summary["assessment"]
+    assert lacking["level"] == level
+    assert sum("a thing may be missing" in one for one in lacking["reasons"]) == lost
+    assert ("agree to within the expected noise" in lacking["reasons"][0]) == (level == "good")
+
+
+def test_a_good_map_with_doubtful_objects_does_not_praise_them():
+    good = {"level": "good", "reasons": ["40 objects, whose boxes agree to within the expected noise.", "A hint."]}
+    first, *others = _praised(good, 2, 40)["reasons"]
+    assert first == "40 objects, and the boxes of all but 2 agree to within the expected noise."
+    assert others == ["A hint."]
+    assert _praised(good, 0, 40) == good
+    check = {**good, "level": "check"}
+    assert _praised(check, 2, 40) == check
 
 
 def test_why_an_object_has_no_position_is_one_reason():
