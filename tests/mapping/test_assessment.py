@@ -47,7 +47,7 @@ def test_a_usual_result_is_good() -> None:
         ),
         ({"uncalibrated": True}, "check", "The errors that all measurements share could not be estimated"),
         ({"doubted": ("mug", "cup")}, "check", "It is not clear whether mug, cup name one object each, or several."),
-        ({"cut": 480}, "check", "48 % of the boxes were dropped, because the image's edge cuts them off."),
+        ({"cut": 520}, "check", "52 % of the boxes were dropped, because the image's edge cuts them off."),
         (
             {"frames": 445, "late": 78, "journal": "map/journal.objslam"},
             "check",
@@ -86,10 +86,17 @@ def test_each_cause_has_its_reason(changes: dict[str, object], level: str, reaso
     assert found.reasons[0].startswith(reason)
 
 
+@pytest.mark.parametrize(("cut", "said"), [(320, False), (340, True), (500, True)])
+def test_up_to_half_of_the_boxes_may_be_cut_off_in_a_good_map(cut: int, said: bool) -> None:
+    found = assess(replace(GOOD, cut=cut))
+    assert found.level == "good"
+    assert ("the image's edge cuts them off" in found.reasons[-1]) == said
+
+
 def test_reasons_add_up_and_a_bad_result_says_only_why() -> None:
-    both = assess(replace(GOOD, misses=2.0, cut=500))
+    both = assess(replace(GOOD, misses=2.0, cut=520))
     assert len(both.reasons) == 2
-    assert len(assess(replace(GOOD, misses=2.0, cut=500, spoilt=True)).reasons) == 1
+    assert len(assess(replace(GOOD, misses=2.0, cut=520, spoilt=True)).reasons) == 1
 
 
 def test_a_map_in_the_frame_of_the_odometry_says_so() -> None:

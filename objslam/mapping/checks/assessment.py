@@ -22,9 +22,10 @@ HEADLINES: dict[Level, str] = {"good": "Good.", "check": "Look closer.", "bad": 
 _MISSES = 1.5
 """A result needs a look if its residuals exceed this multiple of their expected noise. At 1.5, more than half of their
 variance is unexplained. A larger value gives fewer warnings."""
-_CUT = 1 / 3
-"""A result needs a look if the image's edge cuts off more than this share of the boxes. A tenth is usual in the demo's
-rooms. A larger value gives fewer warnings."""
+_CUT, _CUT_NAMED = 1 / 2, 1 / 3
+"""A result needs a look if the image's edge cuts off more than the first share of the boxes: the map then does without most
+of what the detector saw. More than the second share is named. A tenth is usual in the demo's rooms, and a third in homes,
+where a robot passes things closely. Boxes that are dropped bend no map. Larger values give fewer warnings."""
 _OFF_PATH = 1 / 3
 """A result needs a look if more than this share of the boxes have no pose of the robot. Recordings often begin before the
 localisation, and end after it. A larger value gives fewer warnings."""
@@ -209,6 +210,8 @@ def _about(e: Evidence) -> list[str]:
     if e.odometry_unused:
         better = "usually more exact for objects seen from several sides"
         found.append(f"Hint: the log has odometry too. --mode joint uses both: {better}.")
+    if _CUT_NAMED * e.boxes < e.cut <= _CUT * e.boxes:
+        found.append(_cut_off(e))
     if part := part_in_words(e.part):
         found.append(f"The map is of a part of the recording: {part}.")
     if e.odometry_frame:
@@ -302,7 +305,7 @@ def _check(e: Evidence) -> list[str]:
             "again, so that the path between them is known."
         )
     if e.cut > _CUT * e.boxes:
-        found.append(f"{100 * e.cut / e.boxes:.0f} % of the boxes were dropped, because the image's edge cuts them off.")
+        found.append(_cut_off(e))
     if e.late > _LATE * e.frames:
         more = f": `objslam run {Path(e.journal).parent}` uses them all" if e.journal else ""
         found.append(f"{100 * e.late / e.frames:.0f} % of the camera frames were dropped, because they came too late{more}.")
@@ -319,6 +322,10 @@ def _check(e: Evidence) -> list[str]:
     if e.rays < _FEW:
         found.append(f"Only {e.rays} boxes were used, which is too few to notice wrong input.")
     return found
+
+
+def _cut_off(e: Evidence) -> str:
+    return f"{100 * e.cut / e.boxes:.0f} % of the boxes were dropped, because the image's edge cuts them off."
 
 
 def _may_be_bent(e: Evidence) -> bool:
