@@ -10,6 +10,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.mapping import pipeline
+from objslam.mapping.moves.other_places import _largest_of_others
 from objslam.simulation import preset, simulate
 
 pytestmark = pytest.mark.usefixtures("one_start")
@@ -60,3 +61,12 @@ def test_a_cart_at_two_places_is_doubted_and_two_carts_are_not(moves: bool) -> N
     assert min(doubt.numbers["frames_after"], doubt.numbers["frames_before"]) >= 10
     assert result.summary["assessment"]["level"] == "check"
     assert "cart" in said[0]
+
+
+def test_the_largest_value_of_other_labels_is_that_of_a_search() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        value = rng.integers(0, 9, rng.integers(1, 12))
+        label = np.unique(rng.integers(0, 4, len(value)), return_inverse=True)[1]
+        searched = [max(value[label != mine], default=0) for mine in label]
+        assert _largest_of_others(value, label).tolist() == searched

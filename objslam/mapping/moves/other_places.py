@@ -3,7 +3,7 @@
 A thing at rest is seen whenever it is in view. One that has moved away is in view no longer: its old place is, without it.
 """
 
-from itertools import combinations
+from itertools import product
 
 import numpy as np
 
@@ -29,17 +29,17 @@ def at_other_places(result: RunResult, history: DetectionHistory, objects: Ints)
     The first object was seen for the last time before the second one was seen first. Its place came into view later, and
     the place of the second one had been in view before. history: of N objects. objects: (N,) their indices in the map.
     """
+    if not len(objects):
+        return []
     before, after, first, last = _without(history)
     map_objects = [result.map.objects[j] for j in objects.tolist()]
-    label = np.array([o.label for o in map_objects])
+    label = np.unique([o.label for o in map_objects], return_inverse=True)[1]
+    least = np.maximum(_FRAMES, _FACTOR * _largest_of_others(np.maximum(before, after), label))
+    seen = (first >= 0) & (len(label) - np.bincount(label)[label] >= _OTHERS)
+    left, came = np.flatnonzero(seen & (after >= least)), np.flatnonzero(seen & (before >= least))
     found = []
-    for i, j in combinations(np.flatnonzero(first >= 0).tolist(), 2):
-        a, b = (i, j) if first[i] < first[j] else (j, i)
-        others = (label != label[a]) & (first >= 0)
-        if label[a] != label[b] or last[a] >= first[b] or others.sum() < _OTHERS:
-            continue
-        usual = np.maximum(before[others], after[others]).max()
-        if min(after[a], before[b]) < max(_FRAMES, _FACTOR * usual):
+    for a, b in product(left.tolist(), came.tolist()):
+        if label[a] != label[b] or last[a] >= first[b]:
             continue
         one, two = map_objects[a], map_objects[b]
         found.append(
@@ -57,6 +57,16 @@ def at_other_places(result: RunResult, history: DetectionHistory, objects: Ints)
             )
         )
     return found
+
+
+def _largest_of_others(value: Ints, label: Ints) -> Ints:
+    """Return the largest value (N,) among the objects of other labels, 0 if there are none. value, label: (N,)."""
+    largest = np.zeros(label.max() + 1, dtype=np.int64)
+    np.maximum.at(largest, label, value)
+    order = np.argsort(-largest, kind="stable")
+    others = np.full(len(largest), largest[order[0]])
+    others[order[0]] = largest[order[1]] if len(order) > 1 else 0
+    return np.asarray(others[label])
 
 
 def _without(history: DetectionHistory) -> tuple[Ints, Ints, Ints, Ints]:
