@@ -24,8 +24,11 @@ _LEAST = 0.2
 
 _TURNED = np.cos(np.radians(20.0))
 """The cosine of the largest angle between the direction of the vertical in one box and the mean of this direction over the
-boxes of the object. From other sides, the same thing has another height in the image: within 20 deg, the height of a flat
-thing changes by 6 %. A larger angle judges more objects of cameras that are not level."""
+boxes of the object. From above, the same thing has another height in the image than from the side: within 20 deg, the height
+of a thing without depth changes by 6 %. What its depth adds is allowed for (`_without_depth`). A larger angle judges more
+objects of cameras that are not level."""
+_DEEP = 0.9
+"""An object is at most as deep as this quantile of its widths in its boxes. A larger value finds fewer mixed objects."""
 
 
 def mixed_sizes(result: RunResult) -> list[Doubt]:
@@ -34,9 +37,9 @@ def mixed_sizes(result: RunResult) -> list[Doubt]:
     A box and the distance to its object give the size of the thing in the box. The size of one thing stays the same. At
     least its height stays the same in boxes that show the vertical in the same direction, such as the boxes of a level
     camera. So only such boxes count. The scatter of the widths and the scatter of the heights are computed, and the smaller
-    one counts. It must exceed the scatter of other objects, and the scatter that the noise of the boxes explains. Boxes of
-    two things have two sizes, also where their rays happen to meet. If a thing is put too far away, its boxes grow faster
-    than its distance falls.
+    one counts. It must exceed the scatter of other objects. Both must exceed the scatter that the noise of the boxes and the
+    depth of the thing explain. Boxes of two things have two sizes, also where their rays happen to meet. If a thing is put
+    too far away, its boxes grow faster than its distance falls.
     """
     if len(result.map) < _OTHERS:
         return []
@@ -46,9 +49,12 @@ def mixed_sizes(result: RunResult) -> list[Doubt]:
     judged = np.flatnonzero((number >= _FEWEST) & np.array([o.status == "ok" for o in result.map.objects], dtype=bool))
     if len(judged) < _OTHERS:
         return []
-    scatter, beyond = _scatter(result, mine)
+    variance, of_noise = _variance(result, mine)
+    scatter, beyond = np.sqrt(variance.min(axis=1)), np.sqrt(np.maximum(variance - of_noise, 0.0))
     usual = float(np.median(scatter[judged]))
-    odd = judged[(scatter[judged] > _TIMES * usual) & (beyond[judged] > _LEAST)]
+    odd = judged[(scatter[judged] > _TIMES * usual) & (beyond[judged] > _LEAST).all(axis=1)]
+    flat = [_without_depth(result, mine[result.association.object[mine] == j]) for j in odd.tolist()]
+    odd = odd[(np.reshape(flat, (-1, 2)) - of_noise[odd] > _LEAST**2).all(axis=1)]
     odd = odd[np.argsort(-scatter[odd], kind="stable")]
     return [_doubt(result, j, mine, float(scatter[j]), usual) for j in odd.tolist()]
 
@@ -64,28 +70,49 @@ def _boxes(result: RunResult) -> Ints:
 
 
 def _alike(result: RunResult, mine: Ints) -> Bools:
-    """Return which of the rays (n,) show the vertical nearly as the mean of their object's rays does.
+    """Return which of the rays (n,) show the vertical nearly as the mean of their object's rays does."""
+    shown, owner = _shown_vertical(result, mine), result.association.object[mine]
+    mean = grouped_sums(shown, owner, len(result.map))
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
+    return np.asarray(np.einsum("ni,ni->n", shown, mean[owner]) >= _TURNED)
 
-    The vertical is compared in the frame of the box: along the ray, and across it in the image.
-    """
+
+def _shown_vertical(result: RunResult, mine: Ints) -> Floats:
+    """Return the direction (n, 3) of the vertical in the frame of each box: across it in the image, and along its ray."""
     turn = (result.map_T_base @ result.keyframes.base_T_camera)[result.rays.keyframe[mine], :3, :3]
     vertical = np.einsum("nji,j->ni", turn, up_vector(up_axis(result.keyframes)))
     ray = np.einsum("nji,nj->ni", turn, result.directions[mine])
     along = np.einsum("ni,ni->n", vertical, ray)
     across = (vertical - along[:, None] * ray)[:, :2]
     length = np.sqrt(np.maximum(1 - along**2, 0.0)) / np.maximum(np.linalg.norm(across, axis=1), 1e-9)
-    shown = np.column_stack([across * length[:, None], along])
-    owner = result.association.object[mine]
-    mean = grouped_sums(shown, owner, len(result.map))
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
-    return np.asarray(np.einsum("ni,ni->n", shown, mean[owner]) >= _TURNED)
+    return np.column_stack([across * length[:, None], along])
 
 
-def _scatter(result: RunResult, mine: Ints) -> tuple[Floats, Floats]:
-    """Return the scatter (N,) of the size of each object, and the part (N,) beyond the noise of boxes.
+def _without_depth(result: RunResult, mine: Ints) -> Floats:
+    """Return the variances (2,) of the logarithms of the sides of an object that its depth does not explain.
 
-    Both are standard deviations of the natural logarithm. mine: (n,) the rays of all objects.
+    A camera that looks down on a thing sees its height and a part of its depth in one side of the box: the depth times the
+    sine of the slope of the ray. The depth of a flat thing, such as a keyboard, is the larger part, and another one from
+    each direction. From where the thing looks wide, it is not deep: the sum of width and depth is the same from all
+    directions, but for a factor of at most 1.4. So this sum is fitted, with the height. An upright thing shows more height
+    than depth, and all of its variance counts.
+    mine: (n,) the rays of the object.
     """
+    away = np.linalg.norm(result.map.positions[result.association.object[mine]] - result.origins[mine], axis=1)
+    size = size_per_metre(result.rays.take(mine), result.keyframes, result.cameras) * away[:, None]
+    slope, other = np.abs(_shown_vertical(result, mine)[:, 2:]), size[:, ::-1]
+    shown, middle = size + slope * other, slope - slope.mean()
+    fitted = (middle * shown).sum(axis=0) / max(float((middle**2).sum()), 1e-9)
+    usual = np.median(other, axis=0)
+    both = np.clip(fitted, usual, usual + np.quantile(other, _DEEP, axis=0))
+    upright = np.maximum(np.median(shown - slope * both, axis=0), 0.0)
+    left = np.log(shown / np.maximum(upright + slope * both, 1e-9)).var(axis=0)
+    return np.where(upright < np.median(slope) * both, left, np.log(size).var(axis=0))
+
+
+def _variance(result: RunResult, mine: Ints) -> tuple[Floats, Floats]:
+    """Return the variances (N, 2) of the logarithms of the width and the height of each object, and the parts (N, 2) of them
+    that the noise of the boxes explains. mine: (n,) the rays of all objects."""
     owner, count = result.association.object[mine], len(result.map)
     away = np.linalg.norm(result.map.positions[owner] - result.origins[mine], axis=1)
     size = np.log(size_per_metre(result.rays.take(mine), result.keyframes, result.cameras) * away[:, None])
@@ -96,10 +123,7 @@ def _scatter(result: RunResult, mine: Ints) -> tuple[Floats, Floats]:
     number = np.maximum(np.bincount(owner, minlength=count), 1)[:, None]
     mean = grouped_sums(size, owner, count) / number
     variance = grouped_sums((size - mean[owner]) ** 2, owner, count) / number
-    least = variance.argmin(axis=1)[:, None]
-    of_noise = grouped_sums(2 * (edge / sides) ** 2, owner, count) / number
-    found, noise = (np.take_along_axis(one, least, axis=1)[:, 0] for one in (variance, of_noise))
-    return np.sqrt(found), np.sqrt(np.maximum(found - noise, 0.0))
+    return variance, grouped_sums(2 * (edge / sides) ** 2, owner, count) / number
 
 
 def _doubt(result: RunResult, j: int, mine: Ints, scatter: float, usual: float) -> Doubt:
