@@ -19,8 +19,9 @@ found. The ranges of objects in front of a wall may all be those of the wall."""
 _DROPPED = 0.02
 """The largest share of rays without which bearings and ranges must agree, and one ray in any case. A detector misreads few
 labels. With a larger share, depths of a wall, measured while the robot stood, could outweigh bearings from other places."""
-_STARTS = 64
-"""The most ends of ranges from which an agreement is sought. With a larger number, objects with many rays take longer."""
+_STARTS = 8
+"""The most ends of ranges from which an agreement is sought. Nearly all rays must agree, so nearly each end is a good start.
+With a larger number, objects with many rays take longer."""
 
 
 def contradicted(index: Ints, used: Bools, distance: Floats, ranges: Floats, sigma: Floats, count: int) -> Ints:

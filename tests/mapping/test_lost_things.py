@@ -52,7 +52,8 @@ def test_a_second_thing_of_a_label_is_in_the_map_or_in_the_verdict(absolute: boo
     result = mapped(mugs(absolute=absolute), settings)
     if sum(item.label == "mug" for item in result.map.resolved()) < 2:
         (reason,) = lost(result)
-        assert "boxes of 'mug'" in reason  # One thing of twelve does not change the level. `test_doubts` tests that.
+        assert "boxes of 'mug'" in reason
+        assert result.summary["assessment"]["level"] == "check"
 
 
 @pytest.mark.parametrize(("absolute", "settings"), [(False, HELD), (True, BY_LABEL)])

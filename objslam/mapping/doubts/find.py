@@ -34,11 +34,12 @@ _LOST = (0.1, 0.5)
 """Two shares. A group of boxes that became no object counts in the assessment if it has at least the first share of all
 boxes of its label. It also counts if it has at least the second share of the boxes that an object of its label has (median).
 False boxes of a detector at one place are usually fewer. With larger shares, more maps are good."""
-_MARKED = 0.1
-"""The level of a map depends on doubts about single objects and on lost things only if they are at least this share of its
-objects and lost things together. Below it, `doubts.json` and the report mark them, and the sigma of an object whose rays do
-not agree allows for that, so the others can be used. Each object is tested by itself, so a large right map often has one.
-With a larger share, more maps are good."""
+_MARKED = 1 / 20
+"""The level of a map at a localisation does not depend on doubts about single objects if they are at most this share of its
+objects, nor on lost things if they are at most this share of the things. `doubts.json` and the report mark them. Each object
+is tested by itself, so a large right map often has one. In simulated homes, doubts name about half of the objects that are
+false or over 3 sigma off. So in a map with a tenth of such objects, about this share is doubted. With a larger share, more
+maps are good."""
 _FEWEST_LOST = 5
 """The fewest boxes of a group that counts in the assessment. With a larger number, more maps are good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
@@ -67,8 +68,8 @@ def with_doubts(result: RunResult) -> RunResult:
 
     A map is not called good in five cases, which may concern its whole path, or an object that is certainly wrong: some
     objects are more likely doubles than not, a place is in the map twice, the robot drove through an object, two objects are
-    likely one thing that moved, or most objects have a wide sigma. In a sixth case, it is not called good because of many
-    things (`_MARKED`): the rays of an object do not agree on one thing, an object has many sizes, or many boxes of a label
+    likely one thing that moved, or most objects have a wide sigma. In a sixth case, it is not called good because of too
+    many things (`_are_few`): the rays of an object do not agree on one thing, an object has many sizes, or many boxes of a label
     meet where the map has no object. Fewer of these are named. The assessment also names labels without an object, things
     that have only cut off boxes, and things that seem to move. They do not change the level of the assessment, because their
     boxes may be false, and because no map contains things that move.
@@ -96,7 +97,7 @@ def with_doubts(result: RunResult) -> RunResult:
     if "assessment" in summary:
         lost, named = _of_lost_things(found.groups, result), wide.in_assessment(unsure, result)
         odd = {j for one in (*disagreeing, *mixed) for j in one.objects}
-        few = len(odd) + len(lost) < _MARKED * (len(result.map.resolved()) + len(lost))
+        few = _are_few(len(odd), len(lost), result)
         if wide.are_most(unsure, result):
             lost, named, few = [*named, *lost], [], False
         twice, of_objects = find_twice(result.map), [*apart.in_assessment(disagreeing), *_of_mixed(len(mixed))]
@@ -109,6 +110,16 @@ def with_doubts(result: RunResult) -> RunResult:
         named += [*_of_moved_things(found.groups, result), *in_assessment(unmapped), *cut_off.in_assessment(cut, result)]
         summary["assessment"] = {**assessment, "reasons": [*assessment["reasons"], *named]}
     return replace(result, doubts=doubts, summary=summary)
+
+
+def _are_few(odd: int, lost: int, result: RunResult) -> bool:
+    """Return whether doubts about `odd` objects and `lost` things concern these alone, and not the map.
+
+    From odometry alone, a false object bends the path, and so it moves all other objects. At a localisation, it does not.
+    """
+    known = len(result.map.resolved())
+    localized = bool(result.keyframes.localized_every)
+    return localized and odd <= _MARKED * known and lost <= _MARKED * (known + lost)
 
 
 def _of_one_label(doubt: Doubt, result: RunResult) -> bool:
