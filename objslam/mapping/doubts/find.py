@@ -69,10 +69,10 @@ def with_doubts(result: RunResult) -> RunResult:
     A map is not called good in five cases, which may concern its whole path, or an object that is certainly wrong: some
     objects are more likely doubles than not, a place is in the map twice, the robot drove through an object, two objects are
     likely one thing that moved, or most objects have a wide sigma. In a sixth case, it is not called good because of too
-    many things (`_are_few`): the rays of an object do not agree on one thing, an object has many sizes, or many boxes of a label
-    meet where the map has no object. Fewer of these are named. The assessment also names labels without an object, things
-    that have only cut off boxes, and things that seem to move. They do not change the level of the assessment, because their
-    boxes may be false, and because no map contains things that move.
+    many things (`_are_few`): the rays of an object do not agree on one thing, an object has many sizes, or many boxes of a
+    label meet where the map has no object. Fewer of these are named. The assessment also names labels without an object,
+    things that have only cut off boxes, and things that seem to move. They do not change the level of the assessment,
+    because their boxes may be false, and because no map contains things that move.
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)
