@@ -13,7 +13,7 @@ from objslam.core.statistics import OUTLIER_RAY
 _GROSS = 0.3
 """A range contradicts a position if it is off by more than this share of its distance. The surface of a large thing is
 nearer than its middle, and depths of things behind are longer, by less. A larger share finds fewer misread boxes."""
-_MOST, _ONE = 0.5, 1
+_MOST = 0.5
 """A position is contradicted if more than the share `_MOST` of its ranges are. With a larger share, fewer misread boxes are
 found. The ranges of objects in front of a wall may all be those of the wall."""
 _DROPPED = 0.02
@@ -60,4 +60,4 @@ def agreeing_with_ranges(
     both = bearing & length
     best = both[both.sum(axis=1).argmax()]
     lacking = int((~best).sum())
-    return best if 0 < lacking <= max(_ONE, _DROPPED * len(best)) else None
+    return best if 0 < lacking <= max(1, _DROPPED * len(best)) else None

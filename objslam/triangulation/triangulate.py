@@ -107,7 +107,8 @@ def triangulate(
         found = _triangulate(m, n, index, count, noise, position_sigma, settings, seed, *given, backend)
         if known is None or spread is None or shared is None or not settings.consensus:
             return found
-        left = _left(found, m, n, index, noise, position_sigma, known, np.hypot(spread, shared))
+        measured = np.where(known > 0, known, np.nan)
+        left = _left(found, m, n, index, noise, position_sigma, measured, np.hypot(spread, shared))
         if not (left >= 0).any():
             return found
         again = _triangulate(m, n, left, count, noise, position_sigma, settings, seed, *given, backend)
@@ -131,8 +132,13 @@ def _left(
     left = np.full(len(index), -1)
     away = np.full(len(index), np.nan)
     away[index >= 0] = np.linalg.norm(found.positions[index[index >= 0]] - m[index >= 0], axis=1)
-    for j in contradicted(index, found.weight > 0, away, ranges, sigma, len(found.ok)).tolist():
-        mine = np.flatnonzero(index == j)
+    far = contradicted(index, found.weight > 0, away, ranges, sigma, len(found.ok))
+    if not len(far):
+        return left
+    order = np.argsort(index, kind="stable")
+    bounds = np.searchsorted(index[order], np.column_stack([far, far + 1]))
+    for j, (begin, end) in zip(far.tolist(), bounds.tolist(), strict=True):
+        mine = order[begin:end]
         agree = agreeing_with_ranges(m[mine], n[mine], noise[mine], ranges[mine], sigma[mine], position_sigma)
         left[mine if agree is None else mine[agree]] = -1 if agree is None else j
     return left

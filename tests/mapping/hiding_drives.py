@@ -195,7 +195,7 @@ def aisle(rng, *, named=False):
     ]
 
 
-def along_aisle(frames=300):
+def along_aisle(frames=150):
     """Poses (F, 3) of three ways along the aisle, with turns at its ends."""
     corners = np.array([(-3, 0), (9, 0.1), (9.6, 0.4), (9, 0.7), (-3, 0.4), (-3.6, 0.1), (-3, -0.2), (9, -0.3)])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])

@@ -1,10 +1,16 @@
 """A solved path that leaves the localisation for seconds is named, in units of the localisation's own noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from small_log import small_log
 
+from objslam.config import Odometry, load_settings
+from objslam.core.diagnostics import Ledger
 from objslam.core.statistics import WHITE, Lasting
-from objslam.mapping.joint.path_against_localization import sigmas_of_pieces
+from objslam.mapping import pipeline
+from objslam.mapping.joint.path_against_localization import BENT_PATH, check_bent_path, sigmas_of_pieces
 
 SIGMA, STAMPS = 0.02, np.arange(0.0, 200.0, 0.25)
 
@@ -63,3 +69,29 @@ def test_a_piece_with_few_poses_is_not_judged():
     sigmas, _ = sigmas_of_pieces(np.array([0.0, 1.0, 6.0, 7.0, 8.0]), np.ones((5, 2)), np.zeros(5), SIGMA, WHITE)
     assert np.isnan(sigmas[0])
     assert sigmas[1] > 10
+
+
+def test_a_jump_of_the_stamps_costs_nothing():
+    sigmas, _ = sigmas_of_pieces(
+        np.append(np.arange(4.0), 1.7e9 + np.arange(4.0)), np.ones((8, 2)), np.zeros(8), SIGMA, WHITE
+    )
+    assert len(sigmas) == 2
+
+
+@pytest.mark.parametrize("bend", [0.0, 1.0])
+def test_a_run_names_the_path_that_is_bent(bend, monkeypatch):
+    """A third of the solved path is moved before it is compared."""
+
+    def bent(solution, errors, settings):
+        path = solution.estimate.map_T_base.copy()
+        path[: len(path) // 3, 0, 3] += bend
+        moved = replace(solution, estimate=replace(solution.estimate, map_T_base=path))
+        return check_bent_path(moved, errors, settings)
+
+    monkeypatch.setattr(pipeline, "check_bent_path", bent)
+    result = pipeline.run(
+        small_log(odometry=Odometry()), load_settings(None, ("mode=joint", "output.recording=false")), Ledger()
+    )
+    found = [one for one in result.summary["wrong_input"] if one["name"] == BENT_PATH]
+    assert len(found) == bool(bend)
+    assert any("from the localisation" in one for one in result.summary["warnings"]) == bool(bend)

@@ -72,7 +72,7 @@ def test_small_and_unsteady_shifts_are_not_clear():
 @pytest.mark.parametrize("named", [False, True])
 def test_a_row_of_lockers_is_doubted_unless_labels_tell_them_apart(named):
     solids = aisle(np.random.default_rng(0), named=named)
-    log = hiding_drive(0, solids=solids, plane=along_aisle(150))
+    log = hiding_drive(0, solids=solids, plane=along_aisle())
     result = pipeline.run(log, load_settings(None, QUIET), Ledger())
     places = np.array([one.position for one in result.map.resolved()])
     far = np.linalg.norm(places[:, None, :2] - [one.centre[:2] for one in solids], axis=2).min(axis=1)
@@ -83,7 +83,7 @@ def test_a_row_of_lockers_is_doubted_unless_labels_tell_them_apart(named):
 
 
 def test_a_session_doubts_such_a_row_too():
-    log = hiding_drive(0, solids=aisle(np.random.default_rng(0)), plane=along_aisle(150))
+    log = hiding_drive(0, solids=aisle(np.random.default_rng(0)), plane=along_aisle())
     session = feed(Session(load_settings(None, ("output.recording=false",)), patient=True).start(), log)
     result = session.stop()
     assert BACK in [one["name"] for one in result.summary["wrong_input"]]

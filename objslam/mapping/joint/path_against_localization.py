@@ -8,7 +8,7 @@ the odometry here, and the distance of the path is judged by that noise.
 import numpy as np
 
 from objslam.config import Settings
-from objslam.core.arrays import Floats
+from objslam.core.arrays import Floats, Ints
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import WHITE, Lasting
 from objslam.frontend.shared_errors import SharedErrors
@@ -91,9 +91,9 @@ def sigmas_of_pieces(stamps: Floats, off: Floats, carried: Floats, sigma: float,
     return sigmas, float(np.sqrt(-2 * np.log(_CHANCE / max(int(np.isfinite(sigmas).sum()), 1))))
 
 
-def _pieces(stamps: Floats) -> np.ndarray:
-    """Return the piece (n,) of each pose."""
-    return ((stamps - stamps[:1]) // _SECONDS).astype(np.int64)
+def _pieces(stamps: Floats) -> Ints:
+    """Return the piece (n,) of each pose. Pieces without a pose have no number, so a jump of the stamps costs nothing."""
+    return np.unique((stamps - stamps[:1]) // _SECONDS, return_inverse=True)[1]
 
 
 def _own_noise(solution: Solution, errors: SharedErrors | None) -> NoiseFactors:

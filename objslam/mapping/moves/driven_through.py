@@ -21,7 +21,7 @@ _LOWEST = 0.2
 """The least height (m) of a robot. If its camera is higher, the robot reaches up to the camera. A larger height names more
 objects."""
 _NAMED = 3
-"""The most objects that the assessment names. A larger number makes the assessment longer."""
+"""The most objects, or pairs of them, that a sentence of the assessment names. With a larger number, it is longer."""
 
 
 def driven_through(result: RunResult) -> list[Doubt]:
@@ -70,6 +70,11 @@ def in_assessment(doubts: list[Doubt]) -> list[str]:
     """Return the sentence about the objects for the assessment."""
     if not doubts:
         return []
-    names = ", ".join(f"{one.label} #{one.objects[0]}" for one in doubts[:_NAMED])
-    more = f" and {len(doubts) - _NAMED} more" if len(doubts) > _NAMED else ""
-    return [f"The robot drove through {names}{more}: what has moved, or is no thing, is at a wrong place."]
+    names = first_names([f"{one.label} #{one.objects[0]}" for one in doubts])
+    return [f"The robot drove through {names}: what has moved, or is no thing, is at a wrong place."]
+
+
+def first_names(names: list[str]) -> str:
+    """Return the first names, and how many more there are."""
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more

@@ -10,6 +10,7 @@ import numpy as np
 from objslam.association.visibility import DetectionHistory
 from objslam.core.arrays import Ints
 from objslam.core.result import Doubt, RunResult
+from objslam.mapping.moves.driven_through import first_names
 
 _FACTOR = 3
 """A place without its thing must be in view in this multiple of the frames of any object of another label. Walls hide things
@@ -19,8 +20,6 @@ _FRAMES = 10
 """The least number of frames with a place without its thing. With a larger number, fewer things are named."""
 _OTHERS = 5
 """The least number of objects of other labels to compare with. With a larger number, fewer maps are judged."""
-_NAMED = 3
-"""The most pairs that the assessment names. A larger number makes the assessment longer."""
 
 
 def at_other_places(result: RunResult, history: DetectionHistory, objects: Ints) -> list[Doubt]:
@@ -52,7 +51,7 @@ def at_other_places(result: RunResult, history: DetectionHistory, objects: Ints)
                 f"{before[b]}.",
                 (one.id, two.id),
                 (one.position + two.position) / 2,
-                np.flatnonzero(np.isin(result.association.object, [one.id, two.id])),
+                np.flatnonzero(np.isin(result.association.object, objects[[a, b]])),
                 {"frames_after": float(after[a]), "frames_before": float(before[b])},
             )
         )
@@ -88,6 +87,5 @@ def in_assessment(doubts: list[Doubt]) -> list[str]:
     """Return the sentence about the objects for the assessment."""
     if not doubts:
         return []
-    names = ", ".join(f"{one.label} #{one.objects[0]} and #{one.objects[1]}" for one in doubts[:_NAMED])
-    more = f" and {len(doubts) - _NAMED} more" if len(doubts) > _NAMED else ""
-    return [f"Likely one thing that moved: {names}{more}. Each place was in view without it (`objslam explain`)."]
+    pairs = first_names([f"{one.label} #{one.objects[0]} and #{one.objects[1]}" for one in doubts])
+    return [f"Likely one thing that moved: {pairs}. Each place was in view without it (`objslam explain`)."]
