@@ -249,7 +249,7 @@ def test_a_lost_thing_of_many_is_named_but_does_not_make_the_verdict(lost, level
 def test_a_good_map_with_doubtful_objects_does_not_praise_them():
     good = {"level": "good", "reasons": ["40 objects, whose boxes agree to within the expected noise.", "A hint."]}
     first, *others = _praised(good, 2, 40)["reasons"]
-    assert first == "40 objects, and the boxes of all but 2 agree to within the expected noise."
+    assert first == "40 objects, 2 of them doubtful. The boxes of the others agree to within the expected noise."
     assert others == ["A hint."]
     assert _praised(good, 0, 40) == good
     check = {**good, "level": "check"}

@@ -66,13 +66,13 @@ def find_doubts(result: RunResult, evidence: Evidence) -> Doubts:
 def with_doubts(result: RunResult) -> RunResult:
     """Return the result with its doubts in words, and their counts by kind in the summary.
 
-    A map is not called good in five cases, which may concern its whole path, or an object that is certainly wrong: some
-    objects are more likely doubles than not, a place is in the map twice, the robot drove through an object, two objects are
-    likely one thing that moved, or most objects have a wide sigma. In a sixth case, it is not called good because of too
-    many things (`_are_few`): the rays of an object do not agree on one thing, an object has many sizes, or many boxes of a
-    label meet where the map has no object. Fewer of these are named. The assessment also names labels without an object,
-    things that have only cut off boxes, and things that seem to move. They do not change the level of the assessment,
-    because their boxes may be false, and because no map contains things that move.
+    A map is not called good in three cases, which may concern its whole path: some objects are more likely doubles than not,
+    a place is in the map twice, or most objects have a wide sigma. In a fourth case, it is not called good because of too
+    many things (`_are_few`): the rays of an object do not agree on one thing, an object has many sizes, the robot drove
+    through it, two objects are likely one thing that moved, or many boxes of a label meet where the map has no object. Fewer
+    of these are named. The assessment also names labels without an object, things that have only cut off boxes, and things
+    that seem to move. They do not change the level of the assessment, because their boxes may be false, and because no map
+    contains things that move.
     """
     evidence = evidence_of(result)
     found = find_doubts(result, evidence)
@@ -96,13 +96,14 @@ def with_doubts(result: RunResult) -> RunResult:
     doubles = int((found.pairs.probability >= _DOUBLE).sum()) + sum(_of_one_label(one, result) for one in filling)
     if "assessment" in summary:
         lost, named = _of_lost_things(found.groups, result), wide.in_assessment(unsure, result)
-        odd = {j for one in (*disagreeing, *mixed) for j in one.objects}
+        odd = {j for one in (*disagreeing, *mixed, *through, *elsewhere) for j in one.objects}
         few = _are_few(len(odd), len(lost), result)
         if wide.are_most(unsure, result):
             lost, named, few = [*named, *lost], [], False
-        twice, of_objects = find_twice(result.map), [*apart.in_assessment(disagreeing), *_of_mixed(len(mixed))]
-        whole = [*([twice.in_words()] if twice else []), *passed.in_assessment(through), *moved.in_assessment(elsewhere)]
-        whole += _of_doubles(doubles)
+        twice = find_twice(result.map)
+        whole = [*([twice.in_words()] if twice else []), *_of_doubles(doubles)]
+        of_objects = [*passed.in_assessment(through), *moved.in_assessment(elsewhere)]
+        of_objects += [*apart.in_assessment(disagreeing), *_of_mixed(len(mixed))]
         assessment = _assessed(summary["assessment"], *((whole, []) if few else ([*whole, *of_objects], lost)))
         if few:
             assessment = _praised(assessment, len(odd), len(result.map.resolved()))
@@ -138,10 +139,10 @@ def _assessed(assessment: dict[str, Any], doubles: list[str], lost: list[str]) -
 
 
 def _praised(assessment: dict[str, Any], odd: int, count: int) -> dict[str, Any]:
-    """Return a good assessment that does not praise the boxes of `odd` doubtful objects of `count`."""
+    """Return a good assessment that does not praise the `odd` doubtful objects of `count`."""
     if assessment["level"] != "good" or not odd:
         return assessment
-    praise = f"{count} objects, and the boxes of all but {odd} agree to within the expected noise."
+    praise = f"{count} objects, {odd} of them doubtful. The boxes of the others agree to within the expected noise."
     return {**assessment, "reasons": [praise, *assessment["reasons"][1:]]}
 
 
