@@ -25,8 +25,9 @@ from objslam.core.types import Log
 from objslam.io.results.files import SUMMARY
 from objslam.output.export.formats import FORMATS
 from objslam.sources.journal.reader import messages
+from objslam.sources.journal.record_format import NAME
 from objslam.sources.journal.records import encode
-from objslam.sources.journal.segments import NAME, is_journal
+from objslam.sources.journal.segments import is_journal
 from objslam.sources.log_folder import write_log_folder
 
 UNEQUAL = (SUMMARY, "report.html")

@@ -37,7 +37,7 @@ from objslam.core.types import Log
 from objslam.live.session import low_latency
 from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
-from objslam.sources.journal.segments import NAME
+from objslam.sources.journal.record_format import NAME
 
 _LAP = 120.0
 """The time of a lap, s."""

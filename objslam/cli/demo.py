@@ -27,12 +27,13 @@ def demo(
     The drive is rendered as RGB-D images of a room with seven objects, which the detector shipped with objslam knows.
     """
     from objslam.errors import OutputError
-    from objslam.output.result_folder import prepare_output
+    from objslam.output.result_folder import prepare_output, refuse_session
     from objslam.simulation import preset, simulate
     from objslam.sources import read
     from objslam.sources.log_folder import write_log_folder
 
     out = out or Path("demo_boxes" if boxes else "demo_out")
+    refuse_session(out)
     prepare_output(out)
     log, model = out / "log", None
     mark = out / ".objslam-demo"  # This file marks a log that the demo may replace.

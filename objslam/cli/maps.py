@@ -65,9 +65,10 @@ def merge_results(
     from objslam.api.sites import load_session, warnings_of
     from objslam.core.object_map import FATES
     from objslam.mapping.sites.merge import merge_sessions
-    from objslam.output.result_folder import prepare_output
+    from objslam.output.result_folder import prepare_output, refuse_session
     from objslam.output.site_folder import islands_of_earlier_merges, summarise_site, write_site
 
+    refuse_session(out)
     prepare_output(out)
     warn_of_neighbours(out)
     sessions = [load_session(path) for path in results]
@@ -141,7 +142,7 @@ def diff_results(
 def _not_in_view(found: Comparison, a: Path, b: Path) -> list[str]:
     """Return a warning for each map that does not say what was in view: what the comparison then cannot show, and why."""
     from objslam.io.results.files import VIEWS
-    from objslam.sources.journal.segments import NAME
+    from objslam.sources.journal.record_format import NAME
 
     if not found.registration.accepted:
         return []

@@ -148,21 +148,45 @@ def disk_errors(path: Path, *, only: bool = False) -> Iterator[None]:
         raise OutputError(f"cannot write or read: {error.strerror or error}", where=where) from error
 
 
+def try_lock(stream: BinaryIO | int) -> bool:
+    """Lock an open file, or its descriptor, without waiting. Return whether it is locked now: False if another holder has
+    the lock. The lock ends when the file is closed. Raises OSError if the file system has no locks."""
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def is_locked(file: Path) -> bool:
+    """Return whether a process holds the lock on a file. It is False without the file, or if the file system has no locks.
+
+    Raises OSError if the file cannot be read.
+    """
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        return _is_locked(stream.fileno())
+
+
+def _is_locked(handle: int) -> bool:
+    """Lock a descriptor, and return whether another holder has the lock. It is False if the file system has no locks."""
+    try:
+        return not try_lock(handle)
+    except OSError as error:
+        if error.errno not in _UNSUPPORTED:
+            raise
+        return False
+
+
 @contextmanager
 def _staged(folder: Path, files: FileSet) -> Iterator[Path]:
     """Lock a folder and yield an empty staging folder in it. The remains of an interrupted run are deleted."""
     staging = folder / _STAGING
     handle = os.open(folder, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise OutputError(
-                "another run is writing here", where=str(folder), hint="name another folder with -o"
-            ) from error
-        except OSError as error:
-            if error.errno not in _UNSUPPORTED:
-                raise
+        if _is_locked(handle):
+            raise OutputError("another run is writing here", where=str(folder), hint="name another folder with -o")
         if staging.exists():  # The lock is free, so a killed run left this folder.
             if is_cut_short(folder, files):
                 for name in files.names(folder):

@@ -16,7 +16,7 @@ from objslam.core.trajectory import rates
 from objslam.core.types import CameraLog, Trajectory, Truth
 from objslam.errors import OutputError
 from objslam.evaluation.alignment import lay_truth
-from objslam.io.atomic_files import FileSet, disk_errors, encode, is_cut_short, replace_files, try_folder
+from objslam.io.atomic_files import FileSet, disk_errors, encode, is_cut_short, is_locked, replace_files, try_folder
 from objslam.io.detections_jsonl import write_detections
 from objslam.io.folders import no_empty_folders
 from objslam.io.objects_json import dump_objects, dump_truth_objects
@@ -30,6 +30,7 @@ from objslam.io.tum_trajectory import write_trajectory
 from objslam.io.views_parquet import Views, dump_views
 from objslam.mapping.measured_motions import motions_of
 from objslam.output.export.formats import FORMATS
+from objslam.sources.journal.record_format import NAME
 from objslam.sources.log_folder import resembles_log
 
 RESULT_FILES = FileSet(files.SUMMARY, (*files.PARTS, *(known.file for known in FORMATS.values())), f"*.{files.DETECTIONS}")
@@ -72,10 +73,23 @@ def foreign_files(out: Path) -> list[str]:
 
 @contextmanager
 def output_folder(out: Path) -> Iterator[None]:
-    """Call `prepare_output`, then run the `with` block. If the block fails, delete the new folder if it is empty."""
+    """Call `prepare_output`, then run the `with` block. If the block fails, delete the new folder if it is empty.
+
+    Raises:
+        OutputError: as `prepare_output`, or a live session writes into the folder.
+    """
     with no_empty_folders(out):
+        refuse_session(out)
         prepare_output(out)
         yield
+
+
+def refuse_session(out: Path) -> None:
+    """Raise OutputError if a running session has its journal in the folder. Its result would replace a new one there."""
+    file = out / NAME
+    with disk_errors(out):
+        if is_locked(file):
+            raise OutputError("a live session writes here", where=str(file), hint="name another folder with -o, or end it")
 
 
 def write_result(

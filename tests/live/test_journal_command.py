@@ -9,10 +9,11 @@ from test_journal_segments import often, pose, segmented, write  # noqa: F401 - 
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import make_pose
 from objslam.live.adapters.stdin import StdinAdapter
-from objslam.simulation import make_camera
+from objslam.simulation import make_camera, preset, simulate
 from objslam.sources.journal.journal import Journal
 from objslam.sources.journal.reader import messages
 from objslam.sources.journal.records import CameraMessage, FrameMessage, MountMessage, NoteMessage, encode
+from objslam.sources.log_folder import write_log_folder
 
 
 def test_verify_and_repair(objslam, tmp_path):
@@ -88,3 +89,22 @@ def test_what_is_exported_can_be_pushed_again(objslam, tmp_path):
     stamp, camera, boxes, labels, scores, depths, _, whole = taken[4][1]
     again = FrameMessage(stamp, camera, boxes, tuple(labels), scores, depths, np.array([-1]), whole)
     assert encode(again) == encode(frame)
+
+
+def test_no_command_writes_into_the_folder_of_a_running_session(objslam, tmp_path):
+    """Its own result, at its end, would replace the other one. After it, the folder is free."""
+    log, out = tmp_path / "log", tmp_path / "out"
+    write_log_folder(simulate(preset("demo", frames=150), 0), log)
+    out.mkdir()
+    journal = Journal(out / "journal.objslam")
+    journal.write(pose(0.0, 1.0))
+    before = sorted(path.name for path in out.iterdir())
+    for command in (("run", log), ("merge", log), ("demo", "--boxes")):
+        code, _, err = objslam(*command, "-o", out)
+        assert code == 1
+        assert err.startswith(f"objslam: {out / 'journal.objslam'}: a live session writes here")
+        assert err.count("\n") == 1
+    assert sorted(path.name for path in out.iterdir()) == before
+    journal.close()
+    assert objslam("run", log, "-o", out, "-q")[0] == 0
+    assert (out / "objects.json").is_file()

@@ -75,7 +75,7 @@ def live(
     from objslam.live.class_names import NamedSink
     from objslam.live.session.session import Session
     from objslam.output.result_folder import output_folder
-    from objslam.sources.journal.segments import NAME
+    from objslam.sources.journal.record_format import NAME
 
     if view is not None and Path(view).resolve() == (out / RECORDING).resolve():
         raise OutputError("this file is the recording of the result", where=view, hint="choose another file for --view")

@@ -163,7 +163,7 @@ def finish(
 
 
 def _ended_early(failure: Exception, out: Path, map_: str) -> ObjslamError:
-    from objslam.sources.journal.segments import NAME
+    from objslam.sources.journal.record_format import NAME
 
     internal = "" if isinstance(failure, ObjslamError) else f"internal error, {type(failure).__name__}: "
     cause = "out of memory" if is_out_of_memory(failure) else f"{internal}{one_line(failure)}"

@@ -1,6 +1,5 @@
 """Set the journal of an earlier session aside, and put it back if the new session gets no message."""
 
-import fcntl
 import itertools
 import re
 from collections.abc import Iterator
@@ -8,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from objslam.errors import OutputError
+from objslam.io.atomic_files import try_lock
 from objslam.sources.journal.record_format import is_cut_header, read_header
 from objslam.sources.journal.segments import holds_messages
 
@@ -29,10 +29,8 @@ def set_aside(file: Path) -> Path | None:
                 raise OutputError("this file is not a journal", where=str(file), hint="move it out of the way")
             if not holds_messages(file, header):
                 return None
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise OutputError("another session writes this journal", where=str(file)) from error
+            if not try_lock(stream):
+                raise OutputError("another session writes this journal", where=str(file))
             others = (file.with_name(f"{file.stem}.{number}{file.suffix}") for number in itertools.count(1))
             return file.rename(next(other for other in others if not other.exists()))
 
@@ -64,9 +62,7 @@ def restore_after_kill(file: Path) -> Path | None:
         if not file.is_file():
             return None
         with file.open("rb") as stream:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not try_lock(stream):
                 return None
             header = read_header(stream)
             stream.seek(0)

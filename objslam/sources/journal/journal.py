@@ -5,7 +5,6 @@ record is on the disk about 1 s later (`_SYNC_EVERY`), so a power failure loses 
 nearly full or fails, or the file is deleted, the journal warns and stops. The session goes on without it.
 """
 
-import fcntl
 import os
 import secrets
 import shutil
@@ -15,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from objslam.errors import OutputError, one_line
+from objslam.io.atomic_files import try_lock
 from objslam.io.folders import remove_leftovers
 from objslam.io.threads import start_thread
 from objslam.sources.journal.aside import refusals, set_aside
@@ -214,13 +214,11 @@ def _locked(file: Path) -> int:
     while True:
         stream = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not try_lock(stream):
+                raise OutputError("another session writes this journal", where=str(file))
             if os.path.samestat(os.fstat(stream), os.stat(file)):  # noqa: PTH116 - the path against the open file
                 return stream
-        except BlockingIOError as error:
-            os.close(stream)
-            raise OutputError("another session writes this journal", where=str(file)) from error
-        except OSError:
+        except (OSError, OutputError):
             os.close(stream)
             raise
         os.close(stream)  # The next segment replaced this file before the lock.

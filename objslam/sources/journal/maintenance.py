@@ -1,6 +1,5 @@
 """Check and repair the files of a journal, and write its messages as JSON lines."""
 
-import fcntl
 import json
 import os
 import shutil
@@ -14,7 +13,7 @@ from typing import Any
 from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import quaternion
 from objslam.errors import LogError, OutputError
-from objslam.io.atomic_files import disk_errors
+from objslam.io.atomic_files import disk_errors, try_lock
 from objslam.io.camera_yaml import camera_keys
 from objslam.io.folders import remove_leftovers, temporary_name
 from objslam.sources.journal.reader import messages
@@ -131,10 +130,8 @@ def _without_damage(segment: Segment) -> Path:
 @contextmanager
 def _locked(file: Path) -> Iterator[None]:
     with file.open("rb") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise OutputError("a session writes this journal", where=str(file), hint="end it first") from error
+        if not try_lock(stream):
+            raise OutputError("a session writes this journal", where=str(file), hint="end it first")
         yield
 
 

@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
+NAME = "journal.objslam"
+"""The usual name of a journal."""
 MAGICS = {1: b"OBJSLAM1", 2: b"OBJSLAM2"}
 """The first bytes of a journal file, by format."""
 LONGEST = 1 << 26

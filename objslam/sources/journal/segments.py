@@ -22,10 +22,8 @@ import zstandard
 from objslam.core.diagnostics import Ledger
 from objslam.errors import LogError
 from objslam.io.folders import remove_leftovers, temporary_name
-from objslam.sources.journal.record_format import Header, pack_header, read_header, records
+from objslam.sources.journal.record_format import NAME, Header, pack_header, read_header, records
 
-NAME = "journal.objslam"
-"""The usual name of a journal."""
 _PACKED = ".zst"
 _LEVEL = 3  # The zstd level. A larger level makes smaller files and takes more time.
 _WINDOW = 1 << 27  # The most memory, bytes, to unpack a segment. A larger value lets a damaged file take more memory.
