@@ -11,6 +11,9 @@ from doubtful_drives import LEAN, mapped
 from objslam.config import Settings
 from objslam.core.result import RunResult
 from objslam.core.types import Log
+from objslam.mapping.doubts.evidence import evidence_of
+from objslam.mapping.doubts.find import _of_lost_things
+from objslam.mapping.doubts.groups import find_groups
 from objslam.simulation import preset, simulate
 
 pytestmark = pytest.mark.usefixtures("one_start")
@@ -60,3 +63,33 @@ def test_a_second_thing_of_a_label_is_in_the_map_or_in_the_verdict(absolute: boo
 def test_boxes_that_scatter_are_no_second_thing(absolute: bool, settings: Settings) -> None:
     assert lost(mapped(mugs(absolute=absolute, scattered=True), settings)) == []
     assert lost(mapped(mugs(absolute=absolute, share=0.0, false=0.1), settings)) == []
+
+
+@pytest.mark.parametrize(("views", "said"), [(2, False), (3, True)])
+def test_rare_boxes_count_from_three_views_on(views: int, said: bool) -> None:
+    """A detector repeats a false box while its view stays the same, and two views cross somewhere in any case."""
+    result = mapped(mugs(absolute=True), HELD)
+    groups = find_groups(evidence_of(result), result.settings)
+    (mug,) = np.flatnonzero(groups.label == result.rays.label_names.index("mug"))
+    assert len(_of_lost_things(groups, result)) == 1
+    azimuth = np.degrees(np.arctan2(*result.directions[groups.ray][:, 1::-1].T))
+    two_views = ((azimuth > -22) & (azimuth < -15)) | ((azimuth > 22) & (azimuth < 30))
+    kept = np.flatnonzero((groups.group == mug) & (two_views | (azimuth < 17 if views == 3 else two_views)))
+    assert len(kept) >= 8
+    changed = replace(groups, ray=groups.ray[kept], group=groups.group[kept])
+    assert bool(_of_lost_things(changed, result)) == said
+
+
+@pytest.mark.parametrize(("others", "said"), [(5, True), (25, False)])
+def test_a_stop_of_a_thing_that_moves_is_no_lost_thing(others: int, said: bool) -> None:
+    """A label without an object has 11 boxes that meet at one place, and `others` that do not."""
+    result = mapped(mugs(absolute=True), HELD)
+    groups = find_groups(evidence_of(result), result.settings)
+    mug = result.rays.label_names.index("mug")
+    others_of_mug = np.setdiff1d(np.flatnonzero(result.rays.label == mug), groups.ray)
+    label = result.rays.label.copy()
+    label[others_of_mug[others:]] = (mug + 1) % 12
+    objects = tuple(item for item in result.map.objects if item.label != "mug")
+    changed = replace(result, rays=replace(result.rays, label=label), map=replace(result.map, objects=objects))
+    assert (label == mug).sum() == 11 + others
+    assert bool(_of_lost_things(groups, changed)) == said

@@ -42,6 +42,14 @@ false or over 3 sigma off. So in a map with a tenth of such objects, about this 
 maps are good."""
 _FEWEST_LOST = 5
 """The fewest boxes of a group that counts in the assessment. With a larger number, more maps are good."""
+_AT_REST = 0.5
+"""The lost things of a label without a placed object count in the assessment if they have at least this share of its boxes.
+If they have fewer, most boxes fit no place, as of another robot that sometimes stops. The assessment names such a label in
+any case. With a larger share, more maps are good."""
+_VIEWS = (3, np.radians(10.0))
+"""The fewest views of a lost thing that few of the frames show, and the least angle (rad) between two views. A detector
+repeats a false box while it sees a place from one view. Two false views cross somewhere, so the third view is the first that
+confirms the place. For the angle see `mapping.box_offsets.ANGLES`. With more views, more maps are good."""
 _PLACED: tuple[Reason, ...] = ("rare", "size", "unclear")
 """The reasons of groups whose boxes agree on one place at rest, and more closely than by chance."""
 _MOVED: tuple[Reason, ...] = ("moves",)
@@ -171,23 +179,40 @@ def _of_doubles(doubles: int) -> list[str]:
 def _of_lost_things(groups: BoxGroups, result: RunResult) -> list[str]:
     """Return a reason for each label with a lost thing: many boxes of the label meet in one place, but the map has no object
     there."""
+    if not len(groups):
+        return []
+    placed = np.isin(groups.reason, [REASONS.index(reason) for reason in _PLACED])
+    at_rest = np.bincount(groups.label[groups.group][placed[groups.group]], minlength=len(result.rays.label_names))
+    mapped = np.isin(result.rays.label_names, [one.label for one in result.map.resolved()])
+    counts = mapped | (at_rest >= _AT_REST * np.bincount(result.rays.label, minlength=len(mapped)))
+    rare = np.flatnonzero(groups.reason == REASONS.index("rare"))
+    few = [g for g in rare.tolist() if not _has_views(result.directions[groups.ray[groups.group == g]])]
     return [
         f"{told} fit no object, but meet in one place near {in_place(place)}: a thing may be missing (`objslam explain`)."
-        for told, place in _large_groups(groups, result, _PLACED)
+        for g, told, place in _large_groups(groups, result, _PLACED)
+        if counts[groups.label[g]] and g not in few
     ]
+
+
+def _has_views(direction: Floats) -> bool:
+    """Return whether unit directions (N, 3) are of at least as many views as `_VIEWS` says."""
+    least, angle = _VIEWS
+    for _ in range(least - 1):
+        direction = direction[direction @ direction[0] < np.cos(angle)] if len(direction) else direction
+    return len(direction) > 0
 
 
 def _of_moved_things(groups: BoxGroups, result: RunResult) -> list[str]:
     """Return a reason for each label with a thing that seems to move, of which the map has no object."""
     return [
         f"{told} fit no object, and the thing near {in_place(place)} seems to move (`objslam explain`)."
-        for told, place in _large_groups(groups, result, _MOVED)
+        for _, told, place in _large_groups(groups, result, _MOVED)
     ]
 
 
-def _large_groups(groups: BoxGroups, result: RunResult, reasons: tuple[Reason, ...]) -> list[tuple[str, Floats]]:
-    """Return a phrase and the place (3,) for each large group with one of the reasons. The phrase says how many boxes of its
-    label the group has."""
+def _large_groups(groups: BoxGroups, result: RunResult, reasons: tuple[Reason, ...]) -> list[tuple[int, str, Floats]]:
+    """Return the index, a phrase and the place (3,) of each large group with one of the reasons. The phrase says how many
+    boxes of its label the group has."""
     if not len(groups):
         return []
     labels = result.rays.label_names
@@ -199,6 +224,6 @@ def _large_groups(groups: BoxGroups, result: RunResult, reasons: tuple[Reason, .
     least = np.fmin(_LOST[0] * every, _LOST[1] * usual)  # A label without an object has no usual number.
     large = wanted & (number >= np.maximum(_FEWEST_LOST, least[groups.label]))
     return [
-        (f"{number[g]} of {every[groups.label[g]]} boxes of {labels[groups.label[g]]!r}", groups.position[g])
+        (g, f"{number[g]} of {every[groups.label[g]]} boxes of {labels[groups.label[g]]!r}", groups.position[g])
         for g in np.flatnonzero(large).tolist()
     ]
