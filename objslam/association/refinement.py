@@ -23,6 +23,9 @@ _ITERATIONS = 6  # The Gauss-Newton steps of a refinement. Few are enough, becau
 _STILL = 1e-11
 """A point rests if its step (m) is at most this long. Rounding errors in a map of kilometres are as large. With a larger
 value, positions are less exact, and an association is less surely the same from another start."""
+_PAIRS_AT_ONCE = 1 << 13
+"""The most pairs of a ray and a point whose terms `refine` computes together, which fit into the processor's cache. A larger
+number reads from memory, and a smaller one needs more calls."""
 _FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 """The rows and the columns of the six entries that determine a symmetric 3 x 3 matrix. The diagonal comes first."""
 
@@ -104,20 +107,24 @@ def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floa
     # For each pair: six entries of a matrix, the pull of the ray, its weight, and the distance.
     each, sums = np.empty((11, len(ray))), np.zeros((11, count))
     for done in range(1, iterations + 1):
-        to = position.T.take(index, axis=1) - origin
-        depth, distance2 = dots(to, direction), np.maximum(dots(to, to), 1e-12)
-        offset, each[10] = to - depth * direction, np.sqrt(distance2)
-        toward = to / each[10]
-        each[9] = weight = 1 / (slope * distance2 + floor + dots(offset, offset) / HALF_RAY)
-        each[6:9] = weight * (dots(toward, offset) * toward - offset)
-        toward_weighted = -weight * toward
-        for row, one, other in zip(each, _FIRST, _SECOND, strict=False):
-            np.multiply(toward_weighted[one], toward[other], out=row)
-        if ranged.any():
-            beyond = np.where(ranged, measured - depth, 0.0)
-            along = np.where(ranged, 1 / range_sigma**2 / (1 + (beyond / range_sigma) ** 2 / _HALF_RANGE) ** 2, 0.0)
-            each[6:9] += along * beyond * direction
-            each[:6] += along * direction[_FIRST] * direction[_SECOND]
+        for first in range(0, len(ray), _PAIRS_AT_ONCE):
+            some_pairs = slice(first, first + _PAIRS_AT_ONCE)
+            row, way = each[:, some_pairs], direction[:, some_pairs]
+            to = position.T.take(index[some_pairs], axis=1) - origin[:, some_pairs]
+            depth, distance2 = dots(to, way), np.maximum(dots(to, to), 1e-12)
+            offset, row[10] = to - depth * way, np.sqrt(distance2)
+            toward = to / row[10]
+            row[9] = weight = 1 / (slope[some_pairs] * distance2 + floor[some_pairs] + dots(offset, offset) / HALF_RAY)
+            row[6:9] = weight * (dots(toward, offset) * toward - offset)
+            toward_weighted = -weight * toward
+            for out, one, other in zip(row, _FIRST, _SECOND, strict=False):
+                np.multiply(toward_weighted[one], toward[other], out=out)
+            if ranged[some_pairs].any():
+                sigma = range_sigma[some_pairs]
+                beyond = np.where(ranged[some_pairs], measured[some_pairs] - depth, 0.0)
+                along = np.where(ranged[some_pairs], 1 / sigma**2 / (1 + (beyond / sigma) ** 2 / _HALF_RANGE) ** 2, 0.0)
+                row[6:9] += along * beyond * way
+                row[:6] += along * way[_FIRST] * way[_SECOND]
         sums[:, some] = np.add.reduceat(each, begin, axis=1) if len(some) else 0.0
         sums[:3] += sums[9]
         sums[:3] += _DAMPING * (sums[0] + sums[1] + sums[2]) + 1e-12

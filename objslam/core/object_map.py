@@ -118,6 +118,13 @@ class MapObject:
     tag: TagPose | None = None
     features: Floats32 | None = None
 
+    def at(self, position: Floats) -> Self:
+        """Return the object at another position (3,), m. It is `dataclasses.replace` in a tenth of the time, because a
+        snapshot moves all objects."""
+        moved = object.__new__(type(self))
+        vars(moved).update(vars(self), position=position)
+        return moved
+
     @property
     def sigma(self) -> float | None:
         """Standard deviation of the position along its least certain direction, m. None without a covariance."""

@@ -62,6 +62,9 @@ near the noise of their class for longer."""
 POOLED_WITH_PROMISE = 20.0
 """The number of rays at which the measured noise of an object and the nominal noise have equal weight, live. A larger number
 keeps objects near the nominal noise for longer."""
+_LARGE_GROUPS = 100
+"""With more than this number of values in a group, on average, a partition of each group is faster than a sort of all
+values: 2.8 against 7.4 ms for 200,000 values in 200 groups. A larger number sorts more often."""
 _FEW_GROUPS = 1 << 16
 """The number of values of 16 bits. Up to this number of groups, the index of a group fits into 16 bits, which numpy sorts
 several times as fast."""
@@ -131,14 +134,20 @@ def grouped_quantile(values: Floats, index: Ints, count: int, share: float) -> F
 
 def grouped_quantiles(values: Floats, index: Ints, count: int, shares: tuple[float, ...]) -> list[Floats]:
     """Return the result of `grouped_quantile` for each share."""
-    order = np.argsort(values)  # Two sorts are several times as fast as np.lexsort.
-    ordered = values[order[order_by_group(index[order], count)]]
     number = np.bincount(index, minlength=count)
     some = number > 0
     begin, number = (np.cumsum(number) - number)[some], number[some]
+    places = [np.minimum((share * number).astype(np.int64), number - 1) for share in shares]
+    if len(index) > _LARGE_GROUPS * len(begin):
+        ordered = values[order_by_group(index, count)]
+        for first, size, *wanted in zip(begin.tolist(), number.tolist(), *(place.tolist() for place in places), strict=True):
+            ordered[first : first + size].partition(wanted)
+    else:
+        order = np.argsort(values)  # Two sorts are several times as fast as np.lexsort.
+        ordered = values[order[order_by_group(index[order], count)]]
     results = [np.full(count, np.nan) for _ in shares]
-    for share, result in zip(shares, results, strict=True):
-        result[some] = ordered[begin + np.minimum((share * number).astype(np.int64), number - 1)]
+    for place, result in zip(places, results, strict=True):
+        result[some] = ordered[begin + place]
     return results
 
 

@@ -43,6 +43,7 @@ class IncrementalGraph(GrowingGraph):
         super().__init__(settings)
         self._isam = new_isam({})
         self._stale = self._unfinished = False
+        self._replaced: object = None  # The tree before the last rebuild in slices. To free it takes 10 ms.
         self._coming = np.zeros(0, dtype=np.int64)  # The landmarks for which the tree was last prepared.
         self._prepared = True  # Whether the tree has a layout for them. A rebuild in slices ends without one.
         self.rebuilds = 0
@@ -184,7 +185,8 @@ class IncrementalGraph(GrowingGraph):
         return self._unfinished
 
     def continue_rebuild(self) -> None:
-        """Run the next slice of the rebuild, if there is one."""
+        """Run the next slice of the rebuild, if there is one. The slice after the last one frees the old tree."""
+        self._replaced = None
         if self._rebuild is None:
             return
         try:
@@ -197,6 +199,7 @@ class IncrementalGraph(GrowingGraph):
             self.rebuild()
             return
         self._clear()  # The new iSAM2 contains these factors and variables too.
+        self._replaced = self._isam, self._rebuild
         self._isam, self._stale = self._rebuild.isam, True
         self._rebuild, self._unfinished, self._prepared = None, False, False
 

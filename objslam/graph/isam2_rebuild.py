@@ -44,20 +44,11 @@ class IncrementalRebuild:
 
     def __init__(self, store: FactorStore, order: list[int], variables: Variables) -> None:
         self.isam = new_isam(variables.others)
-        self._variables, self._order = variables, order
+        self._store, self._variables, self._order = store, variables, order
+        self._sorted = False
         self._at: list[list[Stored]] = [[] for _ in order]  # Factors by their last keyframe in the order.
         self._alone: dict[int, list[Stored]] = {}  # Factors on a single variable that is not a keyframe.
         self._last: list[Stored] = []  # Factors on several variables without a keyframe.
-        place = {X0 + k: i for i, k in enumerate(order)}
-        for stored in store.kinds.values():
-            for one in stored.values():
-                at = max([place.get(key, -1) for key in one.keys])
-                if at >= 0:
-                    self._at[at].append(one)
-                elif len(one.keys) == 1:
-                    self._alone.setdefault(next(iter(one.keys)), []).append(one)
-                else:
-                    self._last.append(one)
         self._done = 0
         self._there: set[int] = set()
         self.later = gtsam.NonlinearFactorGraph()
@@ -70,6 +61,7 @@ class IncrementalRebuild:
 
     def step(self, keyframes: int) -> None:
         """Add the next `keyframes` keyframes and their factors. RuntimeError if the graph is indeterminate."""
+        self._sort()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         begin, self._done = self._done, self._done + keyframes
         for k, here in zip(self._order[begin : self._done], self._at[begin : self._done], strict=True):
@@ -80,6 +72,7 @@ class IncrementalRebuild:
 
     def finish(self, variables: Variables) -> None:
         """Add the later variables at their values in `variables`, and all other factors. RuntimeError if indeterminate."""
+        self._sort()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for key in self._alone:
             self._bring(key, graph, values)
@@ -89,6 +82,22 @@ class IncrementalRebuild:
         graph.push_back(self.later)
         self.isam.update(graph, values)
         self.isam.calculateEstimate()  # It raises here if the graph is indeterminate.
+
+    def _sort(self) -> None:
+        """Sort the factors. The first step does it, and not the start, which comes after other work on the same image."""
+        if self._sorted:
+            return
+        self._sorted = True
+        place = {X0 + k: i for i, k in enumerate(self._order)}
+        for stored in self._store.kinds.values():
+            for one in stored.values():
+                at = max([place.get(key, -1) for key in one.keys])
+                if at >= 0:
+                    self._at[at].append(one)
+                elif len(one.keys) == 1:
+                    self._alone.setdefault(next(iter(one.keys)), []).append(one)
+                else:
+                    self._last.append(one)
 
     def _push(self, one: Stored, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
         for key in one.keys:

@@ -195,3 +195,10 @@ def test_importing_the_map_is_light() -> None:
     code = "import sys; from objslam import ObjectMap; print(*sys.modules)"
     modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not {"torch", "gtsam", "open3d", "rerun", "onnxruntime", "cv2", "scipy"} & set(modules)
+
+
+def test_an_object_at_another_position_is_a_replaced_one() -> None:
+    one = MapObject(3, "box", np.array([1.0, 2.0, 3.0]), np.eye(3), "ok", 10, 9, 30.0, 0.5, 1.0, 2.0, extent=(0.2, 0.4))
+    there = np.array([4.0, 5.0, 6.0])
+    assert vars(one.at(there)) == vars(replace(one, position=there))
+    assert one.position.tolist() == [1.0, 2.0, 3.0]

@@ -20,6 +20,7 @@ from objslam.core.statistics import (
     distinct,
     grouped_median,
     grouped_quantile,
+    grouped_quantiles,
     log_beta,
     logistic,
     noise_factors,
@@ -148,3 +149,17 @@ def test_log_odds_become_probabilities_however_large_they_are():
 @given(npst.arrays(np.float64, st.integers(1, 40), elements=st.floats(-1e3, 1e3)), st.floats(0, 1))
 def test_a_quantile_is_that_of_numpy(values, share):
     assert quantile(values, share) == pytest.approx(np.quantile(values, share), abs=1e-9)
+
+
+def test_quantiles_of_large_groups_are_those_of_sorted_groups():
+    """Groups of 3 to 600 values, one empty, so that some calls partition and others sort."""
+    rng = np.random.default_rng(4)
+    for size in (10, 1800):
+        index = rng.choice([0, 1, 1, 3], size)
+        values = np.where(rng.random(size) < 0.02, np.nan, rng.normal(size=size).round(1))
+        shares = (0.0, 0.5, 0.95, 1.0)
+        for share, found in zip(shares, grouped_quantiles(values, index, 4, shares), strict=True):
+            for group, one in enumerate(found.tolist()):
+                mine = np.sort(values[index == group])
+                expected = mine[min(int(share * len(mine)), len(mine) - 1)] if len(mine) else np.nan
+                np.testing.assert_array_equal(one, expected)

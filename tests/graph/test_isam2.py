@@ -190,6 +190,9 @@ def test_built_anew_in_turns_is_built_anew(drive, monkeypatch):
         graph.continue_rebuild()
     graph.continue_rebuild()
     assert graph._isam is not old
+    assert graph._replaced is not None  # To free the old tree takes time, and the last slice has other work.
+    graph.continue_rebuild()
+    assert graph._replaced is None
     assert graph._isam.getFactorsUnsafe().size() == whole._store.graph().size()
     for g in (graph, whole):
         for _ in range(3):

@@ -20,7 +20,7 @@ from objslam.frontend.corrected_odometry import OdometryCorrection
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.io.calibration_yaml import dump_calibration
 from objslam.live.adapters.replay import events
-from objslam.live.calibration.calibrator import observed
+from objslam.live.calibration.calibrator import Calibrator, observed
 from objslam.live.calibration.recalibration import recalibrate
 from objslam.live.session.session import Session
 from objslam.simulation import PoseNoise, preset, simulate
@@ -233,13 +233,25 @@ def test_a_clock_that_may_be_right_delays_no_frame():
     def of(clock, sigma=0.1):
         return Calibration(names, np.array([clock, 0.01]), covariance, np.array([sigma, 0.05]))
 
-    kept = observed(of(0.03), np.zeros(2))
-    np.testing.assert_allclose(kept.values, [0.0, 0.01 - 0.03 * 2e-4 / 0.04**2], atol=1e-12)
-    drawn = rng.multivariate_normal(of(0.03).values, covariance, 100_000) - kept.values
+    kept = observed(of(0.07), np.zeros(2))
+    np.testing.assert_allclose(kept.values, [0.0, 0.01 - 0.07 * 2e-4 / 0.04**2], atol=1e-12)
+    drawn = rng.multivariate_normal(of(0.07).values, covariance, 100_000) - kept.values
     np.testing.assert_allclose(kept.covariance, drawn.T @ drawn / len(drawn), rtol=0.03)
-    for clock in (-0.03, 0.05):  # The first delays nothing, and the second is clearly behind.
+    for clock in (-0.03, 0.09):  # The first delays nothing, and the second is clearly behind.
         assert observed(of(clock), np.zeros(2)).values.tolist() == [clock, 0.01]
-    assert observed(of(0.03), np.array([0.05, 0.0])).values[0] == 0
+    assert observed(of(0.07), np.array([0.05, 0.0])).values[0] == 0
+
+
+def test_frames_stop_waiting_for_a_clock_that_may_be_right():
+    """An estimate within its noise of the present value ends the wait, although nothing else has changed."""
+    session = Session(settings_of())
+    calibrator = next(one for one in session._rounds if isinstance(one, Calibrator))
+    found = Calibration(("front.clock", "front.yaw"), np.array([0.05, 0.01]), np.diag([0.04, 0.02]) ** 2, np.full(2, 0.1))
+    for clock, wanted in ((0.07, True), (0.0, False)):
+        session._mapper.state.errors.update({"front.clock": clock, "front.yaw": 0.01})
+        message = calibrator._correction(200, (found, NOMINAL))
+        assert (message is not None) == wanted
+        assert message is None or message.calibration.values.tolist() == [0.0, 0.01]
 
 
 def test_a_worker_that_fails_costs_no_frame(log, monkeypatch, own_processes):

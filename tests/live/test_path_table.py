@@ -7,9 +7,11 @@ from test_session import make_log
 
 from objslam.config import Odometry, load_settings
 from objslam.core.geometry import exp_se3, interpolate, lift_se2
+from objslam.core.trajectory import travel
 from objslam.core.types import Trajectory
 from objslam.frontend.corrected_odometry import corrected_odometry
 from objslam.frontend.odometry_drift import gathered_drift
+from objslam.live.mapper import tables
 from objslam.live.mapper.tables import PathTable
 from objslam.live.session.finalize import finish
 from objslam.live.session.session import Session
@@ -111,3 +113,18 @@ def test_a_session_ends_with_the_same_map_from_fewer_poses():
         assert one.label == other.label
         apart = one.position - other.position
         assert apart @ np.linalg.solve(one.covariance, apart) < 1.0
+
+
+def test_no_pose_waits_for_the_sums_of_many(monkeypatch):
+    """A path of 3,000 poses, of which some are dropped at 2,000, sums up at most `_SUMMED` steps at a time."""
+    steps: list[int] = []
+    monkeypatch.setattr(tables, "_MOST_POSES", 2000)
+    monkeypatch.setattr(tables, "_SUMMED", 100)
+    monkeypatch.setattr(tables, "travel", lambda poses: (steps.append(len(poses) - 1), travel(poses))[1])
+    path = PathTable(max_gap=1.0, reach=1.0, newest=1.0)
+    pose = np.eye(4)
+    for i in range(3000):
+        pose[0, 3] = 0.01 * i
+        path.append(0.005 * i, pose, np.zeros(0))
+    assert max(steps) <= 100
+    assert sum(path.trajectory().travel[:, 0]) == pytest.approx(29.99)

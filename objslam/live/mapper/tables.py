@@ -19,6 +19,9 @@ more often."""
 _LEAST = 0.25
 """The share of `_MOST_POSES` that is reserved for poses that no solve asks for. A larger share keeps the path between old
 keyframes finer, and costs memory if there are many keyframes."""
+_SUMMED = 1024
+"""The way between poses is summed up for this number of poses at once, 1 ms for 1024. If it waited until poses are dropped,
+it would hold up one message by 50 ms. A larger number sums up more rarely, and holds up that message for longer."""
 _FIRST = 64  # The rows that a new table has room for. More rows cost memory, fewer rows cost copies in a young session.
 
 
@@ -96,21 +99,23 @@ class PathTable(GrowingTable):
         super().__init__()
         self._reach, self._newest = reach + max_gap, newest + max_gap
         self._widest, self._spacing, self._most = max_gap / 4, 0.0, _MOST_POSES
-        self._summed = 0  # The number of poses whose `travel` is filled in. It is 0 until poses are dropped.
+        self._summed, self._thinned = 0, False  # How many poses have their `travel`. Whether poses were dropped.
 
     def append(self, stamp: float, pose: Floats, asked: Floats) -> None:
         """Append a pose (4, 4) at a stamp, s, later than all others. asked: (K,) s, the stamps that later solves ask for."""
         if len(self) >= self._most:
             self._thin(asked)
+        if len(self) >= self._summed + _SUMMED:
+            self._sum_up()
         self.add(stamp=(stamp,), pose=pose[None], travel=0.0)
 
     def trajectory(self) -> Trajectory | None:
         """Return a copy of the path, None if it has no pose."""
         if not len(self):
             return None
-        if self._summed:
+        if self._thinned:
             self._sum_up()
-        return Trajectory(self.stamp.copy(), self.pose.copy(), self.travel.copy() if self._summed else None)
+        return Trajectory(self.stamp.copy(), self.pose.copy(), self.travel.copy() if self._thinned else None)
 
     def _thin(self, asked: Floats) -> None:
         """Keep one pose per period, and the poses at gaps. The period doubles until few enough poses stay.
@@ -130,7 +135,7 @@ class PathTable(GrowingTable):
         total = np.cumsum(self.travel, axis=0)[stays]
         self.keep(stays)
         self.travel[1:] = np.diff(total, axis=0)
-        self._summed = len(self)
+        self._summed, self._thinned = len(self), True
         if len(self) > _FULL * self._most:
             self._most *= 2
 

@@ -11,6 +11,9 @@ _LARGE = 2**20
 32 MB, when it frees a larger block, and then keeps the memory of a calibration. A larger value keeps more, and saves
 time."""
 _M_MMAP_THRESHOLD = -3  # The name of this limit in glibc's malloc.h.
+_SOON = 2
+"""A full garbage collection runs early if Python would run it after this number of smaller ones. A larger number collects
+more often. With a smaller one, more collections come while a frame is being mapped."""
 
 
 def configure() -> None:
@@ -23,3 +26,12 @@ def configure() -> None:
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE)
     gc.collect()
     gc.freeze()
+
+
+def collect_early() -> None:
+    """Run a full garbage collection now if one is soon due. It takes 20 ms, and else comes while a frame is being mapped.
+
+    Call it when there is time. Without `configure`, Python alone decides.
+    """
+    if gc.get_freeze_count() and gc.get_count()[2] > gc.get_threshold()[2] - _SOON:
+        gc.collect()

@@ -25,6 +25,7 @@ from objslam.live.mapper.mapper import Mapper
 from objslam.live.names.name_judge import NameJudge
 from objslam.live.reassociation.reassociator import Reassociator
 from objslam.live.rounds import Rounds
+from objslam.live.session import low_latency
 from objslam.live.session.finalize import finish
 from objslam.live.session.frame_queue import FrameQueue
 from objslam.live.session.intake import Intake
@@ -265,10 +266,10 @@ class Session(Intake):
             begin, worked = time.perf_counter(), False
             while self._taken:
                 worked |= self._frames_waiting.take(*self._taken.popleft())
-            if self._has_time(worked, begin):
-                self._answer()
+            if self._has_time(worked, begin) and not self._answer():
+                low_latency.collect_early()
 
-    def _guard(self, work: Callable[[], None]) -> None:
+    def _guard(self, work: Callable[[], object]) -> None:
         """Call `work`, and keep its error as the session's `failure`, unless there is an earlier failure."""
         try:
             work()
@@ -301,12 +302,14 @@ class Session(Intake):
         now = time.perf_counter()
         return now - self._frames_waiting.worked > _IDLE or (worked and (now - begin < _SHORT or now - self._asked > _LONG))
 
-    def _answer(self) -> None:
+    def _answer(self) -> bool:
+        """Make the snapshot that was asked for, and return whether there was one."""
         wanted = self._wanted
         if wanted == self._given and not self._stopping:
-            return
+            return False
         snapshot = take_snapshot(self._mapper.state, self._describer, self._frames_waiting.lag, whole=self._stopping)
         snapshot = self._locator.in_map(snapshot)
         with self._changed:
             self._snapshot, self._given = snapshot, wanted
             self._changed.notify_all()
+        return True

@@ -60,10 +60,10 @@ class Describer:
             sure = not against[row]
             state = (int(landmarks.seen[row]), float(landmarks.last[row]), sure)
             before, late = known.get(j), time.perf_counter() > end
-            if late and widest is None:
+            if late and before is None and widest is None:
                 widest = self._widest(landmarks)
             if before is not None and (before[0] == state or late):
-                described, state = replace(before[1], position=points[row]), before[0]
+                described, state = before[1].at(points[row]), before[0]
             elif late and widest is not None:
                 alone = covariances(landmarks, np.array([row]))[0]
                 described = describe_landmark(m, row, points[row], alone + widest, sure=sure)

@@ -34,7 +34,7 @@ def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats
     local = np.stack([cos * x + sin * y, cos * y - sin * x, z])
     across, along, up = corner = np.sign(local) * half  # in the frame of the cuboid
     a, b, c = reach = corner * local
-    by, points = np.empty((*z.shape, 4)), np.empty((*z.shape, 3))
+    by, points = np.empty((*z.shape, 4), order="F"), np.empty((*z.shape, 3), order="F")
     by[..., 0], by[..., 1], by[..., 2], by[..., 3] = a + b, a - b, across * local[1] - along * local[0], c
     points[..., 0], points[..., 1], points[..., 2] = cos * across - sin * along, sin * across + cos * along, up
     return reach.sum(axis=0), by, points

@@ -50,14 +50,22 @@ class BoxEdges:
         return len(self.body)
 
     def take(self, boxes: Bools | Ints) -> BoxEdges:
-        """Select boxes by a mask or by indices."""
-        selected: dict[str, Any] = {name: value[boxes] for name, value in vars(self).items()}
+        """Select boxes by a mask or by indices. In memory, each number of all boxes lies together (`by_columns`)."""
+        selected: dict[str, Any] = {name: by_columns(value, boxes) for name, value in vars(self).items()}
         return replace(self, **selected)
 
     def joined(self, other: BoxEdges) -> BoxEdges:
         """Return these boxes, and then the boxes of `other`."""
         both: dict[str, Any] = {name: np.concatenate([value, vars(other)[name]]) for name, value in vars(self).items()}
         return replace(self, **both)
+
+
+def by_columns(rows: Any, which: Bools | Ints) -> Any:
+    """Return some rows (b, ...) of an array (B, ...), by a mask or by indices, so that each column lies together in memory.
+
+    A box has few numbers of each kind, so a loop over the boxes is several times as fast as one over the numbers of a box.
+    """
+    return np.take(rows.T, which.nonzero()[0] if which.dtype == bool else which, axis=-1).T
 
 
 def tangent_planes(

@@ -44,7 +44,7 @@ def section(form: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floa
     normal of a tangent plane, the square root of the form is the distance of this plane from the centre.
     """
     across, along, cross, upward = x * x + y * y, x * x - y * y, 2 * x * y, form[9] * z * z
-    by = np.empty((*across.shape, 4))
+    by = np.empty((*across.shape, 4), order="F")
     flat, by[..., 1], by[..., 2] = (a * across + b * along + c * cross for a, b, c in (form[:3], form[3:6], form[6:9]))
     by[..., 0], by[..., 3] = 2 * flat, 2 * upward
     return flat + upward, by
@@ -62,7 +62,7 @@ def support(values: Floats, body: Ints, normals: Floats) -> tuple[Floats, Floats
 
 def touched(form: Floats, x: Floats, y: Floats, z: Floats, distance: Floats) -> Floats:
     """Return M n (B, 4, 3) of normals n = (x, y, z), each divided by a distance (B, 4). form: as in `section`."""
-    points = np.empty((*distance.shape, 3))
+    points = np.empty((*distance.shape, 3), order="F")
     points[..., 0] = ((form[0] + form[1]) * x + form[2] * y) / distance
     points[..., 1] = (form[2] * x + (form[0] - form[1]) * y) / distance
     points[..., 2] = form[9] * z / distance

@@ -176,8 +176,9 @@ def _weight(now: Residuals, weights: Weights) -> Floats:
 
 def _normal(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the information (N, 7, 7), the gradient (N, 7) and the cost (N,) of the bodies."""
-    weighted = now.by * (weight * now.use)[..., None]
-    sums = sums_of_products(body, weighted, now.rows, len(values))
+    rooted = np.empty(now.rows.shape)  # Each box lies together in memory, because the sums run over the boxes of a body.
+    np.multiply(now.rows, np.sqrt(weight * now.use)[..., None], out=rooted)
+    sums = sums_of_products(body, rooted[..., :PARAMETERS], rooted, len(values))
     information = sums[:, :, :PARAMETERS] + prior.information
     gradient = sums[:, :, PARAMETERS] + np.einsum("nij,nj->ni", prior.information, values - prior.mean)
     return information, gradient, _cost(body, now, weight, prior, values)
@@ -189,7 +190,10 @@ def sums_of_products(body: Ints, one: Floats, other: Floats, count: int) -> Floa
         return grouped(body, np.swapaxes(one, 1, 2) @ other, count)
     ends = (one.shape[1] * np.searchsorted(body, np.arange(count + 1))).tolist()
     wide, deep = one.reshape(-1, one.shape[2]).T, other.reshape(-1, other.shape[2])
-    return np.stack([wide[:, first:last] @ deep[first:last] for first, last in pairwise(ends)])
+    total = np.empty((count, len(wide), deep.shape[1]))
+    for mine, (first, last) in zip(total, pairwise(ends), strict=True):
+        np.matmul(wide[:, first:last], deep[first:last], out=mine)
+    return total
 
 
 def _cost(body: Ints, now: Residuals, weight: Floats, prior: Prior, values: Floats) -> Floats:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.core.arrays import Bools, Floats, Ints
-from objslam.triangulation.bodies.edges import BoxEdges
+from objslam.triangulation.bodies.edges import BoxEdges, by_columns
 from objslam.triangulation.bodies.shapes import PARAMETERS, Kind, rows_of_kinds
 
 ROWS = 5
@@ -49,7 +49,7 @@ class Residuals:
 
     def take(self, boxes: Bools | Ints) -> Residuals:
         """Select boxes by a mask or by indices."""
-        return Residuals(self.rows[boxes], self.use[boxes])
+        return Residuals(by_columns(self.rows, boxes), by_columns(self.use, boxes))
 
     def put(self, boxes: Bools | Ints, new: Residuals) -> None:
         """Overwrite the residuals of some boxes."""
@@ -59,26 +59,32 @@ class Residuals:
 def edge_gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
     """Return the gaps (B, 4), m, by which bodies (N, 7) reach beyond their planes, the derivatives (B, 4, 7), and the points
     (B, 4, 3) in map at which the bodies come closest to the planes."""
-    centre = values[edges.body, :3]
+    gap, by_shape, points = _gaps(edges, values, kind)
+    return gap, np.concatenate([edges.normal, by_shape], axis=2), points
+
+
+def _gaps(edges: BoxEdges, values: Floats, kind: Kind) -> tuple[Floats, Floats, Floats]:
+    """Return the same as `edge_gaps`, but the derivatives (B, 4, 4) by the last four parameters only. Those by the centre
+    are the normals."""
+    centre = by_columns(values[:, :3], edges.body)
     reach, by_shape, points = kind.support(values, edges.body, edges.normal)
-    gap = np.einsum("bei,bi->be", edges.normal, centre - edges.origin) + reach
-    return gap, np.concatenate([edges.normal, by_shape], axis=2), centre[:, None] + points
+    points += centre[:, None]
+    return _products(edges.normal, (centre - edges.origin)[:, None]) + reach, by_shape, points
 
 
 def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
     """Return the residuals of bodies (N, 7) of one kind. The derivatives treat the distance to touched points as fixed."""
-    gap, by_gap, points = edge_gaps(edges, values, kind)
+    gap, by_gap, points = _gaps(edges, values, kind)
     half = 0.5 / _scale(edges, points)
-    mixed = np.empty((len(gap), 4, PARAMETERS + 1))  # Half of the rows of single edges.
-    np.multiply(by_gap, half[..., None], out=mixed[..., :PARAMETERS])
-    np.multiply(gap, half, out=mixed[..., PARAMETERS])
-    rows, use = np.empty((len(gap), ROWS, PARAMETERS + 1)), np.ones((len(gap), ROWS))
-    low, high = mixed[:, :2], mixed[:, 2:]
-    np.subtract(high, low, out=rows[:, :2])
-    np.add(high, low, out=rows[:, 2:4])
+    rows, use = np.empty((len(gap), ROWS, PARAMETERS + 1), order="F"), np.ones((len(gap), ROWS), order="F")
     row, axis = _axes_with_bound(edges)
+    # A column of all boxes at a time stays in the cache of the processor.
+    for number, column in enumerate([*edges.normal.T, *by_gap.T, gap.T]):
+        low, high = (column * half.T).reshape(2, 2, -1)  # Half of the rows of single edges.
+        np.subtract(high, low, out=rows.T[number, :2])
+        np.add(high, low, out=rows.T[number, 2:4])
+        rows[row, axis, number], rows[row, axis + 2, number] = 2 * low[axis, row], 2 * high[axis, row]
     for place in (axis, axis + 2):
-        rows[row, place] = 2 * mixed[row, place]
         use[row, place] = 1.0 - edges.bound[row, place] * (gap[row, place] > 0)
     rows[:, 4], use[:, 4] = 0.0, 0.0
     known = np.flatnonzero(np.isfinite(edges.range))
@@ -93,14 +99,19 @@ def residuals(edges: BoxEdges, values: Floats, kind: Kind) -> Residuals:
 
 def beyond_edges(edges: BoxEdges, values: Floats, kind: Kind) -> Floats:
     """Return how far (B, 4), px, bodies (N, 7) of one kind reach beyond each edge."""
-    gap, _, points = edge_gaps(edges, values, kind)
+    gap, _, points = _gaps(edges, values, kind)
     return gap / _scale(edges, points)
 
 
 def _scale(edges: BoxEdges, points: Floats) -> Floats:
     """Return the length (B, 4), m, that one pixel has at points (B, 4, 3) of the bodies."""
     away = points - edges.origin[:, None]
-    return np.maximum(np.sqrt(np.einsum("bei,bei->be", away, away)) * edges.turn, _LEAST)
+    return np.maximum(np.sqrt(_products(away, away)) * edges.turn, _LEAST)
+
+
+def _products(one: Floats, other: Floats) -> Floats:
+    """Return the scalar products (B, 4) of vectors (B, 4, 3) with vectors (B, 4, 3) or (B, 1, 3)."""
+    return np.asarray(one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1] + one[..., 2] * other[..., 2])
 
 
 def residuals_of_shapes(edges: BoxEdges, values: Floats, shape: Ints) -> Residuals:
@@ -120,7 +131,7 @@ def touched_points(edges: BoxEdges, values: Floats, shape: Ints) -> Floats:
     points = np.empty((len(edges), 4, 1 + 3 * len(_ALONG), 3))
     for kind, boxes in rows_of_kinds(shape[edges.body]):
         some = edges.take(boxes)
-        nearest, centre = edge_gaps(some, values, kind)[2][:, :, None], values[some.body, None, :3]
+        nearest, centre = _gaps(some, values, kind)[2][:, :, None], values[some.body, None, :3]
         points[boxes] = nearest
         along = kind.sides(values[some.body, None], nearest[:, :, 0] - centre)
         more = (nearest[..., None, :] + _ALONG * along[..., None, :]).reshape(len(some), 4, -1, 3)
