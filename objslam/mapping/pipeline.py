@@ -53,6 +53,7 @@ from objslam.mapping.fixed.far_sides import with_far_sides
 from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasting_errors
 from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
+from objslam.mapping.ground.level_path import levelled
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.joint.path_against_localization import check_bent_path
@@ -210,6 +211,8 @@ def _run(
         if settings.checks.use:
             diagnosis = diagnosis.with_findings(at_bounds(solution.estimate, errors.bounds))
             say(diagnosis, ledger)
+    if settings.mode == "joint" and known is None:  # Objects of an older map say how a drive tilts.
+        solution = levelled(solution)
     lasting, late, noisy = None, None, None
     if diagnosis.jumps is not None:
         solution = with_jumps(solution, diagnosis.jumps)

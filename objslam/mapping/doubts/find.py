@@ -91,7 +91,7 @@ def with_doubts(result: RunResult) -> RunResult:
     disagreeing = [*apart.crossing(result, evidence), *apart.disagreeing(result, apart.misfits_of(result))]
     through = passed.driven_through(result)
     paired = {one.objects for one in doubts if one.kind == "pair"}
-    elsewhere = moved.at_other_places(result, evidence.state.history, evidence.object)
+    elsewhere = moved.at_other_places(result, evidence.state, evidence.object)
     elsewhere = [one for one in elsewhere if one.objects not in paired and one.objects[::-1] not in paired]
     mixed, unsure = mixed_sizes(result), wide.unsure_objects(result)
     # If a whole label has no object, its doubt is enough. Its things get no doubts of their own.

@@ -1,0 +1,57 @@
+"""Level a map that was solved from planar odometry alone.
+
+Rays and odometry measure how a robot tilts relative to its first pose. How the first pose tilts, they do not say, so a solve
+holds it level. But a robot that accelerates, or stands on a bump, tilts by a degree, and the heights of all things 20 m away
+would then be wrong by 0.3 m. A floor is level where the robot is level on average.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.geometry import is_planar
+from objslam.core.rotation import quaternion_from_rotation, rotation_from_vector
+from objslam.mapping.solution import Solution
+
+
+def levelled(solution: Solution) -> Solution:
+    """Return a solution without bodies, turned about its first pose so that the robot is level on average.
+
+    Nothing that was measured changes. With a localisation, or with poses that are not planar, the measured poses say how the
+    robot tilts, and the solution stays as it is.
+    """
+    keyframes, estimate = solution.keyframes, solution.estimate
+    if keyframes.localized_every or not is_planar(keyframes.map_T_base):
+        return solution
+    turn, origin = _to_level(estimate.map_T_base[:, :3, 2].mean(axis=0)), estimate.map_T_base[0, :3, 3]
+    poses = estimate.map_T_base.copy()
+    poses[:, :3, :3] = turn @ poses[:, :3, :3]
+    poses[:, :3, 3] = (poses[:, :3, 3] - origin) @ turn.T + origin
+    more, correlated, held = estimate.error_covariance, estimate.correlated, estimate.moved_by_held
+    tags = {
+        j: replace(
+            tag,
+            xyzw=quaternion_from_rotation((turn @ tag.rotation)[None])[0],
+            other_xyzw=None if tag.other is None else quaternion_from_rotation((turn @ tag.other)[None])[0],
+        )
+        for j, tag in estimate.tags.items()
+    }
+    found = replace(
+        estimate,
+        map_T_base=poses,
+        positions=(estimate.positions - origin) @ turn.T + origin,
+        covariance=turn @ estimate.covariance @ turn.T,
+        error_covariance=None if more is None else turn @ more @ turn.T,
+        correlated=None if correlated is None else turn @ correlated,
+        moved_by_held=None if held is None else turn @ held,
+        tags=tags,
+    )
+    return replace(solution, estimate=found)
+
+
+def _to_level(up: Floats) -> Floats:
+    """Return the least rotation (3, 3) that turns a direction (3,) upright."""
+    axis = np.cross(up, (0.0, 0.0, 1.0))
+    size = np.linalg.norm(axis)
+    return rotation_from_vector(axis * (np.arctan2(size, up[2]) / max(size, 1e-12)))
