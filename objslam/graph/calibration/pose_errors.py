@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
@@ -60,10 +61,6 @@ class ErrorKind:
         return Lasting(_SHARES[self.share], _TIMES[self.time]) if self.share else WHITE
 
 
-_NO_ERROR = ErrorKind(factor=-np.inf)
-"""An error of variance 0."""
-
-
 @dataclass(frozen=True)
 class PoseErrors:
     """A hypothesis: the errors of headings and places, and the logarithm of the factor on the error of the prediction."""
@@ -119,7 +116,7 @@ class ComparedPoses:
 
     def expected(self, model: PoseErrors) -> Floats:
         """Return the covariance (3 n, 3 n) of `off`."""
-        n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance + self.shared
+        n, found = len(self.times), self.by_prediction(model.predicted).copy()
         for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
             own = self._own(kind, nominal)
             for part in (0,) if first == 0 else (1, 2):
@@ -131,6 +128,20 @@ class ComparedPoses:
         variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
         own = variance * (1 - lasting.share) * self.white
         return own + variance * lasting.share * self.alike[kind.time] if lasting.share else own
+
+    def by_prediction(self, predicted: float) -> Floats:
+        """Return the covariance (3 n, 3 n) of `off` by all but the error of the poses. predicted: as in `PoseErrors`.
+
+        The last one is kept, because most steps of a search leave the prediction as it is.
+        """
+        if self._predicted.get("at") != predicted:
+            self._predicted.update(at=predicted, covariance=np.exp(2 * predicted) * self.covariance + self.shared)
+        found: Floats = self._predicted["covariance"]
+        return found
+
+    @cached_property
+    def _predicted(self) -> dict[str, Any]:
+        return {}
 
     @cached_property
     def _costs(self) -> dict[PoseErrors, float]:
@@ -154,7 +165,8 @@ class ComparedPoses:
     def _cost(self, model: PoseErrors) -> float:
         key = model.place, model.predicted
         if key not in self._placed:
-            self._placed[key] = _Placed.of(self.expected(replace(model, heading=_NO_ERROR)), self.off)
+            own = self._own(model.place, self.nominal[1])
+            self._placed[key] = _Placed.of(self.by_prediction(model.predicted), own, self.off)
         placed = self._placed[key]
         if placed is None:
             return np.inf
@@ -180,13 +192,20 @@ class _Placed:
     left: Floats
 
     @classmethod
-    def of(cls, covariance: Floats, off: Floats) -> "_Placed | None":
-        """Take the places out of a covariance (3 n, 3 n) of `off` (3 n,), headings first. None if it is singular."""
+    def of(cls, covariance: Floats, own: Floats, off: Floats) -> "_Placed | None":
+        """Take the places out of a covariance (3 n, 3 n) of `off` (3 n,), headings first. None if it is singular.
+
+        own: (n, n) the covariance of each axis of the places that is not yet in `covariance`.
+        """
         n = len(off) // 3
-        root, failed = dpotrf(np.asfortranarray(covariance[n:, n:]), lower=1, clean=0, overwrite_a=1)
+        places = covariance[n:, n:].copy()
+        places[:n, :n] += own
+        places[n:, n:] += own
+        # LAPACK reads columns. A symmetric matrix is its own transpose, and the transpose of rows needs no copy.
+        root, failed = dpotrf(places.T, lower=1, clean=0, overwrite_a=1)
         if failed:
             return None
-        told, _ = dtrtrs(root, np.column_stack([off[n:], covariance[n:, :n]]), lower=1)
+        told, _ = dtrtrs(root, np.vstack([off[n:], covariance[:n, n:]]).T, lower=1, overwrite_b=1)
         white, by_heading = told[:, 0], told[:, 1:]
         cost = white @ white + 2 * np.log(np.diagonal(root)).sum()
         return cls(float(cost), off[:n] - by_heading.T @ white, covariance[:n, :n] - by_heading.T @ by_heading)
