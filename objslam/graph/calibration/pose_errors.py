@@ -2,14 +2,13 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.noise import MOST_NOISE, MOST_POSE_NOISE
-from objslam.core.statistics import SAME_POINT_WIDE, WHITE, Lasting
+from objslam.core.statistics import WHITE, Lasting
 
 _TIMES = tuple(2.0**k for k in range(8))
 """The tried times (s) for which errors last. A shorter one hardly differs from new errors in each pose, and a longer one
@@ -31,8 +30,6 @@ because a short log may agree with two quite different sizes. More of them are m
 _USUAL = 1.0
 """The standard deviation of the logarithm of a factor on noise above 1, before the log is seen. In a short log, an error of
 usual size looks like one twice as large that lasts four times as long. A larger value makes the second one more likely."""
-_MOST_STRAYS = 0.1
-"""At most this share of the poses are jumps. A larger share explains noise by jumps."""
 _LEAST_FACTOR, _MOST_FACTOR = np.log(0.05), np.log(MOST_POSE_NOISE)
 """The bounds of the logarithm of a factor on noise. A localisation may be far better than the settings say. Without small
 factors, its small differences from pose to pose would look like errors that last."""
@@ -130,17 +127,14 @@ class ComparedPoses:
         return own + variance * lasting.share * self.alike[kind.time] if lasting.share else own
 
     def by_prediction(self, predicted: float) -> Floats:
-        """Return the covariance (3 n, 3 n) of `off` by all but the error of the poses. predicted: as in `PoseErrors`.
-
-        The last one is kept, because most steps of a search leave the prediction as it is.
-        """
-        if self._predicted.get("at") != predicted:
-            self._predicted.update(at=predicted, covariance=np.exp(2 * predicted) * self.covariance + self.shared)
-        found: Floats = self._predicted["covariance"]
-        return found
+        """Return the covariance (3 n, 3 n) of `off` without the poses' own error. The last is kept: few steps change it."""
+        if predicted not in self._predicted:
+            self._predicted.clear()
+            self._predicted[predicted] = np.exp(2 * predicted) * self.covariance + self.shared
+        return self._predicted[predicted]
 
     @cached_property
-    def _predicted(self) -> dict[str, Any]:
+    def _predicted(self) -> dict[float, Floats]:
         return {}
 
     @cached_property
@@ -209,17 +203,6 @@ class _Placed:
         white, by_heading = told[:, 0], told[:, 1:]
         cost = white @ white + 2 * np.log(np.diagonal(root)).sum()
         return cls(float(cost), off[:n] - by_heading.T @ white, covariance[:n, :n] - by_heading.T @ by_heading)
-
-
-def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
-    """Return the poses (m,) that agree with what all other poses predict, or all poses if too many disagree."""
-    inner = np.linalg.inv(data.expected(model))
-    n = len(data.times)
-    at = np.arange(n)[:, None] + n * np.arange(3)
-    blocks, pull = inner[at[:, :, None], at[:, None, :]], (inner @ data.off)[at]
-    size = (pull * np.linalg.solve(blocks, pull[..., None])[..., 0]).sum(axis=1)
-    near = np.flatnonzero(size < SAME_POINT_WIDE)
-    return near if len(near) >= (1 - _MOST_STRAYS) * n else np.arange(n)
 
 
 def most_likely(data: ComparedPoses, near: PoseErrors | None = None) -> PoseErrors:
