@@ -7,6 +7,8 @@ this share lasts.
 """
 
 from dataclasses import replace
+from hashlib import sha256
+from threading import Lock
 
 import numpy as np
 
@@ -15,10 +17,10 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import NoiseFactors
-from objslam.core.statistics import WHITE
+from objslam.core.statistics import SAME_POINT_WIDE, WHITE, Lasting
 from objslam.core.types import Keyframes
 from objslam.graph.calibration.linearised_graph import Linearised
-from objslam.graph.calibration.pose_errors import ComparedPoses, averaged, most_likely, without_jumps
+from objslam.graph.calibration.pose_errors import ComparedPoses, PoseErrors, averaged, most_likely
 from objslam.graph.calibration.shared_error_jacobian import linearise
 from objslam.graph.factors.localization import localized, sharing
 
@@ -29,6 +31,17 @@ _FIRST, _LAGS = 18, (0, 1, 2, 4, 8, 16)
 """In a long log, the compared poses are at `_FIRST` keyframes, evenly spread, and `_LAGS` keyframes after each of them.
 Poses close together show errors that are new in each pose, and poses far apart show errors that last. More poses are more
 exact, and the time grows with the cube of their number."""
+_MOST_STRAYS = 0.1
+"""At most this share of the poses are jumps. A larger share explains noise by jumps."""
+_KEPT = 64
+"""For how many logs' paths the noise is kept. A run that compares the same two paths again, as its checks do, then searches
+once. A larger number takes more memory, some hundred bytes each."""
+
+_kept = dict[bytes, "_Noise"]()
+_lock = Lock()
+
+_Noise = tuple[tuple[float, Lasting], tuple[float, Lasting]]
+"""The factors on the noise of headings and places, and their lasting parts."""
 
 
 def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
@@ -37,13 +50,7 @@ def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta:
     Factors are at least 1. They are 1 if the log agrees with the settings. theta: (P,) the shared errors. SolveError if the
     graph without its localisation is singular.
     """
-    data = _compared(of, errors, theta)
-    found = most_likely(data)
-    near = without_jumps(data, found)
-    if len(near) < len(data.times):
-        data = data.take(near)
-        found = most_likely(data, found)
-    (heading, turned), (place, shifted) = averaged(data, found)
+    (heading, turned), (place, shifted) = _noise_in(_compared(of, errors, theta))
     return replace(
         errors.noise,
         heading=heading,
@@ -53,6 +60,43 @@ def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta:
         place_share=shifted.share,
         place_seconds=shifted.seconds,
     )
+
+
+def _noise_in(data: ComparedPoses) -> _Noise:
+    """Return the noise of headings and places that agrees best with the data. That of the same data is kept."""
+    key = _digest(data)
+    with _lock:
+        if key in _kept:
+            return _kept[key]
+    found = most_likely(data)
+    near = _without_jumps(data, found)
+    if len(near) < len(data.times):
+        data = data.take(near)
+        found = most_likely(data, found)
+    noise = averaged(data, found)
+    with _lock:
+        _kept[key] = noise
+        if len(_kept) > _KEPT:
+            del _kept[next(iter(_kept))]
+    return noise
+
+
+def _digest(data: ComparedPoses) -> bytes:
+    """Return a digest of all values, which is the same for the same data."""
+    arrays = (np.ascontiguousarray(one) for one in (data.off, data.covariance, data.shared, data.times))
+    rest = repr((data.apart, data.nominal, data.free, data.prior)).encode()
+    return sha256(b"".join(one.tobytes() for one in arrays) + rest).digest()
+
+
+def _without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
+    """Return the poses (m,) that agree with what all other poses predict, or all poses if too many disagree."""
+    inner = np.linalg.inv(data.expected(model))
+    n = len(data.times)
+    at = np.arange(n)[:, None] + n * np.arange(3)
+    blocks, pull = inner[at[:, :, None], at[:, None, :]], (inner @ data.off)[at]
+    size = (pull * np.linalg.solve(blocks, pull[..., None])[..., 0]).sum(axis=1)
+    near = np.flatnonzero(size < SAME_POINT_WIDE)
+    return near if len(near) >= (1 - _MOST_STRAYS) * n else np.arange(n)
 
 
 def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> ComparedPoses:

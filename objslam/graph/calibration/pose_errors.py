@@ -8,7 +8,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from objslam.core.arrays import Floats, Ints
 from objslam.core.noise import MOST_NOISE, MOST_POSE_NOISE
-from objslam.core.statistics import SAME_POINT_WIDE, WHITE, Lasting
+from objslam.core.statistics import WHITE, Lasting
 
 _TIMES = tuple(2.0**k for k in range(8))
 """The tried times (s) for which errors last. A shorter one hardly differs from new errors in each pose, and a longer one
@@ -30,8 +30,6 @@ because a short log may agree with two quite different sizes. More of them are m
 _USUAL = 1.0
 """The standard deviation of the logarithm of a factor on noise above 1, before the log is seen. In a short log, an error of
 usual size looks like one twice as large that lasts four times as long. A larger value makes the second one more likely."""
-_MOST_STRAYS = 0.1
-"""At most this share of the poses are jumps. A larger share explains noise by jumps."""
 _LEAST_FACTOR, _MOST_FACTOR = np.log(0.05), np.log(MOST_POSE_NOISE)
 """The bounds of the logarithm of a factor on noise. A localisation may be far better than the settings say. Without small
 factors, its small differences from pose to pose would look like errors that last."""
@@ -58,10 +56,6 @@ class ErrorKind:
     def lasting(self) -> Lasting:
         """The lasting part."""
         return Lasting(_SHARES[self.share], _TIMES[self.time]) if self.share else WHITE
-
-
-_NO_ERROR = ErrorKind(factor=-np.inf)
-"""An error of variance 0."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +113,7 @@ class ComparedPoses:
 
     def expected(self, model: PoseErrors) -> Floats:
         """Return the covariance (3 n, 3 n) of `off`."""
-        n, found = len(self.times), np.exp(2 * model.predicted) * self.covariance + self.shared
+        n, found = len(self.times), self.by_prediction(model.predicted).copy()
         for first, kind, nominal in ((0, model.heading, self.nominal[0]), (1, model.place, self.nominal[1])):
             own = self._own(kind, nominal)
             for part in (0,) if first == 0 else (1, 2):
@@ -131,6 +125,17 @@ class ComparedPoses:
         variance, lasting = (nominal * np.exp(kind.factor)) ** 2, kind.lasting
         own = variance * (1 - lasting.share) * self.white
         return own + variance * lasting.share * self.alike[kind.time] if lasting.share else own
+
+    def by_prediction(self, predicted: float) -> Floats:
+        """Return the covariance (3 n, 3 n) of `off` without the poses' own error. The last is kept: few steps change it."""
+        if predicted not in self._predicted:
+            self._predicted.clear()
+            self._predicted[predicted] = np.exp(2 * predicted) * self.covariance + self.shared
+        return self._predicted[predicted]
+
+    @cached_property
+    def _predicted(self) -> dict[float, Floats]:
+        return {}
 
     @cached_property
     def _costs(self) -> dict[PoseErrors, float]:
@@ -154,7 +159,8 @@ class ComparedPoses:
     def _cost(self, model: PoseErrors) -> float:
         key = model.place, model.predicted
         if key not in self._placed:
-            self._placed[key] = _Placed.of(self.expected(replace(model, heading=_NO_ERROR)), self.off)
+            own = self._own(model.place, self.nominal[1])
+            self._placed[key] = _Placed.of(self.by_prediction(model.predicted), own, self.off)
         placed = self._placed[key]
         if placed is None:
             return np.inf
@@ -180,27 +186,23 @@ class _Placed:
     left: Floats
 
     @classmethod
-    def of(cls, covariance: Floats, off: Floats) -> "_Placed | None":
-        """Take the places out of a covariance (3 n, 3 n) of `off` (3 n,), headings first. None if it is singular."""
+    def of(cls, covariance: Floats, own: Floats, off: Floats) -> "_Placed | None":
+        """Take the places out of a covariance (3 n, 3 n) of `off` (3 n,), headings first. None if it is singular.
+
+        own: (n, n) the covariance of each axis of the places that is not yet in `covariance`.
+        """
         n = len(off) // 3
-        root, failed = dpotrf(np.asfortranarray(covariance[n:, n:]), lower=1, clean=0, overwrite_a=1)
+        places = covariance[n:, n:].copy()
+        places[:n, :n] += own
+        places[n:, n:] += own
+        # LAPACK reads columns. A symmetric matrix is its own transpose, and the transpose of rows needs no copy.
+        root, failed = dpotrf(places.T, lower=1, clean=0, overwrite_a=1)
         if failed:
             return None
-        told, _ = dtrtrs(root, np.column_stack([off[n:], covariance[n:, :n]]), lower=1)
+        told, _ = dtrtrs(root, np.vstack([off[n:], covariance[:n, n:]]).T, lower=1, overwrite_b=1)
         white, by_heading = told[:, 0], told[:, 1:]
         cost = white @ white + 2 * np.log(np.diagonal(root)).sum()
         return cls(float(cost), off[:n] - by_heading.T @ white, covariance[:n, :n] - by_heading.T @ by_heading)
-
-
-def without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
-    """Return the poses (m,) that agree with what all other poses predict, or all poses if too many disagree."""
-    inner = np.linalg.inv(data.expected(model))
-    n = len(data.times)
-    at = np.arange(n)[:, None] + n * np.arange(3)
-    blocks, pull = inner[at[:, :, None], at[:, None, :]], (inner @ data.off)[at]
-    size = (pull * np.linalg.solve(blocks, pull[..., None])[..., 0]).sum(axis=1)
-    near = np.flatnonzero(size < SAME_POINT_WIDE)
-    return near if len(near) >= (1 - _MOST_STRAYS) * n else np.arange(n)
 
 
 def most_likely(data: ComparedPoses, near: PoseErrors | None = None) -> PoseErrors:
