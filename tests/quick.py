@@ -6,7 +6,9 @@ compare a map with the truth, run them.
 
 ROUGH = ("checks.use=false", "bodies.use=false", "noise.localization=false", "noise.odometry=false", "noise.rays=false")
 """No look at the input, no bodies, and the noise that the settings say."""
-HELD = (*ROUGH, "calibration.use=false", "live.calibrate_from=0", "live.search_from=0")
+NOTHING_BESIDE = ("live.calibrate_from=0", "live.search_from=0")
+"""No work beside a session while the robot drives: no calibration, and no search through all boxes. The end does both."""
+HELD = (*ROUGH, "calibration.use=false", *NOTHING_BESIDE)
 """No shared errors either, and no work beside a session."""
 NOTHING_DRAWN = ("output.recording=false", "output.picture=false")
 

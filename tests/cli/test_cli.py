@@ -36,7 +36,7 @@ from objslam.sources.log_folder import write_log_folder
 
 LEAN = options(*NOTHING_DRAWN)
 BY_LABEL = options(*ROUGH, *NOTHING_DRAWN, "association.method=by_label")
-CHECKED = (*LEAN, *options("bodies.use=false", "calibration.use=false"))
+CHECKED = (*LEAN, *options("bodies.use=false", "calibration.use=false", "noise.localization=false"))
 MODES = ("fixed", "joint")
 SCRIPT = Path(sysconfig.get_path("scripts")) / "objslam"
 

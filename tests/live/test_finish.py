@@ -9,6 +9,7 @@ from mapping.hiding_drives import hiding_drive
 from mapping.test_checks import drive
 from mapping.test_depth_axis import driven, with_power
 from mapping.test_moved_camera import turned
+from quick import NOTHING_BESIDE
 from wrong_inputs import MISTAKES
 
 from objslam.config import load_settings
@@ -18,7 +19,7 @@ from objslam.live.session.session import Session
 from objslam.simulation import preset, simulate
 
 ODD, TIMES = 1, 4.0
-QUIET = ("output.recording=false",)
+QUIET = ("output.recording=false", *NOTHING_BESIDE)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,8 @@ def ended():
         return replace(found, odd=odd, times=np.where(odd, TIMES, found.times))
 
     find_misfits = finalize.find_misfits
-    session = feed(Session(load_settings(None, ("mode=joint",)), patient=True).start(), hiding_drive(0, frames=150))
+    settings = load_settings(None, ("mode=joint", "noise.localization=false", *NOTHING_BESIDE))
+    session = feed(Session(settings, patient=True).start(), hiding_drive(0, frames=150))
     with pytest.MonkeyPatch.context() as patch:
         for name in ("with_bodies", "with_box_offsets", "describe"):
             patch.setattr(finalize, name, noted(name))
@@ -73,7 +75,8 @@ def test_an_object_whose_rays_do_not_agree_has_a_larger_sigma(ended):
 def test_the_end_names_depths_that_are_distances_along_the_ray(power, words):
     """An offline run names them too (`test_depth_axis`)."""
     log = with_power(driven(localization=None), power)
-    result = feed(Session(load_settings(None, ("mode=joint", "bodies.use=false")), patient=True).start(), log).stop()
+    settings = load_settings(None, ("mode=joint", "bodies.use=false", *NOTHING_BESIDE))
+    result = feed(Session(settings, patient=True).start(), log).stop()
     assert [one["name"] for one in result.summary["wrong_input"]] == ["depth axis"] * bool(words)
     assert any(words in line for line in result.summary["warnings"]) or not words
 
@@ -81,7 +84,7 @@ def test_the_end_names_depths_that_are_distances_along_the_ray(power, words):
 @pytest.mark.long
 def test_the_end_trusts_no_object_of_a_camera_that_somebody_turned():
     log = simulate(preset("demo", frames=160, objects=12, classes=12, localization=None), 3)
-    settings = load_settings(None, ("mode=joint", "bodies.use=false", "live.search_from=0"))
+    settings = load_settings(None, ("mode=joint", "bodies.use=false", *NOTHING_BESIDE))
     for degrees, names in ((0.0, []), (10.0, ["camera moved"])):
         result = feed(Session(settings, patient=True).start(), turned(log, 0, degrees)).stop()
         assert [one["name"] for one in result.summary["wrong_input"]] == names

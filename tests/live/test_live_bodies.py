@@ -19,8 +19,8 @@ from objslam.live.bodies.request import BodyRequest
 from objslam.live.session.session import Session
 from objslam.live.worker import Worker
 
-ALONE = ("calibration.use=false", "checks.use=false")
-"""Bodies of a session depend on neither."""
+ALONE = ("calibration.use=false", "checks.use=false", "noise.localization=false", "live.search_from=0")
+"""Bodies of a session depend on none of these."""
 
 
 @pytest.fixture(scope="module")

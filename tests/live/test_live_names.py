@@ -91,7 +91,7 @@ def test_a_session_killed_after_a_judgement_goes_on_to_the_same_map(log, whole, 
 
 
 def test_two_things_of_one_label_are_two_objects_and_the_others_keep_their_names():
-    log = drive()
+    log = drive(frames=150, laps=1)
     (camera,) = log.cameras
     boxes = camera.detections
     place = {o.label: o.position for o in log.truth.objects}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from driving import feed
 from more_boxes import aside, left_parts, with_second_boxes
+from quick import NOTHING_BESIDE
 
 from objslam.config import Odometry, load_settings
 from objslam.evaluation.evaluate import evaluate
@@ -17,7 +18,7 @@ def test_second_boxes_of_things_make_no_objects_while_the_robot_drives(second):
     drive = simulate(preset("demo", frames=200, false=0.0, localization=None, odometry=Odometry()), 3)
     some = np.arange(0, len(drive.cameras[0].detections), 2)
     log = with_second_boxes(drive, some, second)
-    session = feed(Session(load_settings(None, ("mode=joint",)), patient=True).start(), log)
+    session = feed(Session(load_settings(None, ("mode=joint", *NOTHING_BESIDE)), patient=True).start(), log)
     found = evaluate(session.snapshot().map, drive.truth, align="se2").objects
     session.abort()
     assert len(found.matches) == len(drive.truth.objects)

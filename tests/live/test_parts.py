@@ -7,6 +7,7 @@ import pytest
 from driving import feed
 from hypothesis import given
 from hypothesis import strategies as st
+from quick import NOTHING_BESIDE
 
 from objslam.association.observations import Observations
 from objslam.association.refinement import information, normalised_residuals
@@ -237,7 +238,8 @@ def test_the_sizes_of_landmarks_are_those_of_their_things(sees_size):
     """The boxes of far and near things, from odometry that drifts: a session measures what the simulation drew."""
     camera = replace(make_camera(), sees_size=sees_size)
     drive = preset("demo", cameras=(camera,), frames=200, localization=None, laps=1.0)
-    session = feed(Session(load_settings(None, ("association.method=global",)), patient=True).start(), simulate(drive, 0))
+    settings = load_settings(None, ("association.method=global", *NOTHING_BESIDE))
+    session = feed(Session(settings, patient=True).start(), simulate(drive, 0))
     m = session._mapper.state
     assert len(m.landmarks) >= 10
     known = m.landmarks.sized >= 5

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from driving import feed
+from quick import NOTHING_BESIDE
 from test_session import make_log
 
 from objslam.config import Odometry, load_settings
@@ -97,7 +98,7 @@ def test_where_many_are_asked_for_the_limit_grows(monkeypatch):
 def test_a_session_ends_with_the_same_map_from_fewer_poses():
     """Only the poses between dropped keyframes go: the end estimates the errors of the robot from the rest."""
     log = make_log(seed=2, frames=200, laps=3.0, frame_rate=1.0, odometry_rate=4.0)
-    settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "live.max_keyframes=50"))
+    settings = load_settings(None, ("mode=joint", "rays.pixel_sigma=2", "live.max_keyframes=50", *NOTHING_BESIDE))
     session = feed(Session(settings, patient=True).start(), log)
     state = session._mapper.state
     table, stamps = state.course.driven, state.keyframes.stamp

@@ -166,9 +166,10 @@ def test_a_snapshot_shows_what_each_camera_saw_last(log):
     session.abort()
 
 
-def test_several_objects_of_a_label(tmp_path):
+def test_several_objects_of_a_label():
+    """By the session itself and at its end. The search beside a session has tests of its own (`test_reassociation`)."""
     log = simulate(preset("demo", frames=250), 1)
-    found = drive(log, ALL).stop().map.resolved()
+    found = drive(log).stop().map.resolved()
     true = [(o.label, o.position) for o in log.truth.objects]
     near = [min(np.linalg.norm(o.position - p) for label, p in true if label == o.label) for o in found]
     assert len(found) >= 11

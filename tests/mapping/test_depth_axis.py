@@ -31,7 +31,8 @@ def with_power(log, power):
 
 def found_in(log, mode):
     ledger = Ledger()
-    result = pipeline.run(log, load_settings(None, (f"mode={mode}", "output.recording=false", "bodies.use=false")), ledger)
+    less = "output.recording=false", "bodies.use=false", "noise.localization=false", "association.method=by_label"
+    result = pipeline.run(log, load_settings(None, (f"mode={mode}", *less)), ledger)
     return [one for one in result.summary["wrong_input"] if one["name"] == "depth axis"], ledger.warnings
 
 

@@ -38,7 +38,7 @@ def table(objects):
 @pytest.mark.parametrize(("mode", "path"), [("fixed", PoseNoise()), ("joint", None)])
 def test_the_camera_and_the_settings_tell_the_same(mode, path):
     plain, told = logs(localization=path)
-    settings = f"mode={mode}", "fixed.loss=huber", "output.recording=false", *HELD
+    settings = f"mode={mode}", "fixed.loss=huber", "output.recording=false", "association.method=by_label", *HELD
     by_camera = table(pipeline.run(told, load_settings(None, settings), Ledger()).map)
     by_settings = table(pipeline.run(plain, load_settings(None, (*settings, *IN_SETTINGS)), Ledger()).map)
     usual = table(pipeline.run(plain, load_settings(None, settings), Ledger()).map)

@@ -18,7 +18,7 @@ from objslam.io.rays_parquet import read_rays
 from objslam.io.views_parquet import read_views
 
 LATE = 0.08  # s, by which the stamps of the frames are too early.
-QUIET = {"mode": "joint", "output": {"recording": False, "picture": False}}
+QUIET = {"mode": "joint", "noise": {"localization": False}, "output": {"recording": False, "picture": False}}
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,7 @@ def test_boxes_of_the_right_distortion_are_not(distortion):
     assert not findings(drive.__wrapped__("fixed", cameras=(make_camera(distortion=distortion),)), "fixed")
 
 
+@pytest.mark.usefixtures("one_start")
 @pytest.mark.parametrize("name", ["boxes of rectified images", None])
 def test_with_odometry_alone_a_solve_with_the_other_lens_decides(name):
     log = drive("joint", seed=1)

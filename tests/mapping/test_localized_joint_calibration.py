@@ -20,7 +20,8 @@ TURNS, PLACE, LENS = (
     dict.fromkeys("xyz", 0.05),
     dict.fromkeys(("focal", "cx", "cy"), 0.02),
 )
-QUIET = ("mode=joint", "output.recording=false", "checks.use=false", "bodies.use=false")
+QUIET = ("mode=joint", "output.recording=false", "checks.use=false", "bodies.use=false", "noise.localization=false")
+"""The localisation has the noise of the settings."""
 PRIORS = {"clock": 0.1, **TURNS, **PLACE, **LENS}
 
 

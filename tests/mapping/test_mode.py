@@ -65,6 +65,9 @@ def test_from_plain_odometry_the_truth_lies_in_the_ellipsoids_of_the_default_mod
     assert inside("mode=fixed") < 0.5
 
 
+ALONE = ("output.recording=false", "bodies.use=false", "calibration.use=false")
+
+
 def metres_off() -> Log:
     """A drive at positions that err by 0.8 m for 20 s, as between houses."""
     room = {"objects": 6, "classes": 6, "frames": 150, "odometry": Odometry(), "pixel_sigma": 2.0}
@@ -82,7 +85,7 @@ def test_the_odometry_tells_that_a_localisation_errs_by_a_metre(monkeypatch):
     boxes, so the boxes do not tell."""
     without_boxes_that_tell(monkeypatch)
     log = metres_off()
-    result = pipeline.run(log, load_settings(None, ("output.recording=false", "bodies.use=false")), Ledger())
+    result = pipeline.run(log, load_settings(None, ALONE), Ledger())
     assert result.summary["mode"] == "joint"
     assert any("the odometry shows that the localisation errs" in said for said in result.summary["warnings"])
     found = evaluate(result.map, log.truth, align="none", radius=4.0).to_dict()
@@ -94,6 +97,6 @@ def test_odometry_of_another_time_costs_no_map(monkeypatch):
     without_boxes_that_tell(monkeypatch)
     log = metres_off()
     log = replace(log, odometry=Trajectory(log.odometry.stamps + 1e4, log.odometry.poses))
-    result = pipeline.run(log, load_settings(None, ("output.recording=false", "bodies.use=false")), Ledger())
+    result = pipeline.run(log, load_settings(None, ALONE), Ledger())
     assert result.summary["mode"] == "fixed"
     assert result.summary["assessment"]["level"] != "good"

@@ -84,7 +84,8 @@ def test_a_row_of_lockers_is_doubted_unless_labels_tell_them_apart(named):
 
 def test_a_session_doubts_such_a_row_too():
     log = hiding_drive(0, solids=aisle(np.random.default_rng(0)), plane=along_aisle())
-    session = feed(Session(load_settings(None, ("output.recording=false",)), patient=True).start(), log)
+    settings = load_settings(None, ("output.recording=false", "noise.localization=false"))  # It is that of the settings.
+    session = feed(Session(settings, patient=True).start(), log)
     result = session.stop()
     assert BACK in [one["name"] for one in result.summary["wrong_input"]]
     assert result.summary["assessment"]["level"] == "check"

@@ -18,8 +18,8 @@ from objslam.sources import read
 pytestmark = pytest.mark.long
 SETTINGS = Settings(output=Output(recording=False))
 """The defaults, without the steps of the solver that a recording would show."""
-UNCHECKED = load_settings(None, ("output.recording=false", "checks.use=false"))
-"""For the halves. The checks look at the whole log, which has the same input."""
+UNCHECKED = load_settings(None, ("output.recording=false", "checks.use=false", "bodies.use=false"))
+"""For the halves. The checks look at the whole log, which has the same input, and so do the bodies."""
 
 
 @pytest.fixture(scope="module")

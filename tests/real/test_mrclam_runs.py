@@ -77,11 +77,11 @@ def test_a_landmark_that_was_born_metres_off_does_not_bend_the_path(data_dir):
 def test_landmarks_without_names(data_dir):
     """Fifteen posts, in clusters 17 cm apart, all called the same: loops are closed by how they stand to each other.
 
-    In these 400 s, the robot sees 14 of them at least nine times. `tools/bench_recordings.py --parts unnamed` maps whole
+    In these 300 s, the robot sees 14 of them at least nine times. `tools/bench_recordings.py --parts unnamed` maps whole
     drives.
     """
     whole = read(data_dir / "mrclam_ds6", Ledger(), SourceOptions(robot=1, anonymous=True))
-    log = part(whole, 200.0, 600.0)
+    log = part(whole, 200.0, 500.0)
     result = pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false")), Ledger())
     stamps, first = np.unique(result.keyframes.stamps, return_index=True)
     path = Trajectory(stamps, result.map_T_base[first])
