@@ -47,6 +47,24 @@ def test_each_object_of_each_label_gets_a_point_and_its_rays(offset):
     np.testing.assert_allclose(fit[held], 1 - (across / allowed) ** 2, atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_things_of_a_row_have_points_though_many_rays_pass_a_far_one(seed):
+    """A robot drives along two rows of posts, and sees those ahead. All rays point along the rows, more or less."""
+    rng = np.random.default_rng(seed)
+    posts = np.array([(5.0 * k, y, 0.0) for k in range(12) for y in (-1.5, 1.5)]) + rng.normal(0, 0.05, (24, 3))
+    robot = np.column_stack([np.arange(-10.0, 55.0, 0.4), *rng.normal(0, 0.03, (2, 163))])
+    to = posts[None] - robot[:, None]
+    ahead = (to[..., 0] > np.abs(to[..., 1])) & (to[..., 0] < 14.0)
+    frame, owner = np.nonzero(ahead)
+    directions = to[ahead] / np.linalg.norm(to[ahead], axis=1, keepdims=True) + 0.004 * rng.normal(size=(len(frame), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    met = fit_points(robot[frame], directions, np.full(len(frame), 0.012), 0.05, np.zeros(len(frame), dtype=int), seed)
+    assert (met.point >= 0).mean() > 0.8
+    near = np.linalg.norm(met.points[:, None] - posts, axis=2).min(axis=0) < 0.3
+    assert near.mean() > 0.5
+    assert len(np.unique(owner)) == 24
+
+
 def test_other_labels_do_not_change_the_points_of_a_label():
     rng = np.random.default_rng(1)
     label = np.repeat(np.arange(40), rng.integers(4, 60, 40))

@@ -5,8 +5,8 @@ places.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -31,6 +31,10 @@ _MOST_POINTS = 40
 """The most points of one label. More points explain more boxes by chance."""
 _REFITS = 2
 """The number of least-squares fits to the rays of a point. More fits are more exact, and take longer."""
+_CANDIDATES = 8
+"""How many of the tried points, from the best on, may fail as seen from one direction before a label has no more points. The
+rays along a row of things all pass a far point, and the things of the row would not be found. A larger number finds points
+in longer rows, and takes longer."""
 _TABLE = 1 << 17
 """The most pairs of a tried point and a ray in one table. A larger table needs fewer passes, but leaves the processor's
 cache."""
@@ -76,6 +80,11 @@ class _Rows:
         at = np.arange(len(places))[:, None], places
         changed = self.number[at], real, self.origins[at], self.directions[at], self.tolerance[at]
         return type(self)(*changed, self.place, self.middle)
+
+    def labels(self, chosen: Ints) -> Self:
+        """Return the rows of some labels (C,)."""
+        taken: dict[str, Any] = {name: value[chosen] for name, value in vars(self).items() if name != "place"}
+        return replace(self, **taken)
 
     def fit(self, points: Floats) -> Floats:
         """Return how well each ray fits each point (L, P, N) of its label: 1 on the ray, 0 from the tolerance on.
@@ -187,16 +196,32 @@ def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
     many = size[:, None] > judges
     chosen = rows.some(np.where(many, drawn, column), column < size[:, None]) if many.any() else rows
     score = np.where(ahead, chosen.fit(points).sum(axis=2), -1.0)
-    best = np.take_along_axis(points, score.argmax(axis=1)[:, None, None], axis=1)[:, 0]
-    fit, good = rows.fit(best[:, None])[:, 0], ahead.any(axis=1)
+    order = np.argsort(-score, axis=1, kind="stable")[:, :_CANDIDATES]
+    point, gain, found = np.zeros((len(size), 3)), np.zeros(rows.real.shape), np.zeros(len(size), dtype=bool)
+    left = np.arange(len(size))  # The labels whose candidates so far were seen from one direction.
+    for k in range(order.shape[1]):
+        left = left[ahead[left, order[left, k]]]
+        if not len(left):
+            break
+        mine = rows if len(left) == len(size) else rows.labels(left)
+        best, fit, around = _refitted(mine, points[left, order[left, k]])
+        many = (fit > 0).sum(axis=1) >= _FEWEST
+        good = left[many & around]
+        point[good], gain[good], found[good] = best[many & around], fit[many & around], True
+        left = left[many & ~around]
+    return point, gain, found
+
+
+def _refitted(rows: _Rows, best: Floats) -> tuple[Floats, Floats, Bools]:
+    """Return points (L, 3) that are fitted to their rays from a start (L, 3), how well each ray fits them (L, N), and which
+    points (L,) were seen from around."""
+    fit = rows.fit(best[:, None])[:, 0]
     for _ in range(_REFITS):
-        good &= (fit > 0).sum(axis=1) >= _FEWEST
         moved = nearest_point(rows.origins, rows.directions, best, fit > 0)
         other = rows.fit(moved[:, None])[:, 0]
         better = other.sum(axis=1) > fit.sum(axis=1)
         best, fit = np.where(better[:, None], moved, best), np.where(better[:, None], other, fit)
-    good &= ((fit > 0).sum(axis=1) >= _FEWEST) & _seen_from_around(rows, best, fit > 0)
-    return best, fit, good
+    return best, fit, _seen_from_around(rows, best, fit > 0)
 
 
 def _nearly_parallel(rows: _Rows) -> Bools:
