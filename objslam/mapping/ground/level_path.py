@@ -6,6 +6,7 @@ would then be wrong by 0.3 m. A floor is level where the robot is level on avera
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +26,19 @@ def levelled(solution: Solution) -> Solution:
     if keyframes.localized_every or not is_planar(keyframes.map_T_base):
         return solution
     turn, origin = _to_level(estimate.map_T_base[:, :3, 2].mean(axis=0)), estimate.map_T_base[0, :3, 3]
-    poses = estimate.map_T_base.copy()
-    poses[:, :3, :3] = turn @ poses[:, :3, :3]
-    poses[:, :3, 3] = (poses[:, :3, 3] - origin) @ turn.T + origin
+
+    def placed(points: Any) -> Floats:
+        return np.asarray((points - origin) @ turn.T + origin)
+
+    def posed(poses: Floats) -> Floats:
+        turned = poses.copy()
+        turned[:, :3, :3], turned[:, :3, 3] = turn @ poses[:, :3, :3], placed(poses[:, :3, 3])
+        return turned
+
+    def spread(covariance: Floats) -> Floats:
+        turned = turn @ covariance @ turn.T
+        return (turned + turned.swapaxes(-1, -2)) / 2
+
     more, correlated, held = estimate.error_covariance, estimate.correlated, estimate.moved_by_held
     tags = {
         j: replace(
@@ -39,15 +50,22 @@ def levelled(solution: Solution) -> Solution:
     }
     found = replace(
         estimate,
-        map_T_base=poses,
-        positions=(estimate.positions - origin) @ turn.T + origin,
-        covariance=turn @ estimate.covariance @ turn.T,
-        error_covariance=None if more is None else turn @ more @ turn.T,
+        map_T_base=posed(estimate.map_T_base),
+        positions=placed(estimate.positions),
+        covariance=spread(estimate.covariance),
+        error_covariance=None if more is None else spread(more),
         correlated=None if correlated is None else turn @ correlated,
         moved_by_held=None if held is None else turn @ held,
         tags=tags,
     )
-    return replace(solution, estimate=found)
+    trace = []
+    for one in solution.trace:
+        steps = tuple(
+            replace(step, path=placed(step.path).astype(np.float32), positions=placed(step.positions).astype(np.float32))
+            for step in one.iterations
+        )
+        trace.append(replace(one, iterations=steps, map_T_base=posed(one.map_T_base), positions=placed(one.positions)))
+    return replace(solution, estimate=found, trace=tuple(trace))
 
 
 def _to_level(up: Floats) -> Floats:
