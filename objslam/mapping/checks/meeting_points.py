@@ -35,6 +35,9 @@ _CANDIDATES = 8
 """How many of the tried points, from the best on, may fail as seen from one direction before a label has no more points. The
 rays along a row of things all pass a far point, and the things of the row would not be found. A larger number finds points
 in longer rows, and takes longer."""
+_MANY = 100
+"""Other candidates are tried for labels with at least this number of rays left. A row of things has hundreds. Of fewer rays,
+some meet by chance, as those of a camera that somebody moved. With a smaller number, shorter rows are found."""
 _TABLE = 1 << 17
 """The most pairs of a tried point and a ray in one table. A larger table needs fewer passes, but leaves the processor's
 cache."""
@@ -208,7 +211,7 @@ def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
         many = (fit > 0).sum(axis=1) >= _FEWEST
         good = left[many & around]
         point[good], gain[good], found[good] = best[many & around], fit[many & around], True
-        left = left[many & ~around]
+        left = left[many & ~around & (size[left] >= _MANY)]
     return point, gain, found
 
 
