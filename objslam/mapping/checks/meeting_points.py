@@ -208,10 +208,10 @@ def _best_points(rows: _Rows, dice: Floats) -> tuple[Floats, Floats, Bools]:
             break
         mine = rows if len(left) == len(size) else rows.labels(left)
         best, fit, around = _refitted(mine, points[left, order[left, k]])
-        many = (fit > 0).sum(axis=1) >= _FEWEST
-        good = left[many & around]
-        point[good], gain[good], found[good] = best[many & around], fit[many & around], True
-        left = left[many & ~around & (size[left] >= _MANY)]
+        enough = (fit > 0).sum(axis=1) >= _FEWEST
+        good = left[enough & around]
+        point[good], gain[good], found[good] = best[enough & around], fit[enough & around], True
+        left = left[enough & ~around & (size[left] >= _MANY)]
     return point, gain, found
 
 
