@@ -23,6 +23,8 @@ ODOMETRY, TF, DETECTIONS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "v
 INFO, POSE = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/PoseWithCovarianceStamped"
 OPTICAL = "front_optical_frame"
 CAMERA = Camera("front", 640, 480, np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
+for array in (CAMERA.matrix, CAMERA.distortion, CAMERA.base_T_camera):
+    array.setflags(write=False)  # All tests share it.
 BOXES = [(100, 120, 140, 180, "cup", 0.9, "7"), (300, 200, 340, 260, "", 0.5, "left")]
 
 
@@ -421,3 +423,11 @@ def test_no_sequence_of_messages_breaks_it(maker, feed):
             robot.send(INFO, "/front/camera_info", message)
     for pose in [p for _, p, *_ in robot.sink.odometry + robot.sink.localization] + [p for _, _, p in robot.sink.mounts]:
         assert np.isfinite(pose).all()
+
+
+def test_a_message_that_a_test_spoils_leaves_the_camera_alone(maker):
+    camera = Camera("front", 640, 480, CAMERA.matrix.copy(), distortion=np.zeros(5))
+    message = maker.camera_info(ns(1.0), camera, OPTICAL)
+    message.k[0] = message.d[0] = 1e8
+    np.testing.assert_array_equal(camera.matrix, CAMERA.matrix)
+    assert not camera.distortion.any()

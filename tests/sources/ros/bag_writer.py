@@ -106,13 +106,13 @@ class Maker:
         return self.make("tf2_msgs/TFMessage", made)
 
     def camera_info(self, stamp, camera, frame, rotation=None, projection=None, binning=0, region=(0, 0, 0, 0)):
-        """region: x_offset, y_offset, height, width."""
+        """region: x_offset, y_offset, height, width. The message has its own arrays, so a test may spoil its numbers."""
         rotation = np.eye(3) if rotation is None else rotation
         projection = np.column_stack([camera.matrix, np.zeros(3)]) if projection is None else projection
         roi = self.make("sensor_msgs/RegionOfInterest", *region, False)
-        flat = [np.ascontiguousarray(m, dtype=np.float64).ravel() for m in (camera.matrix, rotation, projection)]
+        flat = [np.array(m, dtype=np.float64).ravel() for m in (camera.matrix, rotation, projection)]
         size = camera.height, camera.width, camera.distortion_model
-        numbers = np.asarray(camera.distortion, dtype=np.float64)
+        numbers = np.array(camera.distortion, dtype=np.float64)
         return self.make("sensor_msgs/CameraInfo", self.header(stamp, frame), *size, numbers, *flat, binning, binning, roi)
 
     def image(self, stamp, array, encoding, frame="", step=0, big_endian=False):
