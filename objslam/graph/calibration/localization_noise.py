@@ -44,13 +44,13 @@ _Noise = tuple[tuple[float, Lasting], tuple[float, Lasting]]
 """The factors on the noise of headings and places, and their lasting parts."""
 
 
-def noise_of_localization(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
+def noise_of_localization(rest: Linearised, errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
     """Return `errors.noise` with the noise of the localisation that agrees best with the rest of a graph at its values.
 
-    Factors are at least 1. They are 1 if the log agrees with the settings. theta: (P,) the shared errors. SolveError if the
-    graph without its localisation is singular.
+    Factors are at least 1. They are 1 if the log agrees with the settings. rest: the graph, `without_localization`. theta:
+    (P,) the shared errors. SolveError if the rest is singular.
     """
-    (heading, turned), (place, shifted) = _noise_in(_compared(of, errors, theta))
+    (heading, turned), (place, shifted) = _noise_in(_compared(rest, errors, theta))
     return replace(
         errors.noise,
         heading=heading,
@@ -99,18 +99,17 @@ def _without_jumps(data: ComparedPoses, model: PoseErrors) -> Ints:
     return near if len(near) >= (1 - _MOST_STRAYS) * n else np.arange(n)
 
 
-def _compared(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> ComparedPoses:
-    """Return the localisation against a prediction by all other measurements."""
-    loose = without_localization(of)
-    system, keyframes, nominal = linearise(loose, errors, theta), loose.measured.keyframes, errors.settings.localization
+def _compared(rest: Linearised, errors: CalibratedMeasurements, theta: Floats) -> ComparedPoses:
+    """Return the localisation against a prediction by the rest of the graph, `without_localization`."""
+    system, keyframes, nominal = linearise(rest, errors, theta), rest.measured.keyframes, errors.settings.localization
     poses = _poses(keyframes)
-    map_T_base = (of.map_T_camera @ inverse(keyframes.base_T_camera))[poses]
+    map_T_base = (rest.map_T_camera @ inverse(keyframes.base_T_camera))[poses]
     apart = inverse(keyframes.map_T_base[poses]) @ map_T_base
     place = map_T_base[:, :2, 3] - keyframes.map_T_base[poses, :2, 3]
     off = np.concatenate([np.arctan2(apart[:, 1, 0], apart[:, 0, 0]), place.T.ravel()])
     by_twist = adjoint(keyframes.base_T_camera[poses])
     by_twist = np.concatenate([by_twist[:, 2:3], map_T_base[:, :2, :3] @ by_twist[:, 3:]], axis=1)  # (n, 3, 6)
-    columns = 3 * len(of.landmarks) + 6 * poses[:, None] + np.arange(6)
+    columns = 3 * len(rest.landmarks) + 6 * poses[:, None] + np.arange(6)
     select = np.zeros((system.jacobian.shape[1], 3 * len(poses)))
     for part in range(3):
         for axis in range(6):

@@ -8,7 +8,7 @@ from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
-from objslam.graph.calibration.localization_noise import noise_of_localization
+from objslam.graph.calibration.localization_noise import noise_of_localization, without_localization
 from objslam.graph.multiframes import Multiframes
 
 
@@ -23,6 +23,6 @@ def noise_of_paths(errors: CalibratedMeasurements, theta: np.ndarray) -> NoiseFa
     used = np.zeros(len(rays), dtype=bool)
     paths = Linearised(measured, nothing, measured.keyframes.map_T_camera, np.zeros((0, 3)), used)
     try:
-        return noise_of_localization(paths, errors, theta)
+        return noise_of_localization(without_localization(paths), errors, theta)
     except SolveError:
         return errors.noise

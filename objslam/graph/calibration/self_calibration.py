@@ -97,8 +97,6 @@ def calibrate(
     state, theta, steps = at.state, at.theta, at.steps
     for _ in range(_NOISE_ROUNDS if errors.unknown_noise else 0):
         noise = _noise_of_measurements(fit, state, at.system, theta)
-        if "localization" in errors.unknown_noise:
-            noise = noise_of_localization(state, fit.errors.with_noise(noise), theta)
         before, same = fit.errors.noise, noise.like(fit.errors.noise, _SAME_NOISE)
         other = replace(fit, errors=fit.errors.with_noise(noise))
         settled = other.remeasured(state, theta)
@@ -156,16 +154,20 @@ def misfit_at_shared_errors(
 
 
 def _noise_of_measurements(fit: _Fit, state: InnerSolve, system: LinearSystem, theta: Floats) -> NoiseFactors:
-    """Return the noise of rays, ranges and odometry. system: of the state, at the shared errors theta (P,).
+    """Return the noise of all kinds of measurements. system: of the state, at the shared errors theta (P,).
 
-    If the noise of the localisation is unknown too, a graph without it shows theirs. In a graph with it, poses that err for
-    seconds would look like noise of the rays, and rays that seem noisy would hide how much the poses err.
+    If the noise of the localisation is unknown too, a graph without it shows that of the others. In a graph with it, poses
+    that err for seconds would look like noise of the rays, and rays that seem noisy would hide how much the poses err.
     """
     errors, prior = fit.errors, fit.prior_residuals
+    if "localization" not in errors.unknown_noise:
+        return estimate_noise(state, system, errors, theta, prior)
+    rest = without_localization(state)  # Made once, because its normal equations take long.
     if errors.unknown_noise > {"localization"}:
-        rest = without_localization(state)
-        return estimate_noise(rest, linearise(rest, errors, theta), errors, theta, prior)
-    return estimate_noise(state, system, errors, theta, prior)
+        noise = estimate_noise(rest, linearise(rest, errors, theta), errors, theta, prior)
+    else:
+        noise = estimate_noise(state, system, errors, theta, prior)
+    return noise_of_localization(rest, errors.with_noise(noise), theta)
 
 
 @dataclass(frozen=True)
