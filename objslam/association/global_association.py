@@ -15,11 +15,12 @@ from objslam.association.crossings.ghost_pairs import replace_ghosts
 from objslam.association.crossings.one_or_two import find_crossings, without_smaller_bundles
 from objslam.association.existence import beyond_chance, existence, rest_odds
 from objslam.association.gating import alternate, gate_limit, near, size_costs
-from objslam.association.hypothesis_search import Search, discover
+from objslam.association.hypothesis_search import WRONG_RANGE, Search, discover
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import better_neighbours, merge_targets
 from objslam.association.observations import PosedRays, observe
+from objslam.association.refinement import right_by_chance
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import lengths
@@ -124,12 +125,18 @@ def associate_globally(
 def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bools, State]:
     """Search for landmarks, and drop unlikely ones, until a search finds none. excluded: landmarks that must not be found.
 
+    If there are ranges at localised poses, a ray with a wrong range first supports no point at all. A robot that passes a
+    row of equal things sees one after the other in the same direction. These rays meet far away, at a point that has more
+    rays than each thing, and no range confirms it. Once nothing more is found, wrong ranges only lower the support. At
+    poses that drift, a right range may seem wrong on a later visit, so wrong ranges only lower the support there.
+
     Also returns the rays (R,) that belonged to a dropped landmark, and the landmarks that seemed to move, with their rays.
     """
     refuted, moving = np.zeros(len(state.matched), dtype=bool), state.keep(np.zeros(state.count, dtype=bool))
+    share = 1.0 if state.view.localized and np.isfinite(state.obs.range).any() else WRONG_RANGE
     for turn in range(_TURNS):
         before = state.count
-        state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded), 2)
+        state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded, share), 2)
         state = _merge_round(task, learned(state.keep(beyond_chance(state, task.gate, _CHANCE_ODDS))))
         likely = existence(state, task.gate)
         moving = moving.joined(state.keep(_seems_to_move(task, state, likely)))
@@ -137,7 +144,9 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
         refuted |= (state.matched >= 0) & (kept.matched < 0)
         state = kept
         if state.count <= before:
-            break
+            if share == WRONG_RANGE:
+                break
+            share = WRONG_RANGE
     return state, refuted, moving
 
 
@@ -163,9 +172,16 @@ def _at_rest(task: _Task, state: State, refuted: Bools, moving: State) -> tuple[
     return state, (refuted | more) & (state.matched < 0)
 
 
-def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: Landmarks | None = None) -> State:
+def _discover(
+    task: _Task,
+    state: State,
+    turn: int,
+    parallax: float,
+    excluded: Landmarks | None = None,
+    wrong_range: float = WRONG_RANGE,
+) -> State:
     """Add landmarks where unassigned rays of one label agree. turn: the number of the search, which changes the random
-    pairs. parallax: as in `Search`. excluded: landmarks that must not be found."""
+    pairs. parallax, wrong_range: as in `Search`. excluded: landmarks that must not be found."""
     obs, noise, landmarks = state.obs, state.class_noise, state.landmarks
     for label in np.flatnonzero(state.unassigned).tolist():
         free = np.flatnonzero((obs.label == label) & (state.matched < 0))
@@ -181,8 +197,10 @@ def _discover(task: _Task, state: State, turn: int, parallax: float, excluded: L
         pool = obs.take(free).noisier(noise[label])
         # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
         chance = np.pi * task.gate * float((pool.sigma**2).sum()) / (state.view.solid_angle * obs.scale)
+        if wrong_range == 1.0:  # Most strays do not count then, because their ranges are wrong for the point.
+            chance *= float(right_by_chance(pool).mean())
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
-        search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device)
+        search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device, wrong_range)
         points = discover(pool, search, rng, None if excluded is None else excluded.position[excluded.accepts[:, label]])
         new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
         landmarks = landmarks.and_also(new) if len(points) else landmarks

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
+from objslam.association.refinement import RANGE_LIMIT
 from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, as_tensor, module_of
 from objslam.core.arrays import Floats, Ints
 
@@ -23,8 +24,9 @@ _SAME = 0.6
 """A point is the same as an excluded one if the rays that support both give it at least this share of its support. With a
 larger share, more points near an excluded one are found."""
 _SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precision. Beyond it, millimetres would be lost.
-_RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
-_RANGE_SHARE = 0.6  # The share of a ray's support that a wrong range takes away. A larger value trusts ranges more.
+WRONG_RANGE = 0.6
+"""The share of a ray's support that a wrong range takes away, unless `Search.wrong_range` says otherwise. A larger value
+trusts ranges more."""
 _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays without parallax.
 
 
@@ -33,13 +35,14 @@ class Search:
     """The settings of a search. hypotheses: the most tried points where two rays meet. The ends of ranges and points along
     single rays come in addition. support: least support of a point. gate: largest squared deviation of a ray that supports a
     point. parallax: least angle (rad) between the rays of a pair. With 0, distances along single rays are tried too. device:
-    the setting `triangulation.device`."""
+    the setting `triangulation.device`. wrong_range: the share of a ray's support that a wrong range takes away."""
 
     hypotheses: int
     support: float
     gate: float
     parallax: float
     device: str
+    wrong_range: float = WRONG_RANGE
 
 
 def discover(obs: Observations, search: Search, rng: np.random.Generator, excluded: Floats | None = None) -> Floats:
@@ -145,12 +148,12 @@ class _Scorer:
         across = np.eye(3) - n[:, :, None] * n[:, None, :]
         self.across = self._tensor(across.reshape(-1, 9))
         self.foot = self._tensor((across @ origin[:, :, None])[:, :, 0])
-        self.range, self.doubt = None, 0.0
+        self.range, self.doubt, self.wrong = None, 0.0, search.wrong_range
         ranged = np.isfinite(obs.range)
         if ranged.any():
             precision = np.where(ranged, 1 / obs.range_sigma, 0.0)
             self.range = self._tensor(np.where(ranged, obs.range, 0.0)), self._tensor(precision)
-            self.doubt = 1 - _RANGE_SHARE  # A ray with less support may have a wrong range, or see an object behind.
+            self.doubt = 1 - WRONG_RANGE  # A ray with less support may have a wrong range, or see an object behind.
 
     def _tensor(self, values: Floats) -> Tensor:
         return as_tensor(np.ascontiguousarray(values, dtype=self.dtype), self.backend)
@@ -176,9 +179,9 @@ class _Scorer:
             part /= depth2
             xp.clip(1 - part, 0.0, 1.0, out=part)
             if self.range is not None:
-                wrong = (depth - self.range[0]) * (self.range[1] / _RANGE_LIMIT)
+                wrong = (depth - self.range[0]) * (self.range[1] / RANGE_LIMIT)
                 wrong *= wrong
-                part *= 1 - (_RANGE_SHARE * wrong).clip(max=_RANGE_SHARE)
+                part *= 1 - (self.wrong * wrong).clip(max=self.wrong)
         return out
 
     def per_frame(self, support: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ RANGE_LOSS = 4.0
 value, more correct boxes are lost."""
 BEHIND = 1e6
 """The deviation, in standard deviations, of a point behind the camera: large, but finite."""
+RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
 _DAMPING = 1e-6
 """The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
@@ -76,6 +77,16 @@ def range_costs(
     with np.errstate(invalid="ignore"):
         wrong = (distance - measured) ** 2 / (obs.range_sigma[of] ** 2 + variance_along) - RANGE_GAIN
     return np.where(np.isfinite(wrong), np.minimum(wrong, RANGE_LOSS), 0.0)
+
+
+def right_by_chance(obs: Observations) -> Floats:
+    """Return for each ray the probability (R,) that its range is right for a point at the distance of another ray's range.
+    It is 1 for a ray without a range."""
+    known = np.isfinite(obs.range)
+    distance, width, share = obs.range[known], RANGE_LIMIT * obs.range_sigma[known], np.ones(len(obs))
+    first, last = np.searchsorted(np.sort(distance), [distance - width, distance + width])
+    share[known] = (last - first) / max(len(distance), 1)
+    return share
 
 
 def ray_costs(obs: Observations, position: Floats, noise: Floats | float, gate: float) -> Floats:
