@@ -144,6 +144,12 @@ def test_depths_that_do_not_tell_the_scale_are_not_asked_for() -> None:
     )
 
 
+@pytest.mark.parametrize("change", [{"poses": 9.0}, {"odometry": 2.5, "several": True, "scale": 0.02}])
+def test_depths_are_asked_for_only_if_there_are_none(change: dict[str, object]) -> None:
+    assert "Depths would show it" in str(assess(replace(GOOD, **change)))
+    assert "Depths would show it" not in str(assess(replace(GOOD, **change, depths=True)))
+
+
 @pytest.mark.parametrize("depth", [False, True])
 def test_boxes_without_depth_do_not_tell_the_scale(depth: bool) -> None:
     """A map and its path can be stretched together, and no box moves. A depth changes."""

@@ -14,7 +14,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import lift_se2
 from objslam.live.session.session import Session
 from objslam.mapping import pipeline
-from objslam.mapping.moves.near_sides import BACK, moves_back, shift_ahead
+from objslam.mapping.moves.near_sides import BACK, check_rows, moves_back, shift_ahead
 
 QUIET = ("output.recording=false", "mode=joint")
 
@@ -67,6 +67,21 @@ def test_small_and_unsteady_shifts_are_not_clear():
     assert not moves_back((0.2, 0.03), settings)
     assert not moves_back((-0.2, 0.15), settings)
     assert not moves_back((-1.5 * settings.localization.xy, 0.001), settings)
+
+
+@pytest.mark.parametrize("ranged", [False, True])
+def test_rays_with_ranges_do_not_count_for_a_neighbour(ranged):
+    keyframes = way()
+    keyframes.localized_every = 1.0
+    back = keyframes.map_T_base.copy()
+    back[:, :3, 3] -= 0.2 * back[:, :3, 0]
+    estimate = SimpleNamespace(
+        map_T_base=back, covariance=np.zeros((2, 3, 3)), calibration=None, weight=np.array([1.0, 1.0, 1.0, 0.0])
+    )
+    association = SimpleNamespace(label=np.zeros(2, dtype=int), object=np.array([0, 0, 1, -1]))
+    rays = SimpleNamespace(range=np.array([1.0, 2.0, np.nan, np.nan]) if ranged else np.full(4, np.nan))
+    solution = SimpleNamespace(keyframes=keyframes, estimate=estimate, association=association, rays=rays)
+    assert (check_rows(solution, ("front",), load_settings(None)) is None) == ranged
 
 
 @pytest.mark.parametrize("named", [False, True])

@@ -267,7 +267,7 @@ def _check(e: Evidence) -> list[str]:
     if not e.fixed and e.poses >= _LOOSE_POSES:
         found.append(
             f"The boxes agree only if the localisation is {e.poses:.0f} times as noisy as the settings say: it may be, or "
-            "boxes of equal things that hide each other bend the path. Depths would show it."
+            "boxes of equal things that hide each other bend the path." + _depths_would_show(e)
         )
     found += lost_input(e.unused, e.malformed, e.frames)
     if e.boxes and e.off_path > _OFF_PATH * e.boxes:
@@ -278,8 +278,8 @@ def _check(e: Evidence) -> list[str]:
     if _may_be_bent(e):
         found.append(
             f"The boxes agree only if the odometry is {e.odometry:.1f} times as noisy as the settings say, and labels do "
-            "not tell which box shows which object. So the path may be bent, and an object may be two things. Depths would "
-            "show it."
+            "not tell which box shows which object. So the path may be bent, and an object may be two things."
+            + _depths_would_show(e)
         )
     if e.unsettled:
         found.append(
@@ -326,6 +326,11 @@ def _check(e: Evidence) -> list[str]:
 
 def _cut_off(e: Evidence) -> str:
     return f"{100 * e.cut / e.boxes:.0f} % of the boxes were dropped, because the image's edge cuts them off."
+
+
+def _depths_would_show(e: Evidence) -> str:
+    """Return the advice to add depths, if the log has none."""
+    return "" if e.depths else " Depths would show it."
 
 
 def _may_be_bent(e: Evidence) -> bool:

@@ -29,6 +29,9 @@ _CLEAR = 2.0
 """A shift is clear if it is at least this many standard deviations, and at least this multiple of `localization.xy`. With a
 larger number, fewer maps are doubted. In simulations of rows, wrong maps have shifts of -5 to -75 cm at 2.4 to 20 standard
 deviations, and right maps have 4 to 19 cm ahead. Other maps have -5 to 2 cm, and recorded robots -2 to 2 cm."""
+_RANGED = 0.5
+"""The share of the used rays with ranges from which they tell a row apart, because a ray of a neighbour has another range. A
+larger share doubts more maps with ranges. Logs have ranges for nearly all boxes or for none."""
 BACK = "rows of equal things that may be off by half their spacing"
 """The name of the finding that a solve moved the cameras back."""
 
@@ -59,8 +62,14 @@ def moves_back(shift: tuple[float, float], settings: Settings) -> bool:
 
 
 def check_rows(solution: Solution, cameras: tuple[str, ...], settings: Settings) -> Finding | None:
-    """Return a finding if a joint solve at localised poses moved the cameras back, and labels have several objects."""
+    """Return a finding if a joint solve at localised poses moved the cameras back, and labels have several objects.
+
+    None if most rays have ranges, which show a neighbour. Then cameras also move back because ranges are too long.
+    """
     keyframes, estimate, association = solution.keyframes, solution.estimate, solution.association
+    used = (estimate.weight > 0) & (association.object >= 0)
+    if used.any() and np.isfinite(solution.rays.range[used]).mean() >= _RANGED:
+        return None
     number = np.bincount(association.label[np.isfinite(estimate.covariance[:, 0, 0])])
     if not keyframes.localized_every or number.max(initial=0) < 2:
         return None
