@@ -15,11 +15,11 @@ from objslam.association.crossings.ghost_pairs import replace_ghosts
 from objslam.association.crossings.one_or_two import find_crossings, without_smaller_bundles
 from objslam.association.existence import beyond_chance, existence, rest_odds
 from objslam.association.gating import alternate, gate_limit, near, size_costs
-from objslam.association.hypothesis_search import WRONG_RANGE, Search, discover
+from objslam.association.hypothesis_search import WRONG_RANGE, Search, discover, ranged_by_size
 from objslam.association.label_fusion import fused_labels
 from objslam.association.landmarks import Landmarks, State
 from objslam.association.merging import better_neighbours, merge_targets
-from objslam.association.observations import PosedRays, observe
+from objslam.association.observations import Observations, PosedRays, observe
 from objslam.association.refinement import right_by_chance
 from objslam.association.visibility import frames_of
 from objslam.core.arrays import Bools, Floats, Ints
@@ -57,12 +57,14 @@ _PARALLAX = np.radians(2.0)  # The least angle (rad) between the rays of a pair.
 @dataclass(frozen=True)
 class _Task:
     """The constants of one association. gate: the largest squared deviation of a match. device: the setting
-    `triangulation.device`. seed: the seed of the random ray pairs."""
+    `triangulation.device`. seed: the seed of the random ray pairs. ranged: the rays with the ranges that count in the
+    first searches."""
 
     gate: float
     settings: config.AssociationSettings
     device: str
     seed: int
+    ranged: Observations
 
 
 def associate_globally(
@@ -90,7 +92,10 @@ def associate_globally(
     view = frames_of(keyframes, keyframe, cameras, of.map_T_camera, settings, drifts=drifts, cut=rays.cut)
     nothing = Landmarks.none(len(rays.label_names))
     state = State(obs, view, nothing, np.full(len(ray), -1, dtype=np.int64))
-    task = _Task(gate_limit(settings.association.gate), settings.association, settings.triangulation.device, seed)
+    sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
+    gate = gate_limit(settings.association.gate)
+    ranged = ranged_by_size(obs, sized, gate, _PARALLAX, seed) if view.localized else obs
+    task = _Task(gate, settings.association, settings.triangulation.device, seed, ranged)
     if guess is not None:
         association, position = guess
         known = flattened_points(position, of.scale), np.ones(len(position)), association.label
@@ -101,7 +106,6 @@ def associate_globally(
         state, refuted = _at_rest(task, state, refuted, moving)
     state, likely, dropped = _merged_and_dropped(task, _add_distant(task, state))
     refuted |= dropped
-    sized = np.array([c.sees_size for c in cameras])[keyframes.camera[rays.keyframe[ray]]]
     if solved or keyframes.localized_every:  # At poses that drift, the rays of one thing fall into bundles that do not meet.
         for repair in (_without_crossings, _without_ghosts):
             state, likely, dropped = repair(task, state, likely, sized)
@@ -127,13 +131,14 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
 
     If there are ranges at localised poses, a ray with a wrong range first supports no point at all. A robot that passes a
     row of equal things sees one after the other in the same direction. These rays meet far away, at a point that has more
-    rays than each thing, and no range confirms it. Once nothing more is found, wrong ranges only lower the support. At
-    poses that drift, a right range may seem wrong on a later visit, so wrong ranges only lower the support there.
+    rays than each thing, and no range confirms it. Where ranges are missing, `ranged_by_size` may show them. Once nothing
+    more is found, wrong ranges only lower the support. At poses that drift, a right range may seem wrong on a later visit,
+    so wrong ranges only lower the support there.
 
     Also returns the rays (R,) that belonged to a dropped landmark, and the landmarks that seemed to move, with their rays.
     """
     refuted, moving = np.zeros(len(state.matched), dtype=bool), state.keep(np.zeros(state.count, dtype=bool))
-    share = 1.0 if state.view.localized and np.isfinite(state.obs.range).any() else WRONG_RANGE
+    share = 1.0 if state.view.localized and np.isfinite(task.ranged.range).any() else WRONG_RANGE
     for turn in range(_TURNS):
         before = state.count
         state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded, share), 2)
@@ -194,14 +199,16 @@ def _discover(
             free = free[np.isin(obs.frame[free], some)]
         if len(free) > _MOST_RAYS:
             free = np.sort(rng.permutation(free)[:_MOST_RAYS])
-        pool = obs.take(free).noisier(noise[label])
+        pool, judged = obs.take(free).noisier(noise[label]), None
         # About `chance` stray rays pass any point within the gate, and each supports it by 0.5 on average.
         chance = np.pi * task.gate * float((pool.sigma**2).sum()) / (state.view.solid_angle * obs.scale)
         if wrong_range == 1.0:  # Most strays do not count then, because their ranges are wrong for the point.
-            chance *= float(right_by_chance(pool).mean())
+            judged = task.ranged.take(free).noisier(noise[label])
+            chance *= float(right_by_chance(judged).mean())
         support = max(_MIN_SUPPORT, 0.5 * (chance + _ABOVE_CHANCE * np.sqrt(chance)))
         search = Search(task.settings.hypotheses, support, task.gate, parallax, task.device, wrong_range)
-        points = discover(pool, search, rng, None if excluded is None else excluded.position[excluded.accepts[:, label]])
+        known = None if excluded is None else excluded.position[excluded.accepts[:, label]]
+        points = discover(pool, search, rng, known, judged)
         new = Landmarks.new(points, np.full(len(points), noise[label]), np.full(len(points), label), len(noise))
         landmarks = landmarks.and_also(new) if len(points) else landmarks
     return state if landmarks is state.landmarks else replace(state, landmarks=landmarks)

@@ -1,13 +1,13 @@
 """Search for points on which many rays of one label agree, from pairs of rays."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.association.observations import MIN_DEPTH, Observations, closest_approach
+from objslam.association.observations import MIN_DEPTH, SIZE_SPREAD, Observations, closest_approach
 from objslam.association.refinement import RANGE_LIMIT
 from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, as_tensor, module_of
-from objslam.core.arrays import Floats, Ints
+from objslam.core.arrays import Bools, Floats, Ints
 
 _PAIRS_AT_ONCE = {"numpy": 1 << 16, "cpu": 1 << 16, "cuda": 1 << 24}
 """The most pairs of a ray and a point scored together, for each backend. On a CPU they fit into the cache. On CUDA, fewer
@@ -27,6 +27,20 @@ _SINGLE_EXTENT = 30.0  # The largest extent (m) of the origins for single precis
 WRONG_RANGE = 0.6
 """The share of a ray's support that a wrong range takes away, unless `Search.wrong_range` says otherwise. A larger value
 trusts ranges more."""
+_SIZE_PAIRS = 4000
+"""The number of pairs of rays drawn to find the usual size of a label. With a larger number, it is more exact and takes more
+time."""
+_SAME_SIZE = 0.25
+"""Two boxes show the same size if ln size differs by less than this. With a larger value, the usual size is less exact."""
+_USUAL = 0.2
+"""The least share of the pairs of meeting rays that show the usual size of a label. In simulated rows of equal things the
+share was 0.24 to 0.31. With a larger share, fewer labels have a usual size."""
+_LARGER = 1 + RANGE_LIMIT * SIZE_SPREAD
+"""A pair of rays that shows more than this times the usual size meets too far away. With a larger value, farther points
+count as the thing."""
+_BEYOND = 0.2
+"""The least share of the pairs of meeting rays that meet too far away, from which sizes count. This share was 0.28 to 0.34
+in simulated rows of equal things, and at most 0.12 in rooms. With a larger share, sizes count in fewer logs."""
 _LADDER = (0.7, 1.0, 1.5, 2.2, 3.3, 5.0, 7.5, 11.0)  # The distances (m) tried along rays without parallax.
 
 
@@ -45,18 +59,66 @@ class Search:
     wrong_range: float = WRONG_RANGE
 
 
-def discover(obs: Observations, search: Search, rng: np.random.Generator, excluded: Floats | None = None) -> Floats:
+def ranged_by_size(obs: Observations, sized: Bools, gate: float, parallax: float, seed: int) -> Observations:
+    """Return the rays with ranges that the sizes of boxes show, where no range is known and many rays meet too far away.
+
+    The size of a box times the distance of the thing is similar for all things of a label. Where rays to several things meet
+    far away, the boxes show a larger thing. sized: (R,) whether the box of each ray shows a size. gate, parallax: as in
+    `Search`. seed: the seed of the random pairs.
+    """
+    sized = sized & (obs.size > 0).all(axis=1)
+    away, sigma = obs.range.copy(), obs.range_sigma.copy()
+    for label in np.unique(obs.label[sized & ~np.isfinite(away)]).tolist():
+        rays = np.flatnonzero(sized & (obs.label == label))
+        usual = _usual_size(obs.take(rays), gate, parallax, np.random.default_rng([seed, label]))
+        if usual is not None:
+            rays = rays[~np.isfinite(away[rays])]
+            away[rays] = usual[1] / obs.size[rays, usual[0]]
+            sigma[rays] = SIZE_SPREAD * away[rays]
+    return replace(obs, range=away, range_sigma=sigma)
+
+
+def _usual_size(obs: Observations, gate: float, parallax: float, rng: np.random.Generator) -> tuple[int, float] | None:
+    """Return the usual size (m) of the things of one label, after its side: 0 for the width and 1 for the height.
+
+    More pairs of meeting rays show this size than any other. The side counts on which more pairs agree, because one of the
+    two may change with the view. The result is None if too few pairs show one size, or if few pairs meet so far away that
+    they show a much larger thing.
+    """
+    first, second = _draw(obs, _SIZE_PAIRS, rng)
+    meet, depth1, depth2, _ = _meeting(obs, first, second, gate, parallax)
+    one, two = (np.log(obs.size[i[meet]] * depth[meet, None]) for i, depth in ((first, depth1), (second, depth2)))
+    middle, best, least = (one + two) / 2, None, _USUAL * len(one)
+    for side in (0, 1):
+        shown = np.sort(middle[np.abs(one - two)[:, side] < _SAME_SIZE, side])
+        begin, end = np.searchsorted(shown, [shown - _SAME_SIZE / 2, shown + _SAME_SIZE / 2])
+        if len(shown) and (end - begin).max() >= least:
+            top, least = (end - begin).argmax(), (end - begin).max()
+            best = side, float(shown[begin[top] : end[top]].mean())
+    if best is None or (middle[:, best[0]] > best[1] + np.log(_LARGER)).mean() < _BEYOND:
+        return None
+    return best[0], float(np.exp(best[1]))
+
+
+def discover(
+    obs: Observations,
+    search: Search,
+    rng: np.random.Generator,
+    excluded: Floats | None = None,
+    judged: Observations | None = None,
+) -> Floats:
     """Return the points (N, 3) m on which rays of one label agree. The point with the most support comes first.
 
     Each hypothesis is scored against all rays at once. In each frame only the best ray counts: 1 for a perfect fit, 0 at the
     gate. The support of a point excludes the rays of better points. excluded: (M, 3) m, points that must not be
-    found.
+    found. judged: the rays with the ranges that support is judged by, if these differ from the ranges that propose points.
     """
     points = _propose(obs, search, rng)
     if len(points) == 0:
         return points
     with array_backend(search.device, len(points) * len(obs) >= _LARGE) as backend:
-        return _best(_Scorer(obs, search, backend), points, search, np.zeros((0, 3)) if excluded is None else excluded)
+        scorer = _Scorer(obs if judged is None else judged, search, backend)
+        return _best(scorer, points, search, np.zeros((0, 3)) if excluded is None else excluded)
 
 
 def _best(scorer: "_Scorer", points: Floats, search: Search, excluded: Floats) -> Floats:
@@ -87,11 +149,9 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
     points along single rays too."""
     n = len(obs)
     # If there are fewer pairs than hypotheses, each pair is tried once. This is both faster and complete.
-    first, second = np.triu_indices(n, 1) if n * (n - 1) // 2 <= search.hypotheses else _draw(obs, search, rng)
-    depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
-    limit = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2
-    meet = (depth1 > MIN_DEPTH) & (depth2 > MIN_DEPTH) & (apart2 <= search.gate * limit)
-    meet &= (obs.frame[first] != obs.frame[second]) & (sin2 >= max(np.sin(search.parallax), 1e-3) ** 2)
+    few, draws = n * (n - 1) // 2 <= search.hypotheses, _DRAWS_EACH * search.hypotheses
+    first, second = np.triu_indices(n, 1) if few else _draw(obs, draws, rng)
+    meet, _, _, middle = _meeting(obs, first, second, search.gate, search.parallax)
     points = [middle[meet][: search.hypotheses]]
     ranged = np.flatnonzero(np.isfinite(obs.range))
     if len(ranged):
@@ -104,13 +164,25 @@ def _propose(obs: Observations, search: Search, rng: np.random.Generator) -> Flo
     return np.concatenate(points)
 
 
-def _draw(obs: Observations, search: Search, rng: np.random.Generator) -> tuple[Ints, Ints]:
-    """Draw `_DRAWS_EACH` pairs of rays for each hypothesis, and return their indices.
+def _meeting(
+    obs: Observations, first: Ints, second: Ints, gate: float, parallax: float
+) -> tuple[Bools, Floats, Floats, Floats]:
+    """Return which pairs (P,) of rays of different frames meet, the distances (P,) m along both rays, and the midpoints
+    (P, 3) m. gate, parallax: as in `Search`."""
+    depth1, depth2, middle, apart2, sin2 = closest_approach(obs, first, second)
+    limit = (obs.sigma[first] * depth1) ** 2 + (obs.sigma[second] * depth2) ** 2 + 2 * obs.position_sigma**2
+    meet = (depth1 > MIN_DEPTH) & (depth2 > MIN_DEPTH) & (apart2 <= gate * limit)
+    meet &= (obs.frame[first] != obs.frame[second]) & (sin2 >= max(np.sin(parallax), 1e-3) ** 2)
+    return meet, depth1, depth2, middle
+
+
+def _draw(obs: Observations, count: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
+    """Draw `count` pairs of rays, and return their indices. Some have only one ray, and drop out.
 
     If the first ray has a track, the second ray has the same track with probability 0.5. In all other cases, the logarithm
     of the number of rays between the two is uniform, because near frames more often show the same object.
     """
-    n, count = len(obs), _DRAWS_EACH * search.hypotheses
+    n = len(obs)
     first = rng.integers(n, size=count)
     reach = np.exp(rng.uniform(0.0, np.log(max(n, 2)), count)).astype(np.int64)
     second = first + reach * rng.choice([-1, 1], count)

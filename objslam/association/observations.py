@@ -19,11 +19,11 @@ from objslam.core.types import Association, Keyframes, Rays
 
 MIN_DEPTH = 0.05
 """The least distance (m) of an object from a camera. A larger value loses objects right in front of the camera."""
-_SIZE_SPREAD = 0.25
+SIZE_SPREAD = 0.25
 """The expected standard deviation of ln width and ln height over the boxes of a landmark. The sizes change with the side and
 with the detector. With a larger value, only larger differences of size count."""
 _SIZE_POOLED = 5.0
-"""With this many boxes, the measured spread of a landmark's sizes weighs as much as `_SIZE_SPREAD`. A larger number trusts
+"""With this many boxes, the measured spread of a landmark's sizes weighs as much as `SIZE_SPREAD`. A larger number trusts
 the measured spread less."""
 SIZED_BY = 5
 """The least number of boxes that give a landmark a size. A larger number leaves more landmarks without a size."""
@@ -237,7 +237,7 @@ class UsualSizes:
         middle = grouped_median(own, owner, count)
         spread = np.nan_to_num(grouped_median(np.abs(own - middle[owner]), owner, count)) / NORMAL_MEDIAN
         weight = number[:, None]
-        return cls(number, middle, (weight * spread**2 + _SIZE_POOLED * _SIZE_SPREAD**2) / (weight + _SIZE_POOLED))
+        return cls(number, middle, (weight * spread**2 + _SIZE_POOLED * SIZE_SPREAD**2) / (weight + _SIZE_POOLED))
 
     def take(self, which: Ints) -> Self:
         """Select landmarks by indices (n,)."""

@@ -286,6 +286,25 @@ def test_ranges_tell_a_row_of_things_from_a_far_point_where_rays_to_all_of_them_
         assert len(np.unique(scene.whose[association.object == j])) == 1
 
 
+def without_ranges(scene):
+    nothing = np.full(len(scene.rays), np.nan)
+    return replace(scene, rays=replace(scene.rays, range=nothing, range_sigma=nothing))
+
+
+@pytest.mark.parametrize("larger", [1.0, 3.0])
+def test_sizes_tell_a_row_of_things_from_a_far_point_without_ranges(larger):
+    """One post may be larger than the others. It is found all the same."""
+    scene = without_ranges(row_of_posts())
+    middle, half = (scene.rays.box[:, :2] + scene.rays.box[:, 2:]) / 2, (scene.rays.box[:, 2:] - scene.rays.box[:, :2]) / 2
+    half[scene.whose == 4] *= larger
+    rays = replace(scene.rays, box=np.hstack([middle - half, middle + half]))
+    association = scene.associate(rays=rays, sigma=np.hypot(rays.sigma, 0.02), position_sigma=0.05)
+    assert association.count == 10
+    assert (association.object >= 0).mean() > 0.9
+    for j in range(association.count):
+        assert len(np.unique(scene.whose[association.object == j])) == 1
+
+
 @pytest.mark.parametrize("scale", [0.5, 1.5])
 def test_ranges_of_a_wrong_scale_hide_nothing_that_bearings_show(scale):
     scene = watch(np.array([[0.3, 0.2, 0.4], [-0.4, 0.3, 0.3], [0.1, -0.5, 0.5]]), circle(60), pixel_sigma=2.0)
