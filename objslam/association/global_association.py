@@ -6,6 +6,7 @@ between landmarks that bearings do not tell apart.
 """
 
 from dataclasses import dataclass, replace
+from itertools import count, islice
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from objslam.core.statistics import grouped_quantile, grouped_sums
 from objslam.core.types import Association
 
 _TURNS = 8
-"""The most searches among the unassigned rays. They end once a search finds nothing. A larger number may find more."""
+"""The most searches of one kind among the unassigned rays. They end when one finds none. A larger number may find more."""
 _ROUNDS = 12  # The most rounds of merging and dropping. Without a limit, they could repeat for ever.
 _SAMPLE = 4096
 """The most rays of one label that a search uses, in whole frames. Later searches use other frames. A larger number costs
@@ -131,27 +132,26 @@ def _search(task: _Task, state: State, excluded: Landmarks) -> tuple[State, Bool
 
     If there are ranges at localised poses, a ray with a wrong range first supports no point at all. A robot that passes a
     row of equal things sees one after the other in the same direction. These rays meet far away, at a point that has more
-    rays than each thing, and no range confirms it. Where ranges are missing, `ranged_by_size` may show them. Once nothing
-    more is found, wrong ranges only lower the support. At poses that drift, a right range may seem wrong on a later visit,
-    so wrong ranges only lower the support there.
+    rays than each thing, and no range confirms it. Where ranges are missing, `ranged_by_size` may show them. Later, and at
+    poses that drift, wrong ranges only lower the support: there a right range may seem wrong on a later visit.
 
     Also returns the rays (R,) that belonged to a dropped landmark, and the landmarks that seemed to move, with their rays.
     """
     refuted, moving = np.zeros(len(state.matched), dtype=bool), state.keep(np.zeros(state.count, dtype=bool))
-    share = 1.0 if state.view.localized and np.isfinite(task.ranged.range).any() else WRONG_RANGE
-    for turn in range(_TURNS):
-        before = state.count
-        state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded, share), 2)
-        state = _merge_round(task, learned(state.keep(beyond_chance(state, task.gate, _CHANCE_ODDS))))
-        likely = existence(state, task.gate)
-        moving = moving.joined(state.keep(_seems_to_move(task, state, likely)))
-        kept = _drop(task, state, likely)
-        refuted |= (state.matched >= 0) & (kept.matched < 0)
-        state = kept
-        if state.count <= before:
-            if share == WRONG_RANGE:
+    strict = state.view.localized and np.isfinite(task.ranged.range).any()
+    turns = count()
+    for share in (1.0, WRONG_RANGE) if strict else (WRONG_RANGE,):
+        for turn in islice(turns, _TURNS):
+            before = state.count
+            state = _alternate(task, _discover(task, state, turn, _PARALLAX, excluded, share), 2)
+            state = _merge_round(task, learned(state.keep(beyond_chance(state, task.gate, _CHANCE_ODDS))))
+            likely = existence(state, task.gate)
+            moving = moving.joined(state.keep(_seems_to_move(task, state, likely)))
+            kept = _drop(task, state, likely)
+            refuted |= (state.matched >= 0) & (kept.matched < 0)
+            state = kept
+            if state.count <= before:
                 break
-            share = WRONG_RANGE
     return state, refuted, moving
 
 

@@ -13,7 +13,7 @@ from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.camera import Camera, project
 from objslam.core.diagnostics import Ledger
-from objslam.core.geometry import inverse, widest_angle
+from objslam.core.geometry import inverse, lift_se2, widest_angle
 from objslam.core.ground.flattening import LEVEL
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.evaluation.alignment import match_points
@@ -124,6 +124,19 @@ def watch(
         points,
         label,
     )
+
+
+def passed_row(pixel_sigma: float) -> tuple[Scene, Floats]:
+    """Return a row of ten equal posts that a robot passes, and the true distances (R,) m. Bushes hide the posts from most
+    directions."""
+    posts = np.column_stack([5.0 * np.arange(10), np.full(10, 1.5), np.full(10, 0.5)])
+    poses = lift_se2(np.column_stack([np.linspace(-6.0, 44.0, 200), np.zeros((200, 2))]))
+    scene = watch(posts, poses, pixel_sigma=pixel_sigma)
+    ahead, aside = (posts[scene.whose, :2] - poses[scene.rays.keyframe, :2, 3]).T
+    seen = np.flatnonzero(abs(np.degrees(np.arctan2(aside, ahead)) - 20.0) < 5.0)
+    scene = replace(scene, rays=scene.rays.take(seen), whose=scene.whose[seen])
+    cameras = scene.keyframes.map_T_camera[scene.rays.keyframe, :3, 3]
+    return scene, np.linalg.norm(posts[scene.whose] - cameras, axis=1)
 
 
 def rays_of_boxes(

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from association_scenes import drive, join, rays_of_boxes, watch
+from association_scenes import drive, join, passed_row, rays_of_boxes, watch
 
+from objslam.association import global_association
 from objslam.config import Settings
 from objslam.core.geometry import lift_se2
 from objslam.core.types import Keyframes, Rays
@@ -262,23 +263,11 @@ def test_depth_tells_apart_what_bearings_cannot():
         assert np.ptp(ranges[association.object == j]) == 0
 
 
-def row_of_posts(scale=1.0):
-    """A robot passes ten equal posts, which bushes hide from most directions. Return the scene, and the rays with ranges.
-    scale: a factor on the ranges."""
-    posts = np.column_stack([5.0 * np.arange(10), np.full(10, 1.5), np.full(10, 0.5)])
-    poses = lift_se2(np.column_stack([np.linspace(-6.0, 44.0, 200), np.zeros((200, 2))]))
-    scene = watch(posts, poses, pixel_sigma=2.0)
-    ahead, aside = (posts[scene.whose, :2] - poses[scene.rays.keyframe, :2, 3]).T
-    seen = np.flatnonzero(abs(np.degrees(np.arctan2(aside, ahead)) - 20.0) < 5.0)
-    distance = np.linalg.norm(posts[scene.whose] - scene.keyframes.map_T_camera[scene.rays.keyframe, :3, 3], axis=1)[seen]
-    measured = scale * (distance + 0.1 * np.random.default_rng(0).standard_normal(len(seen)))
-    rays = replace(scene.rays.take(seen), range=measured, range_sigma=np.full(len(seen), 0.1))
-    return replace(scene, rays=rays, whose=scene.whose[seen])
-
-
 def test_ranges_tell_a_row_of_things_from_a_far_point_where_rays_to_all_of_them_meet():
-    scene = row_of_posts()
-    association = scene.associate(sigma=np.hypot(scene.rays.sigma, 0.02), position_sigma=0.05)
+    scene, distance = passed_row(pixel_sigma=2.0)
+    measured = distance + 0.1 * np.random.default_rng(0).standard_normal(len(distance))
+    rays = replace(scene.rays, range=measured, range_sigma=np.full(len(distance), 0.1))
+    association = scene.associate(rays=rays, sigma=np.hypot(rays.sigma, 0.02), position_sigma=0.05)
     held = association.object >= 0
     assert held.mean() > 0.9
     assert association.count == 10
@@ -286,15 +275,10 @@ def test_ranges_tell_a_row_of_things_from_a_far_point_where_rays_to_all_of_them_
         assert len(np.unique(scene.whose[association.object == j])) == 1
 
 
-def without_ranges(scene):
-    nothing = np.full(len(scene.rays), np.nan)
-    return replace(scene, rays=replace(scene.rays, range=nothing, range_sigma=nothing))
-
-
 @pytest.mark.parametrize("larger", [1.0, 3.0])
 def test_sizes_tell_a_row_of_things_from_a_far_point_without_ranges(larger):
     """One post may be larger than the others. It is found all the same."""
-    scene = without_ranges(row_of_posts())
+    scene, _ = passed_row(pixel_sigma=2.0)
     middle, half = (scene.rays.box[:, :2] + scene.rays.box[:, 2:]) / 2, (scene.rays.box[:, 2:] - scene.rays.box[:, :2]) / 2
     half[scene.whose == 4] *= larger
     rays = replace(scene.rays, box=np.hstack([middle - half, middle + half]))
@@ -306,7 +290,9 @@ def test_sizes_tell_a_row_of_things_from_a_far_point_without_ranges(larger):
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.5])
-def test_ranges_of_a_wrong_scale_hide_nothing_that_bearings_show(scale):
+def test_ranges_of_a_wrong_scale_hide_nothing_that_bearings_show(scale, monkeypatch):
+    """The searches that trust bearings have turns of their own, which those that trust ranges cannot use up."""
+    monkeypatch.setattr(global_association, "_TURNS", 3)  # Each finds one of the three.
     scene = watch(np.array([[0.3, 0.2, 0.4], [-0.4, 0.3, 0.3], [0.1, -0.5, 0.5]]), circle(60), pixel_sigma=2.0)
     distance = np.linalg.norm(scene.points[scene.whose] - scene.keyframes.map_T_camera[scene.rays.keyframe, :3, 3], axis=1)
     rays = replace(scene.rays, range=scale * distance, range_sigma=np.full(len(distance), 0.05))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from association_scenes import rays_of_boxes, watch
+from association_scenes import passed_row, rays_of_boxes, watch
 from scipy.optimize import least_squares
 
 from objslam.association.hypothesis_search import Search, _Scorer, discover, ranged_by_size
@@ -128,19 +128,9 @@ def test_a_point_stays_along_a_direction_that_its_rays_do_not_fix():
     assert np.degrees(np.arccos((fitted[0] - eye) @ mean / np.linalg.norm(fitted[0] - eye) / np.linalg.norm(mean))) < 0.05
 
 
-def passed_row():
-    """What a robot sees of a row of things that it passes, each in the same few directions, and the true distances (R,)."""
-    posts = np.column_stack([5.0 * np.arange(10), np.full(10, 1.5), np.full(10, 0.5)])
-    poses = lift_se2(np.column_stack([np.linspace(-6.0, 44.0, 200), np.zeros((200, 2))]))
-    scene = watch(posts, poses, pixel_sigma=1.0)
-    ahead, aside = (posts[scene.whose, :2] - poses[scene.rays.keyframe, :2, 3]).T
-    seen = np.flatnonzero(abs(np.degrees(np.arctan2(aside, ahead)) - 20.0) < 5.0)
-    away = np.linalg.norm(posts[scene.whose] - scene.keyframes.map_T_camera[scene.rays.keyframe, :3, 3], axis=1)[seen]
-    return observed(scene, scene.rays.take(seen)), away
-
-
 def test_sizes_show_ranges_where_rays_to_several_things_meet_far_away():
-    obs, away = passed_row()
+    scene, away = passed_row(pixel_sigma=1.0)
+    obs = observed(scene)
     every = np.ones(len(obs), dtype=bool)
     ranged = ranged_by_size(obs, every, SEARCH.gate, SEARCH.parallax, 0)
     np.testing.assert_allclose(ranged.range, away, rtol=0.25)
@@ -156,7 +146,8 @@ def test_sizes_show_no_ranges_where_rays_meet_only_at_the_things():
 
 
 def test_a_known_range_stays_where_sizes_show_others():
-    obs, away = passed_row()
+    scene, away = passed_row(pixel_sigma=1.0)
+    obs = observed(scene)
     known = np.arange(len(obs)) % 3 == 0
     partly = replace(obs, range=np.where(known, 1.1 * away, np.nan), range_sigma=np.where(known, 0.1, np.nan))
     ranged = ranged_by_size(partly, np.ones(len(obs), dtype=bool), SEARCH.gate, SEARCH.parallax, 0)
