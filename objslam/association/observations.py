@@ -31,8 +31,14 @@ _SIZE_FREE = 5.99
 """A size may deviate up to this squared deviation without a cost: chi-squared of 2 degrees of freedom at 95 %. With a larger
 value, only larger differences of size count."""
 SIZE_LOSS = 6.0
-"""The largest cost of a size. It is less than a usual gate, so that the bearing alone can still match a half hidden thing. A
-larger value loses more boxes of half hidden things."""
+"""The largest cost of a size, unless the box is of a nearer thing. It is less than a usual gate, so that the bearing alone
+can still match a half hidden thing. A larger value loses more boxes of half hidden things."""
+_ONE_FACTOR = 3.84
+"""Two sides are larger by one factor up to this squared deviation from it: chi-squared of 1 degree of freedom at 95 %. With
+a larger value, boxes with other proportions than the landmark's count as boxes of nearer things too."""
+_NEARER = 3.0
+"""A range shows a nearer thing if it is too short by more than this number of standard deviations. A larger value believes
+fewer ranges."""
 
 
 @dataclass(frozen=True)
@@ -246,12 +252,14 @@ class UsualSizes:
     def costs(
         self, obs: Observations, ray: Ints, landmark: Ints, distance: Floats, distance_sigma: Floats | None = None
     ) -> Floats:
-        """Return the cost (E,), from 0 to `SIZE_LOSS`, of the size of the box in each match, in squared standard deviations.
+        """Return the cost (E,) >= 0 of the size of the box in each match, in squared standard deviations.
 
         Bearings do not distinguish a small thing from a large thing on the same line of sight. If only one of the two is
-        detected, its box fits the bearings of both, but only one of the sizes. Boxes of another size than usual cost more. A
-        box without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the matches. distance: (E,)
-        m, from the camera to the landmark. distance_sigma: (E,) m, its uncertainty, by default 0.
+        detected, its box fits the bearings of both, but only one of the sizes. Boxes of another size than usual cost more.
+        The cost is at most `SIZE_LOSS`, because a thing can be half hidden, and a box can have two things side by side. It
+        has no limit if both sides are larger than usual by one factor and the range is too short: size and range show a
+        nearer thing. A box without a size, and a landmark with few boxes, cost nothing. ray, landmark: (E,) of the matches.
+        distance: (E,) m, from the camera to the landmark. distance_sigma: (E,) m, its uncertainty, by default 0.
         """
         cost = np.zeros(len(ray))
         some = np.flatnonzero((self.number[landmark] >= SIZED_BY) & (obs.size[ray] > 0).all(axis=1))
@@ -265,5 +273,9 @@ class UsualSizes:
         if distance_sigma is not None:
             spread += (distance_sigma[some] / distance[some])[:, None] ** 2
         squared = (off**2 / spread).sum(axis=1)
-        cost[some] = np.clip(squared - _SIZE_FREE, 0.0, SIZE_LOSS)
+        factor = (off / spread).sum(axis=1) ** 2 / (1 / spread).sum(axis=1)  # What one factor on both sides explains.
+        larger = (off > 0).all(axis=1) & (squared - factor <= _ONE_FACTOR)
+        unsure = obs.range_sigma[ray] if distance_sigma is None else np.hypot(obs.range_sigma[ray], distance_sigma[some])
+        nearer = larger & (distance[some] - obs.range[ray] > _NEARER * unsure)  # False without a range.
+        cost[some] = np.clip(squared - _SIZE_FREE, 0.0, np.where(nearer, np.inf, SIZE_LOSS))
         return cost
