@@ -33,5 +33,6 @@ def collect_early() -> None:
 
     Call it when there is time. Without `configure`, Python alone decides.
     """
-    if gc.get_freeze_count() and gc.get_count()[2] > gc.get_threshold()[2] - _SOON:
+    # Python counts its exempt objects one by one, which takes milliseconds. So this comes last.
+    if gc.get_count()[2] > gc.get_threshold()[2] - _SOON and gc.get_freeze_count():
         gc.collect()
