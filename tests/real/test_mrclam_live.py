@@ -17,7 +17,7 @@ from objslam.sources import SourceOptions, read
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("robot", "every", "seconds"), [(3, 10, 450.0), (1, 11, np.inf)])
+@pytest.mark.parametrize(("robot", "every", "seconds"), [(3, 10, 300.0), (1, 11, np.inf)])
 def test_live_and_offline_find_the_same_in_the_same_place(data_dir, monkeypatch, robot, every, seconds):
     """Robot 3 stands at first and then turns: were its first boxes given up, the map would lie turned by 0.06 rad.
 
