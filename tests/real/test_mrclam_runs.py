@@ -24,6 +24,7 @@ from objslam.sources import SourceOptions, read
 RADIUS = 2.0  # m; labels say who is whom, the error is what is asked
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("robot", "with_range", "position"),
     [(1, False, 0.25), (3, False, 0.25), (1, True, 0.10), (3, True, 0.10), (5, True, 0.10)],
@@ -99,6 +100,7 @@ def of_truth(objects, truth):
     return objects.positions, at @ pose[:3, :3].T + pose[:3, 3]
 
 
+@pytest.mark.long
 def test_three_robots_without_a_common_frame_are_one_map(data_dir):
     """Three drives in frames of their own. Their own errors and their shared ones hold the truth of the whole map, as one
     vector: the covariances of objects alone would be too wide for it, those of one graph of all keyframes far too small."""
@@ -129,6 +131,7 @@ def test_three_robots_without_a_common_frame_are_one_map(data_dir):
     assert (squared < 7.815).all()
 
 
+@pytest.mark.long
 def test_three_robots_are_one_map_also_without_names(data_dir):
     """The same maps, with one label for all landmarks. They stand in clusters 17 cm apart."""
     sessions = []
