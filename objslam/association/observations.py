@@ -211,9 +211,11 @@ def extents(
 
 def overlap(one: Floats, two: Floats) -> Floats:
     """Return the intersection over union of boxes (..., 4) whose shapes broadcast together."""
-    low, high = np.maximum(one[..., :2], two[..., :2]), np.minimum(one[..., 2:], two[..., 2:])
-    common = np.maximum(high - low, 0.0).prod(axis=-1)
-    total = (one[..., 2:] - one[..., :2]).prod(axis=-1) + (two[..., 2:] - two[..., :2]).prod(axis=-1) - common
+    # A product of two columns takes a third of the time of `prod` along a short axis.
+    both = np.maximum(np.minimum(one[..., 2:], two[..., 2:]) - np.maximum(one[..., :2], two[..., :2]), 0.0)
+    size, other = one[..., 2:] - one[..., :2], two[..., 2:] - two[..., :2]
+    common = both[..., 0] * both[..., 1]
+    total = size[..., 0] * size[..., 1] + other[..., 0] * other[..., 1] - common
     return np.asarray(common / np.maximum(total, 1e-12))
 
 

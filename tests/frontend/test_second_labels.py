@@ -12,6 +12,7 @@ from objslam.config import Settings, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Detections, Log
 from objslam.frontend.bearings import build_rays
+from objslam.frontend.boxes import second_labels
 from objslam.frontend.boxes.second_labels import SECOND_LABELS, SecondLabelFinder, without_second_labels
 from objslam.frontend.keyframes import build_keyframes
 from objslam.simulation import PRESETS, preset, simulate
@@ -151,3 +152,29 @@ def test_a_session_learns_what_a_log_shows(drive):
     assert len(later) == len(found) - len(drive.cameras[0].detections)
     assert 0.9 * len(later) < len(gone) <= len(later)
     assert set(gone) <= set(later.tolist())
+
+
+def test_a_frame_whose_boxes_are_apart_takes_no_search_and_changes_nothing(monkeypatch):
+    """Against the search in every frame, for boxes of which some lie on each other."""
+    search, calls, rng = second_labels.pairs_on_each_other, [], np.random.default_rng(2)
+    monkeypatch.setattr(second_labels, "pairs_on_each_other", lambda *boxes: (calls.append(1), search(*boxes))[1])
+    quick, full = SecondLabelFinder(), SecondLabelFinder()
+    for _ in range(200):
+        at, label, score = rng.uniform(0, 400, (6, 2)), rng.integers(0, 3, 6), rng.uniform(0.3, 1.0, 6)
+        frame = np.hstack([at, at + rng.uniform(20, 200, (6, 2))]), label, score
+        before = len(calls)
+        found = quick.add(0, *frame)
+        searched = len(calls) > before
+        with monkeypatch.context() as patch:
+            patch.setattr(second_labels, "_lie_on_each_other", lambda *_: True)
+            expected = full.add(0, *frame)
+        assert [one.tolist() for one in found] == [one.tolist() for one in expected]
+        assert searched == bool(len(search(frame[0], np.zeros(6, dtype=int), label, score).first))
+    assert quick == full
+    assert full._near.total() > 20
+    assert 200 < len(calls) < 400
+
+
+def test_a_frame_without_a_box_has_no_second_labels():
+    none = np.zeros(0, dtype=np.int64)
+    assert [len(one) for one in SecondLabelFinder().add(0, np.zeros((0, 4)), none, np.zeros(0))] == [0, 0]

@@ -144,6 +144,8 @@ class SecondLabelFinder:
 
         camera: its number. boxes: (M, 4) px. label, scores: (M,) of the boxes.
         """
+        if not _lie_on_each_other(boxes, label):  # So it is in most frames, and this takes a tenth of the time.
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         pairs = pairs_on_each_other(boxes, np.zeros(len(boxes), dtype=np.int64), label, scores)
         for (a, b), equal, place in zip(pairs.labels.tolist(), pairs.equal.tolist(), pairs.place.tolist(), strict=True):
             key = (a, b, int(equal), camera, *place)
@@ -162,6 +164,11 @@ class SecondLabelFinder:
         same, near = (np.array([of[a, b] for a, b in keys.tolist()], dtype=float) for of in (self._same, self._near))
         one = labels_of_one_thing(same, near, self._same.total(), self._near.total())[which.ravel()] & pairs.equal
         return _without_repeats(pairs.first[one], pairs.second[one])
+
+
+def _lie_on_each_other(boxes: Floats, label: Ints) -> bool:
+    """Return whether two boxes (M, 4) of a frame, px, lie on each other and have different labels (M,)."""
+    return bool((show_one_thing(boxes[:, None], boxes) & (label[:, None] != label)).any())
 
 
 def _places(boxes: Floats) -> Ints:
