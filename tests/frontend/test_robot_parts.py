@@ -17,7 +17,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.geometry import interpolate, inverse, lift_se2, make_pose
 from objslam.core.types import CameraLog, Detections, Log, Trajectory
 from objslam.evaluation.evaluate import evaluate
-from objslam.frontend.boxes.part_finder import RobotPartFinder, _overlap
+from objslam.frontend.boxes.part_finder import RobotPartFinder
 from objslam.frontend.boxes.robot_parts import ROBOT_PARTS, without_robot_parts
 from objslam.mapping import pipeline
 from objslam.simulation import preset, simulate
@@ -275,14 +275,3 @@ def test_a_run_without_the_boxes_of_an_arm_has_the_map_of_the_drive():
     assert [o.label for o in result.map.objects] == [o.label for o in want.map.objects]
     np.testing.assert_allclose(result.map.positions, want.map.positions, atol=1e-9)
     assert not evaluate(result.map, log.truth).objects.false
-
-
-def test_the_overlap_of_a_session_is_the_usual_one():
-    rng = np.random.default_rng(4)
-    low = rng.uniform(0, 100, (300, 2, 2))
-    boxes = np.concatenate([low, low + rng.uniform(0, 80, (300, 2, 2))], axis=2)
-    boxes[:10, 1] = boxes[:10, 0]
-    boxes[10:15, 0, 2:] = boxes[10:15, 0, :2]  # without an area
-    expected = overlap(boxes[:, 0], boxes[:, 1])
-    assert [_overlap(one.tolist(), two.tolist()) for one, two in boxes] == expected.tolist()
-    assert (expected > 0).mean() > 0.2

@@ -1,7 +1,6 @@
 """Find boxes of parts of the robot while a session runs, with bounded memory. The rules are those of `robot_parts`."""
 
 from dataclasses import dataclass, field
-from statistics import median
 
 import numpy as np
 
@@ -77,7 +76,7 @@ class _Place:
             change = box - self.latest
             self.changes = count + 1, total + change, squares + change**2
         self.latest = box
-        if self.gaps and frame - self.last > ABSENT * median(self.gaps):
+        if self.gaps and frame - self.last > ABSENT * float(np.median(self.gaps)):
             self.open = []
             self._keep(slice(0, 0))
         self.gaps = [*self.gaps[1 - _GAPS :], frame - self.last]
@@ -111,7 +110,6 @@ class RobotPartFinder:
 
     def __init__(self) -> None:
         self._places: dict[int, list[_Place]] = {}
-        self._boxes: dict[int, list[list[float]]] = {}  # The boxes of these places, px.
         self._frame = 0
 
     def add(self, boxes: Floats, label: Ints, pose: Floats, direction: Floats) -> Bools:
@@ -139,41 +137,20 @@ class RobotPartFinder:
 
     def _add(self, box: Floats, label: int, pose: Floats, direction: Floats) -> bool:
         places = self._places.setdefault(label, [])
-        self._keep(label, [one for one in places if self._frame - one.last <= _FORGOTTEN or not one.is_part])
-        places = self._places[label]
+        places[:] = [one for one in places if not one.is_part or self._frame - one.last <= _FORGOTTEN]
         if places:
-            corners, boxes = box.tolist(), self._boxes[label]
-            alike = [_overlap(one, corners) for one in boxes]
-            most = max(alike)
-            best = alike.index(most)
-            for index, share in enumerate(alike):
-                if share >= LIKE_BOX and (index != best or most < SAME_BOX):
+            alike = overlap(np.array([one.box for one in places]), box)
+            best = int(alike.argmax())
+            for index in np.flatnonzero(alike >= LIKE_BOX).tolist():
+                if index != best or alike[best] < SAME_BOX:
                     places[index].near += 1
-            if most >= SAME_BOX:
+            if alike[best] >= SAME_BOX:
                 places[best].add(box, self._frame, pose, direction)
-                boxes[best] = places[best].box.tolist()
                 return places[best].is_part
         if len(places) < _PLACES:
-            self._keep(label, [*places, _Place(box.copy(), self._frame)])
+            places.append(_Place(box.copy(), self._frame))
             return False
         for one in places:
             one.hits -= 1
-        self._keep(label, [one for one in places if one.hits > 0 or one.is_part])
+        places[:] = [one for one in places if one.hits > 0 or one.is_part]
         return False
-
-    def _keep(self, label: int, places: list[_Place]) -> None:
-        """Set the places of a label, of which some left or one is new."""
-        if len(places) != len(self._places[label]):
-            self._places[label] = places
-            self._boxes[label] = [one.box.tolist() for one in places]
-
-
-def _overlap(one: list[float], two: list[float]) -> float:
-    """Return the intersection over union of two boxes, px, as `overlap` does. It avoids numpy, and most boxes are apart."""
-    left, top, right, bottom = one
-    begin, upper, end, lower = two
-    width, height = min(right, end) - max(left, begin), min(bottom, lower) - max(top, upper)
-    if width <= 0 or height <= 0:
-        return 0.0
-    common = width * height
-    return common / max((right - left) * (bottom - top) + (end - begin) * (lower - upper) - common, 1e-12)
