@@ -4,8 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from objslam.association.observations import MIN_DEPTH, SIZE_SPREAD, Observations, closest_approach
-from objslam.association.refinement import RANGE_LIMIT
+from objslam.association.observations import MIN_DEPTH, RANGE_LIMIT, SIZE_SPREAD, Observations, closest_approach
 from objslam.core.array_module import Backend, Tensor, array_backend, as_numpy, as_tensor, module_of
 from objslam.core.arrays import Bools, Floats, Ints
 

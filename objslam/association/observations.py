@@ -36,9 +36,8 @@ can still match a half hidden thing. A larger value loses more boxes of half hid
 _ONE_FACTOR = 3.84
 """Two sides are larger by one factor up to this squared deviation from it: chi-squared of 1 degree of freedom at 95 %. With
 a larger value, boxes with other proportions than the landmark's count as boxes of nearer things too."""
-_NEARER = 3.0
-"""A range shows a nearer thing if it is too short by more than this number of standard deviations. A larger value believes
-fewer ranges."""
+RANGE_LIMIT = 3.0
+"""The deviation, in standard deviations, from which a range counts as wrong. A larger value believes more ranges."""
 
 
 @dataclass(frozen=True)
@@ -278,6 +277,6 @@ class UsualSizes:
         factor = (off / spread).sum(axis=1) ** 2 / (1 / spread).sum(axis=1)  # What one factor on both sides explains.
         larger = (off > 0).all(axis=1) & (squared - factor <= _ONE_FACTOR)
         unsure = obs.range_sigma[ray] if distance_sigma is None else np.hypot(obs.range_sigma[ray], distance_sigma[some])
-        nearer = larger & (distance[some] - obs.range[ray] > _NEARER * unsure)  # False without a range.
+        nearer = larger & (distance[some] - obs.range[ray] > RANGE_LIMIT * unsure)  # False without a range.
         cost[some] = np.clip(squared - _SIZE_FREE, 0.0, np.where(nearer, np.inf, SIZE_LOSS))
         return cost

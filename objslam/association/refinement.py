@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from objslam.association.observations import MIN_DEPTH, Observations
+from objslam.association.observations import MIN_DEPTH, RANGE_LIMIT, Observations
 from objslam.core.arrays import Floats, Ints
 from objslam.core.rotation import dots
 from objslam.core.statistics import HALF_RAY, grouped_quantiles, grouped_sums, order_by_group
@@ -15,7 +15,6 @@ RANGE_LOSS = 4.0
 value, more correct boxes are lost."""
 BEHIND = 1e6
 """The deviation, in standard deviations, of a point behind the camera: large, but finite."""
-RANGE_LIMIT = 3.0  # The deviation, in standard deviations, from which a range counts as wrong.
 _HALF_RANGE = 3.0  # The scale of the robust range weight in squared deviations. With a larger one, wrong ranges pull more.
 _DAMPING = 1e-6
 """The share of the information added in all directions. Unobserved directions then stay unchanged. A larger share slows the
