@@ -25,7 +25,7 @@ from objslam.mapping.bodies.fitting import repeated_error
 from objslam.triangulation.bodies.choice import shapes_disagree, with_shares_of_shapes
 from objslam.triangulation.bodies.edges import BoxEdges, contacts
 from objslam.triangulation.bodies.fit import Prior, Weights, fit, sums_of_products
-from objslam.triangulation.bodies.prior import weak_prior
+from objslam.triangulation.bodies.prior import label_prior, weak_prior
 from objslam.triangulation.bodies.residuals import edge_gaps, nominal_noise, residuals, touched_points
 from objslam.triangulation.bodies.shapes import CUBOID, CYLINDER, ELLIPSOID
 from objslam.triangulation.bodies.shared import covariance_of, sides_of
@@ -295,3 +295,48 @@ def test_the_shape_of_a_thing_is_judged_with_the_others_of_its_label():
     many = with_shares_of_shapes(np.stack([open_, *[sure] * 100], axis=1), np.zeros(101, dtype=int))
     assert many[2, 0] - many[3, 0] == pytest.approx(np.log((6 + 5 * 7 / 11) / (5 / 11)))
     assert np.ptp(with_shares_of_shapes(np.zeros((5, 7)), np.arange(7))) < 1e-9
+
+
+def test_wrong_boxes_of_one_body_do_not_make_all_outlines_inexact():
+    """A half of the boxes of one of 24 bodies, all from one side, are those of a thing that looks twice as large."""
+    rng, camera, each = np.random.default_rng(8), CAMERAS["pinhole"], 30
+    true = random_bodies(24, rng)
+    views = [views_of(camera, body, each, rng, arc=1.0 if i % 2 else 2 * np.pi) for i, body in enumerate(true)]
+    boxes, poses = (np.concatenate(part) for part in zip(*views, strict=True))
+    noisy = boxes + rng.normal(0, 2, boxes.shape)
+    clean = solved(camera, noisy, poses, true[:, :3], np.full((24, 2), 0.3))
+    wrong = noisy[: each // 2]
+    middle, half = (wrong[:, :2] + wrong[:, 2:]) / 2, wrong[:, 2:] - wrong[:, :2]
+    noisy[: each // 2] = np.concatenate([middle - half, middle + half], axis=1)
+    found = solved(camera, noisy, poses, true[:, :3], np.full((24, 2), 0.3))
+    assert found.share[1] < clean.share[1] + 0.02
+
+
+def test_sizes_that_no_box_shows_are_no_sizes_of_their_label():
+    """The boxes of forty bodies show their heights, of 2 m, and nothing about their lengths and widths."""
+    weak = weak_prior(np.zeros((40, 3)), np.tile([[0.3, 0.9]], (40, 1)))
+    values, told = weak.mean.copy(), np.linalg.inv(weak.information)
+    values[:, 6], told[:, 6, 6] = np.log(1.0), 0.05**2
+    found = label_prior(weak, weak, values, told, np.zeros(40, dtype=int), np.zeros(40, dtype=bool))
+    sigma = np.sqrt(1 / np.einsum("nii->ni", found.information))[0]
+    before = np.sqrt(1 / np.einsum("nii->ni", weak.information))[0]
+    assert sigma[4:6] == pytest.approx(before[4:6])
+    assert sigma[3] == pytest.approx(before[3], rel=0.1)
+    assert found.mean[0, 3:6] == pytest.approx(weak.mean[0, 3:6], abs=0.01)
+    assert found.mean[0, 6] == pytest.approx(np.log(1.0), abs=0.02)
+    assert sigma[6] < 0.25
+
+
+def test_sizes_that_boxes_show_are_sizes_of_their_label():
+    """Forty plates of one size, each seen from all sides."""
+    rng = np.random.default_rng(5)
+    weak = weak_prior(np.zeros((40, 3)), np.tile([[0.3, 0.9]], (40, 1)))
+    values, told = weak.mean.copy(), np.tile(0.02**2 * np.eye(7), (40, 1, 1))
+    yaw = rng.uniform(0, np.pi, 40)
+    values[:, 3:] = np.column_stack([np.full(40, -1.5), 1.2 * np.cos(2 * yaw), 1.2 * np.sin(2 * yaw), np.zeros(40)])
+    values[:, 3:] += rng.normal(0, 0.02, (40, 4))
+    found = label_prior(weak, weak, values, told, np.zeros(40, dtype=int), np.zeros(40, dtype=bool))
+    sigma = np.sqrt(1 / np.einsum("nii->ni", found.information))[0]
+    assert found.mean[0, [3, 6]] == pytest.approx([-1.5, 0.0], abs=0.05)
+    assert (sigma[[3, 6]] < 0.25).all()
+    assert sigma[4] == pytest.approx(1.2 / np.sqrt(2), rel=0.1)

@@ -164,7 +164,7 @@ def solve_bodies(
         hidden = doubt.edges & which[edges.body, None]
         if number == _ROUNDS:
             break
-        prior = label_prior(weak, best.values, now.covariance, np.where(which, label, -1), now.solid == _CUBOID)
+        prior = label_prior(weak, now.prior, best.values, now.covariance, np.where(which, label, -1), now.solid == _CUBOID)
         if sizes:
             prior = known_sizes(prior, now.fitted[_ELLIPSOID], names, sizes)
         now = replace(now, prior=prior)
