@@ -5,7 +5,7 @@ import numpy as np
 from objslam.core.arrays import Floats
 from objslam.core.geometry import interpolate, inverse, log_se3, twist_lengths
 from objslam.core.rotation import rotation_vector
-from objslam.core.types import Trajectory
+from objslam.core.types import Keyframes, Trajectory
 
 _SPAN = 0.4
 """The time, s, over which a speed is averaged. It spans several poses of slow odometry. A longer time smooths more."""
@@ -73,3 +73,13 @@ def poses_near(path: Trajectory, stamps: Floats, max_gap: float) -> Floats:
     before, after = at[index - 1], at[np.minimum(index, last)]
     nearest = np.where(known - before < after - known, before, after)
     return interpolate(at, path.poses, np.where(after - before > max_gap, nearest, known), np.inf)[0]
+
+
+def ways(keyframes: Keyframes) -> Floats:
+    """Return how far (K,) m the robot had driven at each keyframe, by the odometry where it measured the motion, else by the
+    localisation."""
+    steps = np.linalg.norm(np.diff(keyframes.map_T_base[:, :3, 3], axis=0), axis=1)
+    if keyframes.odom_T_base is not None:
+        by_odometry = np.linalg.norm(np.diff(keyframes.odom_T_base[:, :3, 3], axis=0), axis=1)
+        steps = np.where(keyframes.measured, by_odometry, steps)
+    return np.append(0.0, np.cumsum(steps))

@@ -19,8 +19,7 @@ from objslam.core.diagnostics import Ledger
 from objslam.core.statistics import WHITE, Lasting
 
 MAX_BOXES = 10_000
-"""The most boxes of a frame. A frame with more is rejected, because no detector finds so many. With a larger number,
-association could be too slow."""
+"""The most boxes of a frame. No detector finds more, so frames with more are rejected. A larger number may be too slow."""
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a map's frame that points up in the world, with its sign."""
 
@@ -209,7 +208,7 @@ class Keyframes:
     for all. It is -1 without odometry, where odom_T_base and drift have no meaning. step: (K,) the place of each keyframe
     among the steps of the odometry. wander: (K, 6) the variance of that step. Both are from `OdometryBridge.at`, and None if
     the odometry is exact between its poses. given_stamps: (K,) s, as the frames have them in the log or came from the robot,
-    None if they are `stamps`.
+    None if they are `stamps`. driven: (K,) m, the `ways` before any correction, None if nothing was corrected.
     """
 
     stamps: Floats
@@ -229,6 +228,7 @@ class Keyframes:
     step: Floats | None = None
     wander: Floats | None = None
     given_stamps: Floats | None = None
+    driven: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.stamps)

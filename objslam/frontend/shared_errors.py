@@ -12,7 +12,7 @@ from objslam.core.arrays import Floats
 from objslam.core.calibration import MOST_SCALE, SCALES, Calibration, kind
 from objslam.core.geometry import inverse
 from objslam.core.noise import NOMINAL, NoiseFactors
-from objslam.core.trajectory import poses_near
+from objslam.core.trajectory import poses_near, ways
 from objslam.core.types import Keyframes, Log, Rays, Trajectory
 from objslam.frontend.corrected_log import corrected_mount, inverse_lens, later, lens_errors, refocused, take_out
 from objslam.frontend.corrected_odometry import ODOMETRY, CorrectablePath
@@ -190,12 +190,13 @@ class SharedErrors:
             keyframes, stamps=stamps, map_T_base=map_T_base, odom_T_base=odom_T_base, base_T_camera=base_T_camera
         )
         moved = replace(moved, drift=gathered, step=step, wander=wander)
-        reach, spread = corrected_lengths(error, rays, self._half, 1 + self.noise.shrinkage)
-        ranged = replace(rays, direction=direction, sigma=sigma, range=reach, range_sigma=spread)
+        reach, spread, bias = corrected_lengths(error, rays, self._half, 1 + self.noise.shrinkage)
+        ranged = replace(rays, direction=direction, sigma=sigma, range=reach, range_sigma=spread, range_bias=bias)
         tags = settings.tags.scaled(1 + error.get("tag_scale", 0.0))
         if self.settings.mode == "joint":
             noise = self.noise
             moved = replace(moved, pose_noise=(noise.heading, noise.place), lasting=noise.lasting)
+            moved = replace(moved, driven=ways(self.keyframes))
         return moved, ranged, settings if tags is settings.tags else settings.model_copy(update={"tags": tags})
 
     def rays_in_map(self, values: Floats) -> tuple[Floats, Floats, Floats]:

@@ -56,13 +56,17 @@ def corrected_ranges(errors: Mapping[str, float], ranges: Floats, direction: Flo
     return np.maximum(ranges * factors + offset / direction[:, 2], _LEAST * ranges) if offset else ranges * factors
 
 
-def corrected_lengths(errors: Mapping[str, float], rays: Rays, half: Floats, larger: float) -> tuple[Floats, Floats]:
-    """Return the ranges (R,) of rays and their standard deviations (R,), m, corrected for the shared errors.
+def corrected_lengths(errors: Mapping[str, float], rays: Rays, half: Floats, larger: float) -> tuple[Floats, Floats, Floats]:
+    """Return the ranges (R,), m, of rays, their standard deviations (R,) and those of their `range_bias` (R,), m, corrected
+    for the shared errors.
+
+    Both standard deviations follow the ranges. Otherwise a smaller map would fit better.
 
     half: as `half_widths`. larger: the factor by which the map and its noise are larger.
     """
     factors = range_factors(errors, half) * larger
-    return corrected_ranges(errors, rays.range, rays.direction, factors), rays.range_sigma * factors
+    ranges = corrected_ranges(errors, rays.range, rays.direction, factors)
+    return ranges, rays.range_sigma * factors, rays.range_bias * factors
 
 
 def measured_ranges(errors: Mapping[str, float], ranges: Floats, direction: Floats, factors: Floats) -> Floats:

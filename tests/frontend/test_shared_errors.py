@@ -58,6 +58,18 @@ def clean():
     return simulate(preset("demo", **changes, depth=DepthNoise(sigma=0, sigma_per_m=0), cameras=(make_camera("front"),)), 3)
 
 
+def test_all_noise_of_ranges_follows_their_scale():
+    """Else, a smaller map would fit better."""
+    log, ledger = simulate(preset("demo", frames=120, depth=DepthNoise(), cameras=(make_camera("front"),)), 3), Ledger()
+    keyframes = build_keyframes(log, SETTINGS, ledger)
+    errors = shared_errors(log, keyframes, build_rays(log, keyframes, SETTINGS, ledger), SETTINGS)
+    larger = np.where(np.array(errors.names) == "range_scale", 1.1 * (1 + errors.mean) - 1, errors.mean)
+    (_, rays, _), (_, longer, _) = errors.at(errors.mean), errors.at(larger)
+    assert np.isfinite(rays.range).any()
+    for name in ("range", "range_sigma", "range_bias"):
+        assert_allclose(getattr(longer, name), 1.1 * getattr(rays, name))
+
+
 def measured(log, settings=SETTINGS):
     keyframes = build_keyframes(log, settings, Ledger())
     rays = build_rays(log, keyframes, settings, Ledger())

@@ -22,7 +22,8 @@ from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.paths_alone import noise_of_paths
 from objslam.graph.calibration.pose_errors import ComparedPoses, ErrorKind, PoseErrors, most_likely
 from objslam.graph.calibration.shared_error_jacobian import linearise
-from objslam.graph.factors.localization import chain
+from objslam.graph.calibration.shrinkage import force_of_heights
+from objslam.graph.factors.localization import chain, localized_motions
 from objslam.graph.least_squares.joint_rows import JointGraph
 from objslam.simulation import PoseNoise, preset, simulate
 
@@ -123,6 +124,41 @@ def test_the_sides_of_a_clock_contain_the_motions_of_the_localisation():
     assert_allclose(
         system.sides[-last:, clock].reshape(-1, 6)[near], told.reshape(-1, 6)[near], atol=0.02 * np.abs(told).max()
     )
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.1])
+def test_motions_that_seem_short_or_long_have_the_same_noise(scale):
+    """Else, short ones would count for more, and the map would be too small."""
+    log, settings = localised(localization=PoseNoise(xy=0.3, yaw=0.02))
+    ledger = Ledger()
+    keyframes = build_keyframes(log, settings, ledger)
+    errors = shared_errors(log, keyframes, build_rays(log, keyframes, settings, ledger), settings)
+    noise = replace(errors.noise, heading_share=1.0, heading_seconds=60.0, place_share=1.0, place_seconds=60.0)
+    errors = errors.with_noise(noise)
+    places = keyframes.map_T_base.copy()
+    places[:, :2, 3] = keyframes.odom_T_base[:, :2, 3]
+    exact = replace(keyframes, map_T_base=places, lasting=noise.lasting)
+    given, _, told = errors.at(np.where(np.array(errors.names) == "odometry.scale", scale, errors.mean))
+    noisy = localized_motions(replace(given, base_T_camera=keyframes.base_T_camera), told)
+    assert_allclose(noisy.covariance, localized_motions(exact, settings).covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_the_noise_of_heights_does_not_make_a_map_small():
+    log, settings = localised()
+    settings = settings.model_copy(update={"planar": settings.planar.model_copy(update={"z": 0.05, "seconds": 3.0})})
+    made = drive_of(log, settings)
+    measured = Measurements.of(replace(made.keyframes, lasting=LASTING), made.rays, settings)
+    height = 0.003 * np.random.default_rng(0).standard_normal(len(made.keyframes))
+
+    def cost(larger):
+        poses = made.keyframes.map_T_base.copy()
+        poses[:, 2, 3] += larger * height
+        state = Linearised(measured, made.association, poses @ made.keyframes.base_T_camera, made.points, made.right())
+        return state, state.rows.residual[state.graph.first_motion + 6 * len(state.graph.moves[0]) :]
+
+    (state, _), (_, more), (_, less) = cost(1.0), cost(1.001), cost(0.999)
+    assert force_of_heights(state) == pytest.approx((more @ more - less @ less) / 2 / 0.002, rel=1e-3)
+    assert force_of_heights(cost(0.0)[0]) == pytest.approx(0.0, abs=1e-6)
 
 
 def found_in(log: Log, *told: str):

@@ -9,7 +9,7 @@ from objslam.core.calibration import CalibratedMeasurements
 from objslam.errors import SolveError
 from objslam.graph.calibration.inner_solve import InnerSolve
 from objslam.graph.calibration.shared_error_jacobian import ReducedSystem
-from objslam.graph.calibration.shrinkage import shrinking_force
+from objslam.graph.calibration.shrinkage import force_of_heights, shrinking_force
 
 RIDGE = 1e-9
 """The share of the variance of a gradient, or of the information, that is added to its diagonal. It prevents a division by
@@ -76,7 +76,8 @@ def without_shrinking(
     size = np.einsum("ni,nip->p", around, moved) / max(float((around**2).sum()), 1e-12)
     growing = np.where([name in errors.unknown_scales for name in errors.names], 1 + theta, 0.0)
     if not growing @ size > _LEAST_GROWTH:
-        return replace(system, gradient=system.gradient + shrinking_force(state)[0] * size)
+        force = shrinking_force(state)[0] + force_of_heights(state)
+        return replace(system, gradient=system.gradient + force * size)
     project = np.eye(len(theta)) - np.outer(size, growing) / (growing @ size)
     return replace(
         system,

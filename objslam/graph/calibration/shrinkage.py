@@ -3,13 +3,17 @@
 import numpy as np
 
 from objslam.core.arrays import Floats
-from objslam.core.geometry import inverse
+from objslam.core.geometry import adjoint, inverse, is_planar, log_se3
 from objslam.graph.calibration.instruments import from_neighbours, moment_of
 from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.factors.localized_rows import LocalizedRows
 
 _LEAST_TOLD = 0.3
 """`shrinking_force` predicts motions by their neighbours if the prediction explains at least this share of the squared
 motions. A larger share uses it more rarely."""
+
+_HEIGHT = 5
+"""The place of the motion upwards in a twist of the robot's base, whose rotation is first."""
 
 
 def shrinking_force(of: Linearised) -> tuple[float, float]:
@@ -47,6 +51,36 @@ def shrinking_force(of: Linearised) -> tuple[float, float]:
     ranged = np.isfinite(rays.range)
     lengths = ways + float(((rays.range[ranged] / rays.range_sigma[ranged]) ** 2).sum()) + _of_tags(of)
     return max(force, 0.0), max(lengths, 1.0)
+
+
+def force_of_heights(of: Linearised) -> float:
+    """Return the force with which heights make a solution at localised, planar poses too small, as `shrinking_force`.
+
+    Noise in the rays, and ground that is not flat, lift and lower the solved poses. Planar poses have no heights. They say
+    only how large heights may be, and the log itself shows this. In a smaller map all heights are smaller, and cost less.
+    This says nothing about the size. The motions by odometry are left out, because their noise follows the odometry's scale.
+    """
+    keyframes = of.measured.keyframes
+    if not keyframes.localized_every or not is_planar(keyframes.map_T_base):
+        return 0.0
+    off, roots, _ = of.graph.absolute_roots(of.map_T_camera)
+    force = _by_heights(keyframes.base_T_camera, off, roots)
+    for rows in of.graph.further:
+        if isinstance(rows, LocalizedRows):
+            off = log_se3(inverse(rows.of.motion) @ rows.moved(of.map_T_camera))
+            force += _by_heights(keyframes.base_T_camera[rows.of.after], off, rows.weighted_roots(of.map_T_camera))
+    return force
+
+
+def _by_heights(base_T_camera: Floats, off: Floats, roots: Floats) -> float:
+    """Return the derivative of the cost by the logarithm of all heights.
+
+    base_T_camera: (n, 4, 4). off: (n, 6) the twists between solved and measured poses or motions, in the camera frames.
+    roots: (n, 6, 6) matrices that whiten them.
+    """
+    height = (adjoint(base_T_camera)[:, _HEIGHT] * off).sum(axis=1)
+    raised = adjoint(inverse(base_T_camera))[:, :, _HEIGHT] * height[:, None]
+    return float(((roots @ off[..., None]) * (roots @ raised[..., None])).sum())
 
 
 def _of_tags(of: Linearised) -> float:

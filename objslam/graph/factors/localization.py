@@ -18,6 +18,7 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.geometry import adjoint, inverse, is_planar
 from objslam.core.ground.flattening import noise_of_ground
 from objslam.core.statistics import Lasting
+from objslam.core.trajectory import ways
 from objslam.core.types import Keyframes
 from objslam.graph.factors.noise import huber
 from objslam.graph.variables import X0
@@ -127,8 +128,14 @@ def localized_motions(keyframes: Keyframes, settings: Settings, on_plane: bool |
 
 
 def _way(keyframes: Keyframes, number: Ints) -> Floats:
-    """Return the distances (n-1,), m, between consecutive keyframes of `number` (n,)."""
-    return np.asarray(np.linalg.norm(np.diff(keyframes.map_T_base[number, :3, 3], axis=0), axis=1))
+    """Return the distances (n-1,), m, that the robot drove between consecutive keyframes of `number` (n,).
+
+    They are from the odometry, without its shared errors. Distances between localised places contain the noise of the
+    motions that they weigh: motions that seem short would count for more, and make the map too small. Distances that
+    follow the odometry's scale would make a larger map fit better.
+    """
+    driven = ways(keyframes) if keyframes.driven is None else keyframes.driven
+    return np.diff(driven[number])
 
 
 def _motions(keyframes: Keyframes, number: Ints, parts: tuple[Parts, ...]) -> LocalizedMotions:
