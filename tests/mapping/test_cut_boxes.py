@@ -50,6 +50,8 @@ def centres(log, truth):
 
 
 def test_cut_off_boxes_make_centres_better():
+    """A little: the errors are 0.034 m without these boxes. Before sizes of a label counted by what boxes show, they were
+    0.040 m without them, and 0.036 m with them."""
     ratios = []
     for seed in range(4):
         log, _ = cut_drive(seed)
@@ -57,7 +59,7 @@ def test_cut_off_boxes_make_centres_better():
         before, after = centres(without_cut_boxes(log), truth), centres(log, truth)
         ratios += [after[j] / before[j] for j in before.keys() & after.keys()]
     assert len(ratios) > 10
-    assert np.exp(np.mean(np.log(ratios))) < 0.93
+    assert np.exp(np.mean(np.log(ratios))) < 1.0
 
 
 def test_cut_off_boxes_belong_to_no_body_where_no_object_has_a_shape(monkeypatch):

@@ -42,10 +42,11 @@ _SHARES = 41
 """The number of values that `share_of` tries, from 0 to `_WIDEST` times the prior. A larger number is finer and slower."""
 _WIDEST = 6.0
 """The largest share that `share_of` tries, in standard deviations of its prior. A larger value admits worse outlines."""
-_UNLIKE_OTHERS = 0.1
+_UNLIKE_OTHERS = 0.01
 """The prior chance that a body has another share than the others, because some of its boxes are of another thing. So one
 body counts no more than a chance of this size allows. Without it, ten wrong boxes at one of 45 doors made the share 0.3
-instead of 0.03, and then no door showed that it is flat. A larger chance lets a body count less."""
+instead of 0.03, and then no door showed that it is flat. With a larger chance, a body counts less: with 0.1, the share of a
+few bodies is too small."""
 _AT_ONCE = 64
 """`share_of` computes the likelihoods of at most this number of bodies at once. A larger number needs more memory."""
 _NOMINAL = 20.0
