@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -173,6 +174,18 @@ def test_a_frame_whose_boxes_are_apart_takes_no_search_and_changes_nothing(monke
     assert quick == full
     assert full._near.total() > 20
     assert 200 < len(calls) < 400
+
+
+def test_the_memory_of_a_crowded_frame_grows_with_its_boxes():
+    """All pairs of 4,000 boxes would take 128 MB for each number of a pair."""
+    rng = np.random.default_rng(3)
+    at, label = rng.uniform(0, 4000, (4000, 2)), rng.integers(0, 3, 4000)
+    boxes = np.hstack([at, at + rng.uniform(5, 50, (4000, 2))])
+    tracemalloc.start()
+    SecondLabelFinder().add(0, boxes, label, rng.uniform(0.3, 1.0, 4000))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 30e6
 
 
 def test_a_frame_without_a_box_has_no_second_labels():
