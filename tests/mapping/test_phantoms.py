@@ -13,6 +13,7 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import joint_solve, pipeline
+from objslam.mapping.moves import phantoms
 from objslam.mapping.moves.phantoms import BENT, NEIGHBOURS, check_neighbours
 from objslam.simulation import DriveSettings, PoseNoise, simulate
 
@@ -89,6 +90,16 @@ def test_no_objects_are_left_where_rays_of_several_things_meet(monkeypatch):
     for name in ("has_lasting_errors", "begins_with_lasting_errors"):
         monkeypatch.setattr(joint_solve, name, lambda state: False)
     assert mapped(log, "checks.use=false")[0][1] > 0
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+def test_no_object_is_tried_where_the_path_search_is_too_coarse(monkeypatch, coarse):
+    tried = []
+    monkeypatch.setattr(phantoms, "_without", lambda state, j: tried.append(j))
+    if coarse:
+        monkeypatch.setattr(phantoms, "_COARSE", -np.inf)
+    mapped(turned(drive(0), 0), "checks.use=false")
+    assert len(tried) == (0 if coarse else 8)
 
 
 def test_a_good_localisation_takes_no_time_for_phantoms(monkeypatch):

@@ -16,6 +16,7 @@ from objslam.mapping.moves.odometry_witness import lasting_by_odometry, lasting_
 if TYPE_CHECKING:
     from objslam.config import Settings
     from objslam.core.arrays import Ints
+    from objslam.core.estimate import Estimate
     from objslam.frontend.shared_errors import SharedErrors
     from objslam.mapping.joint.joint_alternation import JointState
     from objslam.mapping.solution import Solution
@@ -43,6 +44,11 @@ UNTOLD = "errors of poses that the solve does not show"
 _MOST = 60
 """The most objects that are tried as phantoms. The least likely objects are tried first. Each takes a search of the path and
 a solve. A larger number finds more phantoms in large maps, and takes longer."""
+_COARSE = 100.0
+"""If the most likely path with all objects loses more log evidence than this, phantoms are not searched. The path search is
+then too coarse for the log, and each path without an object loses about as much. In 12 simulated drives the path lost at
+most 20, and a dropped object gained at most 50. In a museum the path lost 360 with each of 60 objects taken out. With a
+larger value, more logs take the time of the search."""
 
 
 def has_lasting_errors(state: JointState) -> bool:
@@ -129,6 +135,11 @@ def without_phantoms(state: JointState) -> JointState:
     assert state.association is not None
     best = replace(state.attempt(), hold=state.errors is not None)
     best = begin = best.solve("association", state.association, state.solved_poses)
+    assert best.estimate is not None
+    whole = _along_likely_path(best, best.estimate)
+    if whole is None or whole.explained < best.explained - _COARSE:
+        return state
+    best = whole if whole.explained > best.explained else best
     tried = _candidates(state)
     while len(tried):
         found, phantoms = best, list[int]()
@@ -166,12 +177,17 @@ def _candidates(state: JointState) -> Ints:
 
 def _without(state: JointState, j: int) -> JointState | None:
     """Return the state after a solve without object `j`, with the rays along the most likely path. None without a path."""
-    assert state.association is not None
     assert state.estimate is not None
     positions = state.estimate.positions.copy()
     positions[j] = np.nan
-    left = replace(state.estimate, positions=positions)
-    found = relocalize(state.keyframes, state.rays, state.cameras, state.settings, state.association, left)
+    return _along_likely_path(state, replace(state.estimate, positions=positions))
+
+
+def _along_likely_path(state: JointState, estimate: Estimate) -> JointState | None:
+    """Return the state after a solve with the rays along the most likely path through the map `estimate`. None without a
+    path."""
+    assert state.association is not None
+    found = relocalize(state.keyframes, state.rays, state.cameras, state.settings, state.association, estimate)
     if found is None:
         return None
     path, association = found
