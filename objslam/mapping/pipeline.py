@@ -55,6 +55,7 @@ from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.level_path import levelled
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
+from objslam.mapping.joint.contradicting_ranges import with_contradicting_ranges
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.joint.path_against_localization import check_bent_path
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log
@@ -257,6 +258,7 @@ def _run(
         diagnosis = diagnosis.with_findings([wrong])
         say(diagnosis, ledger)
     objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
+    objects = with_contradicting_ranges(objects, solved, *used, estimate.weight)
     objects = widened(objects, *used, estimate.weight, diagnosis)
     where = None
     if known is not None:
