@@ -47,6 +47,7 @@ from objslam.mapping.chosen_poses import (
     with_mode_of,
     without_localization,
 )
+from objslam.mapping.contradicting_ranges import with_contradicting_ranges
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.far_sides import with_far_sides
@@ -55,7 +56,6 @@ from objslam.mapping.fixed.lasting_noise import LastingNoise
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.level_path import levelled
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
-from objslam.mapping.joint.contradicting_ranges import with_contradicting_ranges
 from objslam.mapping.joint.held_errors import check_turned_camera, with_held_errors
 from objslam.mapping.joint.path_against_localization import check_bent_path
 from objslam.mapping.localization import PriorMap, describe_in_map, localize, moved_log

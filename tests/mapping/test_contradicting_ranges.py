@@ -6,9 +6,12 @@ import json
 
 import numpy as np
 import pytest
+from waiting import LIMIT
 
 import objslam
 from objslam.config import load_settings
+from objslam.live.adapters.replay import events
+from objslam.live.session.session import Session
 
 FOCAL, HALF = 500.0, 0.15
 CAMERA = """image_width: 640
@@ -60,4 +63,17 @@ def test_an_object_has_a_sigma_that_reaches_to_its_ranges(tmp_path):
     assert 4.3 < ahead < 4.7
     assert sigma_ahead(by_label["fridge"]) == pytest.approx(4.9 - ahead, abs=0.15)
     assert all(sigma_ahead(one) < 0.1 for one in usual)
+    assert sigma_ahead(by_label["oven"]) < 0.2
+
+
+def test_a_session_ends_with_the_same_sigma(tmp_path):
+    settings = load_settings(None, ("mode=joint", "calibration.use=false", "checks.use=false", "output.recording=false"))
+    log = log_with_depths(tmp_path / "log", {"fridge": 0.9})
+    session = Session(settings, patient=True).start()
+    session.push_camera(log.cameras[0].camera)
+    for _, frame, one in events(log):
+        one(session)
+        assert not frame or session.wait(LIMIT), session.failure
+    by_label = {one.label: one for one in session.stop().map.objects}
+    assert sigma_ahead(by_label["fridge"]) == pytest.approx(4.9 - by_label["fridge"].position[0], abs=0.15)
     assert sigma_ahead(by_label["oven"]) < 0.2

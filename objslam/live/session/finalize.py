@@ -32,6 +32,7 @@ from objslam.mapping.checks.finding import Finding
 from objslam.mapping.checks.misfits import find_misfits, with_misfits
 from objslam.mapping.checks.shared_errors import at_bounds
 from objslam.mapping.checks.verdict import say
+from objslam.mapping.contradicting_ranges import with_contradicting_ranges
 from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.joint.doubted_labels import doubted_names
@@ -106,6 +107,7 @@ def finish(m: MapState, name: str, journal: Path | None, known: PriorMap | None 
         findings += [finding for finding in (near, rows, depths) if finding is not None]
     say(Diagnosis(tuple(findings)), ledger)
     objects = with_misfits(objects, find_misfits(objects, *used, residual, estimate.weight, settings))
+    objects = with_contradicting_ranges(objects, estimate.map_T_base @ keyframes.base_T_camera, *used, estimate.weight)
     ids = _kept_ids(found.association, found.ids, solution.association)
     objects = replace(objects, objects=tuple(replace(o, id=j) for o, j in zip(objects.objects, ids, strict=True)))
     where = None
