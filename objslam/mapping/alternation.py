@@ -15,6 +15,7 @@ from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.unexplained import warn_of_unexplained
 from objslam.mapping.fixed.camera_calibration import calibrate_fixed
 from objslam.mapping.fixed.fixed_poses import FixedPoses, associate_fixed
+from objslam.mapping.fixed.map_at_poses import MapAtPoses
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import Solution, seen_something, without_errors
 
@@ -31,6 +32,7 @@ def solve(
     progress: Progress,
     start: InitialEstimate | None = None,
     errors: SharedErrors | None = None,
+    earlier: MapAtPoses | None = None,
 ) -> Solution:
     """Find and solve the objects of a log.
 
@@ -42,7 +44,8 @@ def solve(
 
     frames: all keyframes with a pose, also without rays. start: a known start for the keyframes with rays. With it,
     the joint mode neither explores nor trusts labels. errors: the shared errors of the keyframes with rays. They are
-    estimated and removed from the keyframes and rays. SolveError if the joint mode has neither odometry nor localisation.
+    estimated and removed from the keyframes and rays. earlier: a map of the log at its poses. SolveError if the joint mode
+    has neither odometry nor localisation.
     """
     keyframes, rays_of_keyframes = seen_something(frames, rays)
     trace = Trace(keyframes.base_T_camera) if settings.output.recording else None
@@ -66,6 +69,8 @@ def solve(
         from objslam.mapping.moves.missed_loops import largest_copy_in
 
         begin = JointState(frames, rays, keyframes, rays_of_keyframes, cameras, settings, ledger, progress, trace, errors)
+        if earlier is not None:
+            begin = replace(begin, at_poses=earlier.association_of(rays_of_keyframes))
         state = solve_joint(begin, start)
         if errors is not None and state.errors is not None and state.errors.names != errors.names:
             estimated = errors = state.errors.with_noise(errors.noise)

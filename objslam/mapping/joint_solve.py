@@ -247,8 +247,10 @@ def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
     """
     if begin.errors is None:
         return state
-    measured = begin.frames, begin.all_rays, *seen_something(begin.frames, begin.all_rays)
-    found = associate_at_poses(FixedPoses(*measured, begin.cameras, begin.settings), begin.errors.log, begin.progress)
+    found = begin.at_poses
+    if found is None:
+        measured = begin.frames, begin.all_rays, *seen_something(begin.frames, begin.all_rays)
+        found = associate_at_poses(FixedPoses(*measured, begin.cameras, begin.settings), begin.errors.log, begin.progress)
     if found is None or finds_same_objects(state, found):
         return state
     attempt = begin.attempt().counted(found).solve("association", found)

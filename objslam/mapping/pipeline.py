@@ -52,7 +52,7 @@ from objslam.mapping.corrected import corrected
 from objslam.mapping.describe import describe, make_result, summarise
 from objslam.mapping.fixed.far_sides import with_far_sides
 from objslam.mapping.fixed.lasting_errors import check_lasting_noise, with_lasting_errors
-from objslam.mapping.fixed.lasting_noise import LastingNoise
+from objslam.mapping.fixed.map_at_poses import MapAtPoses
 from objslam.mapping.fixed.sparse_noise import with_sparse_noise
 from objslam.mapping.ground.level_path import levelled
 from objslam.mapping.ground.uneven_ground import with_uneven_ground
@@ -90,7 +90,7 @@ def run(
     """
     before = ledger.copy()
     try:
-        result, wrong, lasting = _run(log, settings, ledger, progress, known)
+        result, wrong, found = _run(log, settings, ledger, progress, known)
     except SolveError as error:
         chosen = chosen_poses(log, settings)
         if settings.mode != "auto" or chosen.localization is None or with_mode_of(chosen, settings).mode == "fixed":
@@ -109,14 +109,14 @@ def run(
             ledger.restore(at_poses)
             return result
     # Without odometry, the second solve takes the noise of the localisation from the rays.
-    untold = lasting is not None and settings.finds_localization_noise
+    untold = found.lasting is not None and settings.finds_localization_noise
     if settings.mode != "auto" or not wrong or (chosen_poses(log, settings).odometry is None and not untold):
         return result
     at_poses = ledger.copy()
     ledger.restore(before)  # What a run drops counts once.
     ledger.warn(f"{wrong}, so the poses are solved too (--mode fixed keeps them)")
     try:
-        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known, lasting)[0]
+        return _run(log, settings.model_copy(update={"mode": "joint"}), ledger, progress, known, found)[0]
     except SolveError as error:  # The map at the given poses is better than none.
         ledger.restore(at_poses)
         ledger.warn(f"{wrong}, but the poses cannot be solved too: {error}")
@@ -129,11 +129,10 @@ def _run(
     ledger: Ledger,
     progress: Progress,
     known: PriorMap | None,
-    earlier: LastingNoise | None = None,
-) -> tuple[RunResult, str, LastingNoise | None]:
+    earlier: MapAtPoses | None = None,
+) -> tuple[RunResult, str, MapAtPoses]:
     """Map the objects of a log as `run` does, in one mode. Also return why given poses seem to be wrong, "" if they do not.
-    The third value is the lasting errors of the poses, None if they are too small for a finding. earlier: the lasting errors
-    that an earlier map at the given poses found."""
+    The third value is what the map tells a joint solve, if it is at the given poses. earlier: this of an earlier map."""
     recorded = [c.detections for c in log.cameras if c.detections is not None]
     log, clock = at_one_clock(with_chosen_poses(log, settings, ledger), settings, ledger)
     log = without_robot_parts(log, settings, ledger)
@@ -191,7 +190,7 @@ def _run(
         if settings.mode == "joint" and diagnosis.refutable:
             of_labels = with_known_labels(diagnosis, log, rays, settings, of_solve)
         try:
-            solution = solve(frames, rays, cameras, of_labels, ledger, of_solve, errors=errors)
+            solution = solve(frames, rays, cameras, of_labels, ledger, of_solve, errors=errors, earlier=earlier)
         except SolveError:
             say(diagnosis, ledger)
             raise
@@ -237,7 +236,8 @@ def _run(
         missing = missing or late
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
-    told = None if earlier is None else (earlier.yaw, earlier.xy)
+    shown = None if earlier is None else earlier.lasting
+    told = None if shown is None else (shown.yaw, shown.xy)
     if (
         settings.checks.use
         and settings.mode == "joint"
@@ -318,7 +318,7 @@ def _run(
     testable = open_mode and settings.mode == "fixed" and not diagnosis.certain  # A joint solve may refute what boxes show.
     if not why and settings.checks.use and testable and unclear and odometry_contradicts(given, settings):
         why = "the odometry shows that the localisation errs for seconds"
-    return result, why, None if late is None else lasting
+    return result, why, MapAtPoses(None if late is None else lasting, solution.rays, solution.association)
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

@@ -54,7 +54,8 @@ class JointState:
     (P,) their last values, None before the first solve. hold: whether the shared errors are known well enough to stay fixed
     until the last solve. unsettled, unfinished: as in `Solution`. effort: of the search that the state is a part of.
     doubted: the labels that may name one object or several. names: the objects of labels that are known to be names. The
-    rounds of association leave these objects their rays, and look for objects of the other labels only.
+    rounds of association leave these objects their rays, and look for objects of the other labels only. at_poses: the
+    association of a map at the given poses, if there is one.
     """
 
     frames: Keyframes
@@ -74,6 +75,7 @@ class JointState:
     effort: Effort = field(default_factory=Effort)
     doubted: tuple[str, ...] = ()
     names: Association | None = None
+    at_poses: Association | None = None
     rounds: tuple[dict[str, int], ...] = ()
     association: Association | None = None
     estimate: Estimate | None = None

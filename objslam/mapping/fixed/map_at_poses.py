@@ -1,0 +1,25 @@
+"""What a map at the given poses tells a joint solve of the same log."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from objslam.core.types import Association, Rays
+from objslam.mapping.fixed.lasting_noise import LastingNoise
+
+
+@dataclass(frozen=True)
+class MapAtPoses:
+    """A map at the given poses. lasting: their errors that last, None if they are too small for a finding. rays: of the map.
+    association: of these rays."""
+
+    lasting: LastingNoise | None
+    rays: Rays
+    association: Association
+
+    def association_of(self, rays: Rays) -> Association | None:
+        """Return the association if these are the rays of the map, from the same boxes. Else return None. Their directions
+        may differ."""
+        ours, theirs = (np.column_stack([of.keyframe, of.label, of.box]) for of in (self.rays, rays))
+        same = np.array_equal(ours, theirs) and self.rays.label_names == rays.label_names
+        return self.association if same else None
