@@ -318,7 +318,7 @@ def _run(
     testable = open_mode and settings.mode == "fixed" and not diagnosis.certain  # A joint solve may refute what boxes show.
     if not why and settings.checks.use and testable and unclear and odometry_contradicts(given, settings):
         why = "the odometry shows that the localisation errs for seconds"
-    return result, why, MapAtPoses(None if late is None else lasting, solution.rays, solution.association)
+    return result, why, MapAtPoses(None if late is None else lasting, solution.rays, solution.association, trusted)
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

@@ -11,15 +11,16 @@ from objslam.mapping.fixed.lasting_noise import LastingNoise
 @dataclass(frozen=True)
 class MapAtPoses:
     """A map at the given poses. lasting: their errors that last, None if they are too small for a finding. rays: of the map.
-    association: of these rays."""
+    association: of these rays. trusted: whether no wrong input spoils the map."""
 
     lasting: LastingNoise | None
     rays: Rays
     association: Association
+    trusted: bool
 
     def association_of(self, rays: Rays) -> Association | None:
-        """Return the association if these are the rays of the map, from the same boxes. Else return None. Their directions
-        may differ."""
+        """Return the association if the map is trusted, and these are its rays, from the same boxes. Else return None. Their
+        directions may differ."""
         ours, theirs = (np.column_stack([of.keyframe, of.label, of.box]) for of in (self.rays, rays))
-        same = np.array_equal(ours, theirs) and self.rays.label_names == rays.label_names
+        same = self.trusted and np.array_equal(ours, theirs) and self.rays.label_names == rays.label_names
         return self.association if same else None
