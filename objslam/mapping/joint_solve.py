@@ -243,7 +243,8 @@ def _or_as_in_fixed_mode(begin: JointState, state: JointState) -> JointState:
     gates may be too wide for rows of equal things. They may be too narrow for a camera that is mounted askew, or for a
     localisation that errs for seconds. Then an object has rays of two things. The later rounds keep these rays, because the
     poses were bent to fit them. The fixed mode calibrates the cameras, and finds the noise of the poses in the boxes of each
-    frame. begin: before the first association. state: after the rounds that began there.
+    frame. The association of an earlier map at the poses is taken, if there is one. begin: before the first association.
+    state: after the rounds that began there.
     """
     if begin.errors is None:
         return state

@@ -60,6 +60,8 @@ def test_only_the_rays_of_the_map_have_its_objects(drive):
     rays = build_rays(drive, build_keyframes(drive, settings, Ledger()), settings, Ledger())
     known = MapAtPoses(None, rays, Association(np.zeros(len(rays), dtype=np.int64), np.zeros(1, dtype=np.int64)), True)
     assert known.association_of(replace(rays, direction=-rays.direction)) is known.association
+    bearings = replace(rays, box=np.full_like(rays.box, np.nan))
+    assert replace(known, rays=bearings).association_of(bearings) is known.association
     assert replace(known, trusted=False).association_of(rays) is None
     assert known.association_of(rays.take(np.arange(len(rays) - 1))) is None
     assert known.association_of(replace(rays, box=rays.box + 1)) is None

@@ -22,5 +22,6 @@ class MapAtPoses:
         """Return the association if the map is trusted, and these are its rays, from the same boxes. Else return None. Their
         directions may differ."""
         ours, theirs = (np.column_stack([of.keyframe, of.label, of.box]) for of in (self.rays, rays))
-        same = self.trusted and np.array_equal(ours, theirs) and self.rays.label_names == rays.label_names
+        same = np.array_equal(ours, theirs, equal_nan=True)  # Bearings without a box have NaN.
+        same = self.trusted and same and self.rays.label_names == rays.label_names
         return self.association if same else None

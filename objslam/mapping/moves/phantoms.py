@@ -47,8 +47,8 @@ a solve. A larger number finds more phantoms in large maps, and takes longer."""
 _COARSE = 100.0
 """If the most likely path with all objects loses more log evidence than this, phantoms are not searched. The path search is
 then too coarse for the log, and each path without an object loses about as much. In 12 simulated drives the path lost at
-most 20, and a dropped object gained at most 50. In a museum the path lost 360 with each of 60 objects taken out. With a
-larger value, more logs take the time of the search."""
+most 20, and a dropped object gained at most 50. In a museum, it lost 360 or more with each of 60 objects taken out. With
+a larger value, more logs take the time of the search."""
 
 
 def has_lasting_errors(state: JointState) -> bool:
@@ -130,7 +130,9 @@ def without_phantoms(state: JointState) -> JointState:
     a thing, and a solve bends the path until they agree. Each ray then fits, so no round of association frees it. Here each
     object is taken out of the map in turn. The most likely path without the object gives its rays to other objects. If this
     explains the log better, the object is a phantom. The phantom whose loss explains the log best is dropped, and the other
-    phantoms are tried again. The shared errors and the noise are fixed in these trials.
+    phantoms are tried again. The shared errors and the noise are fixed in these trials. The first trial keeps all objects.
+    If its path is much worse, the path search is too coarse for the log (`_COARSE`), and nothing else is tried. If it is
+    better, the other trials begin there.
     """
     assert state.association is not None
     best = replace(state.attempt(), hold=state.errors is not None)
@@ -141,6 +143,8 @@ def without_phantoms(state: JointState) -> JointState:
         return state
     best = whole if whole.explained > best.explained else best
     tried = _candidates(state)
+    assert best.estimate is not None
+    tried = tried[np.isfinite(best.estimate.positions[tried, 0])]
     while len(tried):
         found, phantoms = best, list[int]()
         for number, j in enumerate(tried.tolist()):
