@@ -1,9 +1,12 @@
-"""Processes of a fleet find the modules of the tests, and the store that fails."""
+"""Processes of a fleet find the modules of the tests, and the store that fails. Several fleets share them."""
 
 import os
+from functools import cache
 from pathlib import Path
 
 import pytest
+
+from objslam.fleet.engines import local_engine as engines
 
 TESTS = Path(__file__).parents[1]
 
@@ -19,3 +22,15 @@ def paths(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", os.pathsep.join([str(folder), str(TESTS), os.environ.get("PYTHONPATH", "")]))
         yield folder
+
+
+@pytest.fixture(autouse=True, scope="package")
+def kept_processes(paths):
+    """The commands in this process share one engine, so that its processes are started once, with a second for imports.
+
+    A process does one task after another anyway. Tests of how processes start and end make engines of their own."""
+    kept = cache(engines.local_engine)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(engines, "local_engine", kept)
+        yield
+    kept.cache_clear()

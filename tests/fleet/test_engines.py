@@ -70,6 +70,15 @@ def test_an_engine_that_is_left_ends_its_processes():
         works.os.kill(first, 0)
 
 
+def test_the_processes_of_an_engine_go_on_with_its_next_call_and_end_with_it():
+    engine = local_engine(1, Limits())
+    (first,), (again,) = (list(engine(WORK + "process", [k])) for k in range(2))
+    assert (first.value[0], 1) == again.value
+    del engine
+    with pytest.raises(ProcessLookupError):
+        works.os.kill(first.value[0], 0)
+
+
 def test_an_engine_takes_arguments_as_it_needs_them():
     taken = []
 

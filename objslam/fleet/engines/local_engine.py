@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 import threading
+import weakref
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -59,31 +59,57 @@ def attempt(worker: Worker, work: str, argument: Any, limits: Limits) -> Answer:
         return Answer(argument, None, "memory", f"out of memory: {one_line(error)}")
 
 
+class _Pool:
+    """Threads, each of which waits for the answers of a process of its own. A thread computes nothing.
+
+    The threads stay with their processes. A process dies with the thread that started it.
+    """
+
+    def __init__(self, jobs: int, limits: Limits) -> None:
+        self._threads = ThreadPoolExecutor(jobs, "objslam fleet")
+        self._own, self._workers, self._limits = threading.local(), list[Worker](), limits
+
+    def submit(self, work: str, argument: Any) -> Future[Answer]:
+        return self._threads.submit(self._task, work, argument)
+
+    def _task(self, work: str, argument: Any) -> Answer:
+        if not hasattr(self._own, "worker"):
+            self._own.worker = Worker()
+            self._workers.append(self._own.worker)
+        return attempt(self._own.worker, work, argument, self._limits)
+
+    def end(self) -> None:
+        """End the processes, whatever they do, and then the threads, which wait for them."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        for worker in self._workers:
+            worker.close()
+        self._threads.shutdown()
+
+
 def local_engine(jobs: int, limits: Limits) -> Engine:
     """Return the engine of this machine, with `jobs` processes. Each does one task at a time.
 
-    For each process, a thread of this program waits for the answers. This thread computes nothing.
+    The processes also do the tasks of the next call, so that each imports the libraries once. They end with the engine, and
+    with a call whose answers are not all taken.
     """
+    pools: list[_Pool] = []
 
     def run(work: str, arguments: Iterable[Any]) -> Iterator[Answer]:
-        own = threading.local()
-        with ExitStack() as stack:
-            pool = stack.enter_context(ThreadPoolExecutor(jobs, "objslam fleet"))
-            closing = stack.enter_context(ExitStack())  # Closed before the pool, whose threads wait for the processes.
+        pool = pools.pop() if pools else _Pool(jobs, limits)
+        try:
+            yield from _in_flight(lambda argument: pool.submit(work, argument), arguments, jobs)
+        except BaseException:
+            pool.end()
+            raise
+        pools.append(pool)
 
-            def task(argument: Any) -> Answer:
-                if not hasattr(own, "worker"):
-                    own.worker = Worker()
-                    closing.callback(own.worker.close)
-                return attempt(own.worker, work, argument, limits)
-
-            try:
-                yield from _in_flight(lambda argument: pool.submit(task, argument), arguments, jobs)
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
-
+    weakref.finalize(run, _end, pools)
     return run
+
+
+def _end(pools: list[_Pool]) -> None:
+    for pool in pools:
+        pool.end()
 
 
 def _in_flight(submit: Callable[[Any], Future[Answer]], arguments: Iterable[Any], jobs: int) -> Iterator[Answer]:
