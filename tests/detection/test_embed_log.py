@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from commands import call
 from onnx import TensorProto, helper
 from tiny_models import COLOURS, Graph, scene, tiny_model
-from waiting import LIMIT
 
 import objslam
 from objslam.config import Settings
@@ -142,9 +140,7 @@ def test_the_command_for_one_photo_tells_the_vectors(log: objslam.Log, tmp_path:
     model = encoder(tmp_path / "m.onnx", **{"objslam.encoder": PLAIN})
     assert log.cameras[0].rgb is not None
     words = ["detect", str(detector), str(log.cameras[0].rgb.paths[0]), "--embed", str(model), "--json"]
-    done = subprocess.run(
-        [sys.executable, "-m", "objslam", *words], capture_output=True, text=True, timeout=LIMIT, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    for row in json.loads(done.stdout)["boxes"]:
+    done = call(*words)
+    assert done.code == 0, done.err
+    for row in json.loads(done.out)["boxes"]:
         assert int(np.argmax(row["features"])) == COLOURS.index(row["label"])

@@ -1,15 +1,10 @@
 """A replayed recording whose boxes a detector finds: `objslam live RECORDING --detector MODEL`."""
 
-import os
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
 from quick import QUICK
 from tiny_models import COLOURS, scene, tiny_model
-from waiting import LIMIT
 
 from objslam.core.camera import Camera
 from objslam.core.geometry import lift_se2, make_pose
@@ -47,32 +42,28 @@ def recording(tmp_path):
     return tmp_path / "log"
 
 
-def live(recording, out, *more):
-    return subprocess.run(
-        [sys.executable, "-m", "objslam", "live", str(recording), "-o", str(out), "--speed", "0", *QUICK, *more],
-        env={**os.environ, "XDG_CACHE_HOME": str(out.parent / "cache")},
-        capture_output=True,
-        text=True,
-        timeout=LIMIT,
-        check=False,
-    )
+@pytest.fixture
+def live(recording, tmp_path, objslam, monkeypatch):
+    """The command on the recording, without boxes of another run in the cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return lambda *more: objslam("live", recording, "-o", tmp_path / "out", "--speed", "0", *QUICK, *more)
 
 
-def test_a_detector_finds_the_boxes_of_a_replay(recording, tmp_path):
+def test_a_detector_finds_the_boxes_of_a_replay(live, tmp_path):
     model = tiny_model(tmp_path / "m.onnx", "yolov8", size=(320, 320), metadata={"names": list(COLOURS)})
-    done = live(recording, tmp_path / "out", "--detector", str(model))
-    assert done.returncode == 0, done.stderr
-    assert "has no meaning" not in done.stderr
+    done = live("--detector", model)
+    assert done.code == 0, done.err
+    assert "has no meaning" not in done.err
     found = {o.label: o.position for o in load_map(tmp_path / "out").resolved()}
     assert set(found) == set(THINGS)
     for name, place in THINGS.items():
         np.testing.assert_allclose(found[name], place, atol=0.05)
 
 
-def test_a_replay_without_boxes_is_refused_at_once(recording, tmp_path):
-    done = live(recording, tmp_path / "out")
-    assert done.returncode == 1
-    assert len(done.stderr.splitlines()) == 1
-    assert "no boxes to replay" in done.stderr
-    assert "--detector" in done.stderr
+def test_a_replay_without_boxes_is_refused_at_once(live, tmp_path):
+    done = live()
+    assert done.code == 1
+    assert len(done.err.splitlines()) == 1
+    assert "no boxes to replay" in done.err
+    assert "--detector" in done.err
     assert not (tmp_path / "out").exists()
