@@ -1,5 +1,7 @@
 """Labels of several things each, which rays in diverging directions show without a solve."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from added_errors import add_shared_errors
@@ -34,9 +36,15 @@ def test_rays_from_one_place_are_compared_by_their_directions():
     assert angles_to_ray(here, ahead, here - ahead, ahead)[0] == 0
 
 
+@cache
+def of_robot(seed: int):
+    """The log of a robot with a gyroscope."""
+    return robot(seed, "gyro")[0]
+
+
 @pytest.mark.parametrize("errors", [{}, {"front.clock": 0.5}, {"front.clock": -0.5}, {"odometry.turn_scale": 0.2}], ids=str)
 def test_names_are_no_classes_whatever_the_errors(errors):
-    log = add_shared_errors(robot(9003, "gyro")[0], errors)
+    log = add_shared_errors(of_robot(9003), errors)
     found = errors_of(log, "mode=joint")
     assert not labels_diverge(found.keyframes, found.rays)
     assert not labels_diverge(found.keyframes, found.rays.take(np.zeros(len(found.rays), dtype=bool)))
@@ -44,7 +52,7 @@ def test_names_are_no_classes_whatever_the_errors(errors):
 
 def test_a_log_whose_labels_have_several_things_takes_no_solve_of_names(monkeypatch):
     monkeypatch.setattr(joint_solve, "by_label", lambda state: pytest.fail("labels were solved as names"))
-    log = with_classes(robot(9004, "gyro")[0], 5, 9004)
+    log = with_classes(of_robot(9004), 5, 9004)
     result = pipeline.run(log, load_settings(None, ("mode=joint", "output.recording=false", "bodies.use=false")), Ledger())
     compared = evaluate(result.map, log.truth, align="se2", radius=0.5).to_dict()
     assert tuple(compared[name] for name in ("matched", "false", "missed")) == (8, 0, 0)
@@ -58,7 +66,7 @@ def test_the_setting_that_labels_are_names_counts(monkeypatch):
         raise RuntimeError
 
     monkeypatch.setattr(joint_solve, "by_label", by_label)
-    log = with_classes(robot(9004, "gyro")[0], 5, 9004)
+    log = with_classes(of_robot(9004), 5, 9004)
     with pytest.raises(RuntimeError):
         pipeline.run(log, load_settings(None, ("mode=joint", "association.method=by_label")), Ledger())
     assert called

@@ -51,13 +51,19 @@ def plain(*more: str):
     return run(drive(0), *more)
 
 
+@cache
+def with_gross(name: str, value: float):
+    """The log of a drive with a gross error, and its run, which keeps the steps of the solver for a recording."""
+    log = add_shared_errors(drive(3), {name: value})
+    return log, *run(log, "output.recording=true")
+
+
 GROSS = [("front.y", -0.2), ("front.x", 0.25), ("front.focal", 0.1), ("front.focal", -0.1)]
 
 
 @pytest.mark.parametrize(("name", "value"), GROSS)
 def test_a_gross_error_is_estimated_and_named(name, value):
-    log = add_shared_errors(drive(3), {name: value})
-    result, ledger = run(log)
+    log, result, ledger = with_gross(name, value)
     found = result.calibration
     at = found.names.index(name)
     assert abs(found.values[at]) > 0.7 * abs(value)
@@ -239,8 +245,7 @@ def test_errors_of_a_calibration_file_are_neither_gross_nor_a_turn(tmp_path):
 
 def test_the_recording_has_the_errors_of_both_solves(tmp_path):
     """The first solve holds the place of the camera, so it has fewer errors than the last one."""
-    log = add_shared_errors(drive(3), {"front.y": -0.2})
-    result = pipeline.run(log, load_settings(None, ("mode=joint", "bodies.use=false")), Ledger())
+    log, result, _ = with_gross(*GROSS[0])
     steps = [step.parameters.names for one in result.trace for step in one.iterations if step.parameters is not None]
     assert len(set(map(len, steps))) == 2
     write_recording(result, tmp_path / "recording.rrd", log.truth)
