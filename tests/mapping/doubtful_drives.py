@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from quick import NOTHING_DRAWN
@@ -20,6 +21,7 @@ from objslam.graph.fixed_pose_triangulation import triangulate_at
 from objslam.mapping.describe import describe, make_result
 from objslam.mapping.pipeline import run
 from objslam.mapping.solution import Solution
+from objslam.simulation import preset, simulate
 
 DEFAULT = load_settings(None, NOTHING_DRAWN)
 LEAN = load_settings(None, (*NOTHING_DRAWN, "checks.use=false", "bodies.use=false"))
@@ -29,6 +31,12 @@ LEAN = load_settings(None, (*NOTHING_DRAWN, "checks.use=false", "bodies.use=fals
 def mapped(log: Log, settings: Settings = LEAN) -> RunResult:
     """The result of a run."""
     return run(log, settings, Ledger())
+
+
+@cache
+def clean_rooms(tracks: str | None = None) -> RunResult:
+    """The result of a drive without false boxes. tracks: as in `DriveSettings`, None for those of the preset."""
+    return mapped(simulate(preset("rooms", false=0.0, **({} if tracks is None else {"tracks": tracks})), 4))
 
 
 def camera_poses(log: Log) -> Floats:

@@ -1,6 +1,7 @@
 """A solved path that leaves the localisation for seconds is named, in units of the localisation's own noise."""
 
 from dataclasses import replace
+from itertools import accumulate
 
 import numpy as np
 import pytest
@@ -19,10 +20,10 @@ def errors_of(lasting, seed, count=len(STAMPS)):
     """Errors of a localisation, (count, 2) m: a lasting part and a white one."""
     rng = np.random.default_rng(seed)
     stays = np.exp(-0.25 / lasting.seconds) if lasting.share else 0.0
-    drawn, lasts = rng.normal(size=(count, 2)), np.zeros((count, 2))
-    lasts[0] = drawn[0]
-    for k in range(1, count):
-        lasts[k] = stays * lasts[k - 1] + np.sqrt(1 - stays**2) * drawn[k]
+    drawn = rng.normal(size=(count, 2))
+    new = np.sqrt(1 - stays**2) * drawn
+    new[0] = drawn[0]
+    lasts = np.stack([list(accumulate(axis.tolist(), lambda last, own: stays * last + own)) for axis in new.T], axis=1)
     white = rng.normal(size=(count, 2))
     return SIGMA * (np.sqrt(lasting.share) * lasts + np.sqrt(1 - lasting.share) * white)
 

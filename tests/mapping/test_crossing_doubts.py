@@ -6,18 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from doubtful_drives import mapped
+from doubtful_drives import clean_rooms
 
 from objslam.association.crossings.one_or_two import find_crossings
 from objslam.core.result import RunResult
 from objslam.mapping.doubts import disagreeing
 from objslam.mapping.doubts.evidence import evidence_of
-from objslam.simulation import preset, simulate
 
 
 @pytest.fixture(scope="module")
 def rooms() -> RunResult:
-    return mapped(simulate(preset("rooms", false=0.0, tracks="perfect"), 4))
+    return clean_rooms("perfect")
 
 
 def test_objects_of_a_clean_drive_are_no_crossings(rooms):

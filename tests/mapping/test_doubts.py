@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from doubtful_drives import DEFAULT, LEAN, boxes_of, camera_poses, mapped, reassociated, relabelled
+from doubtful_drives import DEFAULT, LEAN, boxes_of, camera_poses, clean_rooms, mapped, reassociated, relabelled
 from more_boxes import with_boxes
 from scipy.spatial.transform import Rotation
 
@@ -269,8 +269,7 @@ def test_why_an_object_has_no_position_is_one_reason():
 
 def test_an_object_whose_boxes_have_two_sizes():
     """A third of its boxes are of a thing that is half as large."""
-    log = simulate(preset("rooms", false=0.0, tracks="perfect"), 4)
-    result = mapped(log)
+    result = clean_rooms("perfect")
     widths = result.rays.box[:, 2] - result.rays.box[:, 0]
     wide = max(range(len(result.map)), key=lambda j: np.median(widths[result.association.object == j]))
     mine = np.flatnonzero(result.association.object == wide)[::3]
@@ -289,7 +288,7 @@ def test_an_object_whose_boxes_have_two_sizes():
 def test_the_depth_of_a_flat_thing_scatters_its_height(times: float, doubted: bool) -> None:
     """The boxes of a keyboard, 0.42 m by 0.12 m, are higher from its ends than from its sides, and from near than from afar.
     If a third of them are of a thing that is 6 times as large, the depth does not explain this."""
-    result = mapped(simulate(preset("rooms", false=0.0, tracks="perfect"), 4))
+    result = clean_rooms("perfect")
     mine = np.flatnonzero(result.association.object == 0)
     ray, away = result.directions[mine], np.linalg.norm(result.map.positions[0] - result.origins[mine], axis=1)
     along, across = np.abs(ray[:, :2].T) / np.linalg.norm(ray[:, :2], axis=1)
@@ -305,7 +304,7 @@ def test_the_depth_of_a_flat_thing_scatters_its_height(times: float, doubted: bo
 
 def test_boxes_that_show_the_vertical_otherwise_tell_no_size():
     """A wrist camera sees a tall thing upright from the side and short from above. A robot's camera sees it alike."""
-    result = mapped(simulate(preset("rooms", false=0.0, tracks="perfect"), 4))
+    result = clean_rooms("perfect")
     mine = np.arange(len(result.rays))
     assert _alike(result, mine[result.association.object >= 0]).all()
     held = np.flatnonzero(result.association.object == 0)
@@ -323,7 +322,7 @@ def test_boxes_that_show_the_vertical_otherwise_tell_no_size():
 
 
 def test_a_camera_that_observes_no_sizes_tells_none():
-    result = mapped(simulate(preset("rooms", false=0.0), 4))
+    result = clean_rooms()
     mine = np.flatnonzero(result.association.object == 0)
     box = result.rays.box.copy()
     box[mine[::2], 2:] += 4 * (box[mine[::2], 2:] - box[mine[::2], :2])

@@ -92,13 +92,31 @@ def test_no_objects_are_left_where_rays_of_several_things_meet(monkeypatch):
     assert mapped(log, "checks.use=false")[0][1] > 0
 
 
+class Begun(Exception):
+    """Ends a run where the search for phantoms begins."""
+
+
+@pytest.fixture(scope="module")
+def begun():
+    """The state of a run from which the search for phantoms begins."""
+
+    def begin(state):
+        raise Begun(state)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(joint_solve, "without_phantoms", begin)
+        with pytest.raises(Begun) as ended:
+            mapped(turned(drive(0), 0), "checks.use=false")
+    return ended.value.args[0]
+
+
 @pytest.mark.parametrize("coarse", [False, True])
-def test_no_object_is_tried_where_the_path_search_is_too_coarse(monkeypatch, coarse):
+def test_no_object_is_tried_where_the_path_search_is_too_coarse(begun, monkeypatch, coarse):
     tried = []
     monkeypatch.setattr(phantoms, "_without", lambda state, j: tried.append(j))
     if coarse:
         monkeypatch.setattr(phantoms, "_COARSE", -np.inf)
-    mapped(turned(drive(0), 0), "checks.use=false")
+    phantoms.without_phantoms(begun)
     assert len(tried) == (0 if coarse else 8)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from objslam.association.nearest_neighbour import associate_by_label
 from objslam.config import Settings, load_settings
 from objslam.core.diagnostics import Ledger
+from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.frontend.bearings import build_rays
 from objslam.frontend.keyframes import build_keyframes
@@ -74,11 +76,17 @@ def test_false_boxes_and_wrong_labels_are_no_noise_of_poses():
     assert found_in(mixed) == (1.0, 1.0)
 
 
+@cache
+def noisy(*told: str) -> tuple[Log, RunResult, Ledger]:
+    """A drive with noisy poses, its map, and what the run warned of."""
+    log, ledger = drive(0.06, 0.05, 1, objects=8, classes=2, frames=250), Ledger()
+    return log, pipeline.run(log, load_settings(None, ("mode=fixed", *QUIET, *told)), ledger), ledger
+
+
 @pytest.mark.parametrize("calibration", ["auto", "false"])
 def test_noisy_poses_do_not_split_objects(calibration):
-    log = drive(0.06, 0.05, 1, objects=8, classes=2, frames=250)
-    told = ("mode=fixed", f"calibration.use={calibration}", *QUIET)
-    result = pipeline.run(log, load_settings(None, told), Ledger())
+    told = () if calibration == "auto" else ("calibration.use=false",)
+    log, result, _ = noisy(*told)
     objects = result.map.resolved()
     assert len(objects) == 8
     for item in log.truth.objects:
@@ -89,13 +97,12 @@ def test_noisy_poses_do_not_split_objects(calibration):
     across = np.hypot(0.005 * noise["heading"], 0.02 * noise["place"] / 3.0)  # The error of a ray at 3 m, which sums both.
     assert across == pytest.approx(np.hypot(0.05, 0.06 / 3.0), rel=0.35)
     if calibration == "false":  # Else the priors of the camera's errors give gates wide enough for this drive.
-        plain = pipeline.run(log, load_settings(None, (*told, "noise.localization=false")), Ledger())
+        _, plain, _ = noisy(*told, "noise.localization=false")
         assert len(plain.map.resolved()) > 8
 
 
 def test_the_verdict_names_the_noise_of_the_poses():
-    log, ledger = drive(0.06, 0.05, 1, objects=8, classes=2, frames=250), Ledger()
-    result = pipeline.run(log, load_settings(None, ("mode=fixed", *QUIET)), ledger)
+    _, result, ledger = noisy()
     assert result.summary["assessment"]["level"] == "check"
     assert "localisation noise" in result.summary["assessment"]["reasons"][0]
     assert any("localization.yaw and localization.xy say" in line for line in ledger.warnings)
