@@ -28,7 +28,7 @@ def test_boxes_of_the_right_distortion_are_not(distortion):
 @pytest.mark.usefixtures("one_start")
 @pytest.mark.parametrize("name", ["boxes of rectified images", None])
 def test_with_odometry_alone_a_solve_with_the_other_lens_decides(name):
-    log = drive("joint", seed=1)
+    log = drive("joint", seed=1, frames=200)
     result = pipeline.run(
         log if name is None else MISTAKES[name](log), load_settings(None, ("mode=joint", "output.recording=false")), Ledger()
     )
