@@ -82,7 +82,7 @@ def test_no_process_without_need(log, monkeypatch, off):
     blind = tuple(replace(c, camera=replace(c.camera, sees_size=False)) for c in log.cameras)
     session = session_of(log, "bodies.use=false") if off else session_of(replace(log, cameras=blind))
     assert len(session.snapshot().map) >= 5
-    session.stop()
+    session.abort()
 
 
 def test_one_process_answers_all_requests_until_one_fails(log, monkeypatch, own_processes):
@@ -91,7 +91,7 @@ def test_one_process_answers_all_requests_until_one_fails(log, monkeypatch, own_
         patch.setattr(Worker, "ask", lambda self, request: asked.append(request))
         session = session_of(log)
         wait_for(lambda: session.snapshot().map and asked)
-        session.stop()
+        session.abort()
     worker, expected, processes = Worker(), asked[0].solve(), []
     assert any(expected)
     for request in (asked[0], asked[0], BodyRequest(None, (), None), asked[0]):

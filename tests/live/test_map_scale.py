@@ -37,7 +37,7 @@ def test_objects_lie_inside_their_ellipsoids_though_the_odometry_is_too_long(see
     inside = evaluate(session.snapshot().map, log.truth, align="se2").to_dict()["inside_95_3d"]
     monkeypatch.setattr(map_scale, "scale_sigma", lambda m: 0.0)
     surer = evaluate(session.snapshot().map, log.truth, align="se2").to_dict()["inside_95_3d"]
-    session.stop()
+    session.abort()
     assert inside >= 11 / 12
     assert surer <= 9 / 12
 

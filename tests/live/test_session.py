@@ -125,7 +125,7 @@ def test_an_object_whose_covariance_is_not_computed_yet_is_not_surer_than_the_pa
     describer._covariances[10**6] = np.zeros((3, 3))  # Of a landmark that has left the map.
     soon = {o.id: np.trace(o.covariance) for o in describer.map(state).resolved()}
     monkeypatch.undo()
-    session.stop()
+    session.abort()
     assert len(soon) >= 10
     assert np.median([soon[j] / exact[j] for j in soon]) > 0.7
 
