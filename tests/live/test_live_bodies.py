@@ -82,7 +82,7 @@ def test_no_process_without_need(log, monkeypatch, off):
     blind = tuple(replace(c, camera=replace(c.camera, sees_size=False)) for c in log.cameras)
     session = session_of(log, "bodies.use=false") if off else session_of(replace(log, cameras=blind))
     assert len(session.snapshot().map) >= 5
-    session.abort()
+    session.stop()
 
 
 def test_one_process_answers_all_requests_until_one_fails(log, monkeypatch, own_processes):

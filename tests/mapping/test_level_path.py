@@ -28,7 +28,7 @@ def drive(pitch: float) -> Log:
 
 
 def mapped(log: Log) -> RunResult:
-    changes = ("output.recording=false", "poses.use=odometry", "mode=joint", "checks.use=false", "bodies.use=false")
+    changes = ("output.recording=false", "poses.use=odometry", "mode=joint", "checks.use=false")
     return pipeline.run(log, load_settings(None, changes), Ledger())
 
 
