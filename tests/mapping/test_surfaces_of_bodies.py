@@ -85,10 +85,12 @@ def test_bodies_tell_how_far_centres_are_behind_surfaces():
 
 @pytest.mark.long
 def test_large_things_tell_the_scale_of_the_map():
-    """Things of up to 2.5 m, whose centres are farther behind than `depth.centre` says. In these drives, the ranges are not
-    taken for those of centres."""
+    """Things of up to 2.5 m, whose centres are farther behind than `depth.centre` says.
+
+    In one of the four drives, the ranges are taken for those of centres, so bodies change nothing.
+    """
     off, widths, inside = [], [], []
-    for seed in (102, 104, 105):
+    for seed in range(102, 106):
         log = surface_drive(seed, around=True, wide=2.5)
         scores, _ = mapped(log)
         inside += [m.squared_3d < INSIDE_95_3D for m in scores.matches]
@@ -97,8 +99,8 @@ def test_large_things_tell_the_scale_of_the_map():
             by_widths, _ = mapped(log)
         off.append(abs(1 / scores.transform.scale - 1))
         widths.append(abs(1 / by_widths.transform.scale - 1))
-    assert np.mean(off) < 0.7 * np.mean(widths)
-    assert len(inside) == 18
+    assert np.mean(off) < 0.8 * np.mean(widths)
+    assert len(inside) == 24
     assert np.mean(inside) > 0.8
 
 
