@@ -228,7 +228,7 @@ def _with_noise_of_poses(state: JointState) -> JointState:
     """Return the state that begins with the noise of the localisation which the odometry shows."""
     if state.errors is None or "localization" not in state.errors.unknown_noise or state.keyframes.odom_T_base is None:
         return state
-    from objslam.graph.calibration.paths_alone import noise_of_paths
+    from objslam.graph.calibration.localization_noise import noise_of_paths
 
     theta = state.errors.mean if state.theta is None else state.theta
     errors = state.errors.with_noise(noise_of_paths(state.errors, theta))

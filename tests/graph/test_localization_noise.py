@@ -19,7 +19,7 @@ from objslam.frontend.keyframes import build_keyframes
 from objslam.frontend.known_errors import shared_errors
 from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
-from objslam.graph.calibration.paths_alone import noise_of_paths
+from objslam.graph.calibration.localization_noise import noise_of_paths
 from objslam.graph.calibration.pose_errors import ComparedPoses, ErrorKind, PoseErrors, most_likely
 from objslam.graph.calibration.shared_error_jacobian import linearise
 from objslam.graph.calibration.shrinkage import force_of_heights

@@ -18,11 +18,14 @@ from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import SAME_POINT_WIDE, WHITE, Lasting
-from objslam.core.types import Keyframes
+from objslam.core.types import Association, Keyframes
+from objslam.errors import SolveError
+from objslam.graph.assembly import Measurements
 from objslam.graph.calibration.linearised_graph import Linearised
 from objslam.graph.calibration.pose_errors import ComparedPoses, PoseErrors, averaged, most_likely
 from objslam.graph.calibration.shared_error_jacobian import linearise
 from objslam.graph.factors.localization import localized, sharing
+from objslam.graph.multiframes import Multiframes
 
 _LOOSE = 1e4
 """In the graph that predicts the localised poses, their noise is multiplied by this factor, so that they hardly count. With
@@ -60,6 +63,23 @@ def noise_of_localization(rest: Linearised, errors: CalibratedMeasurements, thet
         place_share=shifted.share,
         place_seconds=shifted.seconds,
     )
+
+
+def noise_of_paths(errors: CalibratedMeasurements, theta: Floats) -> NoiseFactors:
+    """Return `errors.noise` with the noise of the localisation that agrees best with the odometry alone, before any ray has
+    an object.
+
+    theta: (P,) the shared errors. If the odometry does not determine the path, the noise stays as it is.
+    """
+    keyframes, rays, settings = errors.at(theta)
+    measured = Measurements.of(keyframes, rays, settings, Multiframes.of(errors.keyframes))
+    nothing = Association(np.full(len(rays), -1), np.zeros(0, dtype=np.int64))
+    used = np.zeros(len(rays), dtype=bool)
+    paths = Linearised(measured, nothing, measured.keyframes.map_T_camera, np.zeros((0, 3)), used)
+    try:
+        return noise_of_localization(without_localization(paths), errors, theta)
+    except SolveError:
+        return errors.noise
 
 
 def _noise_in(data: ComparedPoses) -> _Noise:

@@ -103,6 +103,6 @@ def _own_noise(solution: Solution, errors: SharedErrors | None) -> NoiseFactors:
         return NoiseFactors()
     if errors.keyframes.odom_T_base is None:
         return solution.estimate.noise or NoiseFactors()
-    from objslam.graph.calibration.paths_alone import noise_of_paths  # It imports scipy.sparse. Few runs need it.
+    from objslam.graph.calibration.localization_noise import noise_of_paths  # It imports scipy.sparse. Few runs need it.
 
     return noise_of_paths(errors, clocks_of_turns(errors))

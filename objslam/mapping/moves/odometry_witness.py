@@ -43,7 +43,7 @@ def lasting_by_odometry(errors: SharedErrors | None) -> tuple[float, float]:
     because frames without a box count too."""
     if errors is None or "localization" not in errors.unknown_noise or errors.keyframes.odom_T_base is None:
         return 0.0, 0.0
-    from objslam.graph.calibration.paths_alone import noise_of_paths  # It imports scipy.sparse. Few runs need it.
+    from objslam.graph.calibration.localization_noise import noise_of_paths  # It imports scipy.sparse. Few runs need it.
 
     return lasting_long(noise_of_paths(errors, clocks_of_turns(errors)))
 
