@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,6 +11,14 @@ from objslam.core.arrays import Floats, Ints
 from objslam.core.camera import Camera
 from objslam.core.statistics import Lasting
 from objslam.core.types import Rays
+
+
+class LabelNoise(NamedTuple):
+    """The noise of the ranges of one label, as factors on `depth.sigma` and on `depth.bias`."""
+
+    label: str
+    ranges: float
+    range_bias: float
 
 
 @dataclass(frozen=True)
@@ -21,7 +30,7 @@ class NoiseFactors:
     odometry's noise of the heading. heading: `localization.yaw`. place: `localization.xy`. shrinkage: the share by which a
     joint solve makes all lengths too short. The other four describe lasting errors (`Lasting`) of localised headings and
     places. heading_share, place_share: the share of the variance that lasts. heading_seconds, place_seconds: how long it
-    lasts, s.
+    lasts, s. by_label: the noise of the ranges of some labels, instead of `ranges` and `range_bias`.
     """
 
     rays: float = 1.0
@@ -37,6 +46,7 @@ class NoiseFactors:
     heading_seconds: float = 0.0
     place_share: float = 0.0
     place_seconds: float = 0.0
+    by_label: tuple[LabelNoise, ...] = ()
 
     @property
     def lasting(self) -> tuple[Lasting, Lasting]:
@@ -73,26 +83,40 @@ class NoiseFactors:
 
     def rays_with_noise(self, nominal: Rays) -> Rays:
         """Return rays whose noise of directions and ranges is multiplied by the factors."""
-        if self.rays == self.ranges == self.range_bias == 1:
+        if self.rays == self.ranges == self.range_bias == 1 and not self.by_label:
             return nominal
+        ranges, range_bias = self.of_labels(nominal.label_names)[:, nominal.label]
         return replace(
             nominal,
             sigma=nominal.sigma * self.rays,
-            range_sigma=nominal.range_sigma * self.ranges,
-            range_bias=nominal.range_bias * self.range_bias,
+            range_sigma=nominal.range_sigma * ranges,
+            range_bias=nominal.range_bias * range_bias,
         )
+
+    def of_labels(self, names: Sequence[str]) -> Floats:
+        """Return the factors (2, L) on the noise of single ranges and on their bias, for labels with these names (L,)."""
+        told = {label: (ranges, bias) for label, ranges, bias in self.by_label}
+        factors = [told.get(name, (self.ranges, self.range_bias)) for name in names]
+        return np.array(factors, dtype=np.float64).reshape(-1, 2).T
 
     def like(self, other: "NoiseFactors", tolerance: float) -> bool:
         """Return whether all factors agree with the factors of `other` within a relative tolerance, and whether the lasting
         errors agree (`Lasting.like`). The shrinkage is not compared."""
         mine, its = self.factors, other.factors
         lasting = all(one.like(two, tolerance) for one, two in zip(self.lasting, other.lasting, strict=True))
+        names = [one.label for one in (*self.by_label, *other.by_label)]
+        mine, its = (np.append(factors, of.of_labels(names)) for factors, of in ((mine, self), (its, other)))
         return lasting and bool((np.abs(np.log(np.maximum(mine, 1e-9) / np.maximum(its, 1e-9))) < tolerance).all())
 
     def to_dict(self, digits: int | None = 4) -> dict[str, float]:
         """Return the factors and the shrinkage by name, as in summary.json. If `digits` is not None, they are rounded to
         that many decimals."""
-        return {name: value if digits is None else round(value, digits) for name, value in asdict(self).items()}
+        factors = {name: value for name, value in asdict(self).items() if name != "by_label"}
+        return {name: value if digits is None else round(value, digits) for name, value in factors.items()}
+
+    def labels_to_dict(self) -> dict[str, dict[str, float]]:
+        """Return the factors on the noise of ranges and on their bias, by label, as in summary.json."""
+        return {one.label: {"ranges": round(one.ranges, 4), "range_bias": round(one.range_bias, 4)} for one in self.by_label}
 
 
 FACTORS = ("rays", "ranges", "range_bias", "along", "across", "turning", "heading", "place")

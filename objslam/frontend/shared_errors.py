@@ -248,10 +248,9 @@ class SharedErrors:
         error = dict(zip(self.names, values.tolist(), strict=True))
         path = self._drift(error)
         keyframes, _, _ = self.at(values, drift=False)
-        stamps, none = np.maximum.accumulate(keyframes.stamps), {"along": 0.0, "across": 0.0, "turning": 0.0}
-        found = []
-        for only in (*none, None):
-            noise = NoiseFactors(**none) if only is None else NoiseFactors(**{**none, only: 1.0})
+        stamps, found = np.maximum.accumulate(keyframes.stamps), []
+        for only in ("along", "across", "turning", None):
+            noise = NoiseFactors(along=only == "along", across=only == "across", turning=only == "turning")
             settings = self.with_noise(noise)._scaled_noise(error)
             if only is not None:
                 flat = settings.planar.model_copy(update={"z": 0.0, "tilt": 0.0})

@@ -236,6 +236,7 @@ def summarise(
         "rounds": list(solution.rounds),
         "calibration": None if estimate.calibration is None else estimate.calibration.to_dict(),
         "noise": None if estimate.noise is None else estimate.noise.to_dict(),
+        "range_noise_by_label": {} if estimate.noise is None else estimate.noise.labels_to_dict(),
         "box_offset": None if estimate.box_offset is None else round(estimate.box_offset, 4),
         "unused_paths": list(ledger.unused),
         "dropped": dict(ledger.dropped),

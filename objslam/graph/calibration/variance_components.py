@@ -6,7 +6,7 @@ part of the residuals that poses, landmarks and shared errors do not absorb. Ran
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy import sparse
@@ -14,9 +14,10 @@ from scipy import sparse
 from objslam.core.arrays import Floats, Ints
 from objslam.core.calibration import CalibratedMeasurements
 from objslam.core.geometry import adjoint, inverse
-from objslam.core.noise import MOST_NOISE, NoiseFactors
-from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
+from objslam.core.noise import MOST_NOISE, LabelNoise, NoiseFactors
+from objslam.core.statistics import HUBER_K
 from objslam.graph.calibration.linearised_graph import Linearised
+from objslam.graph.calibration.range_noise import RangeNoise
 from objslam.graph.calibration.shared_error_jacobian import LinearSystem
 from objslam.graph.calibration.shrinkage import shrinking_force
 from objslam.graph.factors.bearing import tangent_basis
@@ -50,9 +51,6 @@ _WINDOWS = 30
 larger number shortens the windows of short logs."""
 _MOST_SHRINKAGE = 0.3
 """The largest shrinkage (a share) that is corrected. A larger one has another cause, which a larger limit hides."""
-_PRIOR_OBJECTS = 4
-"""The range bias in the settings weighs at most as much as this number of objects. With a larger number, the bias changes
-less."""
 _KINDS = ("rays", "ranges", "range_bias", "along", "across", "turning")
 """The factors that this iteration estimates, as fields of `NoiseFactors`."""
 _MEAN_NORMAL = np.sqrt(np.pi / 2)
@@ -64,17 +62,16 @@ class _Rows:
     """A description of the rows of a linear system: n bearings, q ranges and s motions, with their nominal noise.
 
     bearing_axes: (n, 2, 2) turn the two rows of a bearing into azimuth and elevation. bearing_weight: (n,) robust weights.
-    owner: (q,) the landmark of each range. range_sigma: (q,) m. bias: (q,) m, the standard deviation of the bias. motions:
-    in the graph. parts: (3, s, 6, 6) their covariances by the noise along, across and in turning. rest: (s, 6, 6) by the
-    noise of `planar`. motion_axes: (3, s, 6) twists along, across and in turning, in the camera frame after the motion.
-    motion_window: (s,), ray_window: (n,) the window of each motion and ray. The errors in a window may be correlated.
+    ranges: of the ranges. label_names: (L,). motions: in the graph. parts: (3, s, 6, 6) their covariances by the noise
+    along, across and in turning. rest: (s, 6, 6) by the noise of `planar`. motion_axes: (3, s, 6) twists along, across and
+    in turning, in the camera frame after the motion. motion_window: (s,), ray_window: (n,) the window of each motion and
+    ray. The errors in a window may be correlated.
     """
 
     bearing_axes: Floats
     bearing_weight: Floats
-    owner: Ints
-    range_sigma: Floats
-    bias: Floats
+    ranges: RangeNoise
+    label_names: tuple[str, ...]
     motions: OdometryMotions | None
     parts: Floats
     rest: Floats
@@ -154,7 +151,6 @@ def _from_logarithms(logarithms: Floats, other: NoiseFactors) -> NoiseFactors:
 
 def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Rows:
     keyframes, rays = of.measured.keyframes, of.measured.rays.take(of.which)
-    ranged = np.isfinite(rays.range)
     motions, (_, after) = of.measured.motions, of.graph.moves
     parts = [np.zeros((0, 6, 6))] * 4
     if motions is not None and len(motions):
@@ -173,9 +169,8 @@ def _rows(of: Linearised, errors: CalibratedMeasurements, theta: Floats) -> _Row
     return _Rows(
         bearing_axes=_azimuth_elevation(rays.direction, keyframes.base_T_camera[rays.keyframe]),
         bearing_weight=np.minimum(1.0, HUBER_K * rays.sigma / np.maximum(off, 1e-12)),
-        owner=of.association.object[of.which][ranged],
-        range_sigma=errors.rays.range_sigma[of.which][ranged],
-        bias=errors.rays.range_bias[of.which][ranged],
+        ranges=_range_rows(of, errors),
+        label_names=tuple(errors.rays.label_names),
         motions=motions,
         parts=np.array(parts[:3]),
         rest=parts[3],
@@ -230,7 +225,7 @@ class _Rescaling:
         system, rows, size = self.system, self.rows, len(self.system.residual)
         scale = np.ones(size)
         scale[: system.first_range] = self.begin.rays / noise.rays
-        ranges = slice(system.first_range, system.first_range + len(rows.owner))
+        ranges = slice(system.first_range, system.first_range + len(rows.ranges.owner))
         scale[ranges] = _range_sigma(rows, self.begin) / _range_sigma(rows, noise)
         last = system.first_motion + whitens.size // 6
         moves = whitens @ self.colours
@@ -254,12 +249,16 @@ def _updated(
     whitens: (s, 6, 6) of the motions, for the present noise. kinds: the kinds of noise to estimate. left: (M, probes + 1)
     the probes and residuals after the solution. prior: the weight of the nominal noise, as a number of residuals.
     """
-    found = noise.to_dict(None)
+    found: dict[str, Any] = noise.to_dict(None)
     residual, kept, count = left[:, -1], left[:, :-1], probes.shape[1]
     if "rays" in kinds and len(rows.bearing_weight):
         found["rays"] = _ray_noise(rows, noise.rays, residual, probes, kept, prior)
-    if "ranges" in kinds and len(rows.owner):
-        found["ranges"], found["range_bias"] = _range_noise(system, rows, noise, residual, prior)
+    if "ranges" in kinds and len(rows.ranges.owner):
+        off = residual[system.first_range : system.first_range + len(rows.ranges.owner)] * _range_sigma(rows, noise)
+        found["ranges"], found["range_bias"], factors = rows.ranges.estimate(off, len(rows.label_names), prior)
+        ranged = np.unique(rows.ranges.label).tolist()
+        names = [rows.label_names[label] for label in ranged]
+        found["by_label"] = tuple(map(LabelNoise, names, *np.clip(factors[:, ranged], *_LIMITS).tolist()))
     steps = len(rows.rest)
     motion = slice(system.first_motion, system.first_motion + 6 * steps)
     if "odometry" in kinds and steps:
@@ -275,7 +274,9 @@ def _updated(
             squares = share * variance**2 * (own**2).sum()
             redundancy = share * variance * (first * second).sum() / count
             found[name] = np.sqrt((prior + squares) / (prior + max(redundancy, 0.0)))
-    return replace(noise, **{kind: float(np.clip(found[kind], *_LIMITS)) for kind in _KINDS})
+    for kind in _KINDS:
+        found[kind] = float(np.clip(found[kind], *_LIMITS))
+    return replace(noise, **found)
 
 
 def _ray_noise(rows: _Rows, factor: float, residual: Floats, probes: Floats, kept: Floats, prior: float) -> float:
@@ -303,31 +304,16 @@ def _sums_in(window: Ints) -> sparse.csr_matrix:
     return sparse.csr_matrix((np.ones(len(window)), (window, np.arange(len(window)))))
 
 
-def _range_noise(
-    system: LinearSystem, rows: _Rows, noise: NoiseFactors, residual: Floats, prior: float
-) -> tuple[float, float]:
-    """Return the factors on the noise of single ranges, and on the bias that all ranges of an object share."""
-    count = int(rows.owner.max()) + 1
-    number = np.bincount(rows.owner, minlength=count)
-    off = residual[system.first_range : system.first_range + len(rows.owner)] * _range_sigma(rows, noise)
-    middle = np.nan_to_num(grouped_median(off, rows.owner, count))
-    within = np.median(np.abs(off - middle[rows.owner]) / rows.range_sigma) / NORMAL_MEDIAN
-    free = max(len(off) - int((number > 0).sum()), 0)
-    ranges = np.sqrt((prior + free * within**2) / (prior + free))
-    bias = np.nan_to_num(grouped_median(rows.bias, rows.owner, count))
-    has = (number > 1) & (bias > 0)
-    if not has.any():
-        return ranges, 1.0
-    typical = np.sqrt(grouped_median(rows.range_sigma**2, rows.owner, count)[has]) * ranges
-    squares = max(((middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2).sum(), 0.0)
-    weight = min(prior, float(_PRIOR_OBJECTS))
-    return ranges, float(np.sqrt((weight + squares) / (weight + has.sum())))
+def _range_rows(of: Linearised, errors: CalibratedMeasurements) -> RangeNoise:
+    """Return the ranges of a graph with their nominal noise."""
+    which = of.which[np.isfinite(of.measured.rays.range[of.which])]
+    owner, rays = of.association.object[which], errors.rays.take(which)
+    return RangeNoise(owner, rays.label, of.association.label, rays.range_sigma, rays.range_bias)
 
 
 def _range_sigma(rows: _Rows, noise: NoiseFactors) -> Floats:
-    """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `factors.range.share_bias`."""
-    number = np.bincount(rows.owner)[rows.owner] if len(rows.owner) else np.zeros(0)
-    return np.sqrt((rows.range_sigma * noise.ranges) ** 2 + number * (rows.bias * noise.range_bias) ** 2)
+    """Return the noise (q,), m, of ranges, with their share of the object's bias."""
+    return rows.ranges.total(noise.of_labels(rows.label_names))
 
 
 def _motion_covariance(rows: _Rows, noise: NoiseFactors) -> Floats:

@@ -1,0 +1,86 @@
+"""Estimate the noise of ranges from their residuals: of all labels, and of each label.
+
+Ranges of a thing that a camera sees through, such as a table, end behind it. So the ranges of some labels are worse than
+those of others.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from objslam.core.arrays import Floats, Ints
+from objslam.core.statistics import HUBER_K, NORMAL_MEDIAN, grouped_median
+
+_PRIOR_OBJECTS = 4
+"""The range bias in the settings weighs at most as much as this number of objects. With a larger number, the bias changes
+less."""
+_LABEL_OBJECTS = 2
+"""The bias of all labels weighs as much as this number of objects in the bias of one label. With a larger number, labels
+differ less."""
+_HUBER_SHARE = float(1 - 2 * norm.sf(HUBER_K) - 2 * HUBER_K * norm.pdf(HUBER_K) + HUBER_K**2 * 2 * norm.sf(HUBER_K))
+"""The mean of min(z^2, `HUBER_K`^2) for Gaussian z."""
+_ROUNDS = 30  # The most rounds of Huber's proposal 2. It converges in a few. A larger number takes longer.
+
+
+@dataclass(frozen=True)
+class RangeNoise:
+    """The nominal noise of q ranges. owner: (q,) the landmark of each range. label: (q,) of its box. landmark_label: (N,).
+    sigma: (q,) m, of a single range. bias: (q,) m, of the error that the ranges of an object share."""
+
+    owner: Ints
+    label: Ints
+    landmark_label: Ints
+    sigma: Floats
+    bias: Floats
+
+    def total(self, factors: Floats) -> Floats:
+        """Return the noise (q,), m, of ranges, with their share of the object's bias, as in `factors.range.share_bias`.
+
+        factors: (2, L) of each label.
+        """
+        ranges, bias = factors[:, self.label]
+        number = np.bincount(self.owner)[self.owner] if len(self.owner) else np.zeros(0)
+        return np.sqrt((self.sigma * ranges) ** 2 + number * (self.bias * bias) ** 2)
+
+    def estimate(self, off: Floats, labels: int, prior: float) -> tuple[float, float, Floats]:
+        """Return the factors on the noise of single ranges and on their bias, and both factors (2, L) for each label.
+
+        off: (q,) m, the residuals. labels: the number of labels. prior: the weight of the nominal noise, as a number of
+        residuals.
+        """
+        count, label = len(self.landmark_label), self.landmark_label
+        number = np.bincount(self.owner, minlength=count)
+        middle = np.nan_to_num(grouped_median(off, self.owner, count))
+        deviation = np.abs(off - middle[self.owner]) / self.sigma
+        free = max(len(off) - int((number > 0).sum()), 0)
+        ranges = float(np.sqrt((prior + free * (np.median(deviation) / NORMAL_MEDIAN) ** 2) / (prior + free)))
+        factors = np.ones((2, labels)) * [[ranges], [1.0]]
+        own = np.bincount(self.label, minlength=labels)
+        objects = np.bincount(label[number > 0], minlength=labels)
+        within = np.nan_to_num(grouped_median(deviation, self.label, labels)) / NORMAL_MEDIAN
+        free_of = np.maximum(own - objects, 0)
+        factors[0] = np.sqrt((prior * ranges**2 + free_of * within**2) / (prior + free_of))
+        bias = np.nan_to_num(grouped_median(self.bias, self.owner, count))
+        has = np.flatnonzero((number > 1) & (bias > 0))
+        if not len(has):
+            return ranges, 1.0, factors
+        typical = np.sqrt(grouped_median(self.sigma**2, self.owner, count)[has]) * factors[0, label[has]]
+        squares = (middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2
+        shared = _robust_variance(squares, min(prior, float(_PRIOR_OBJECTS)))
+        many = np.bincount(label[has], minlength=labels)
+        total = np.maximum(np.bincount(label[has], squares, labels), 0.0)
+        each = np.sqrt((_LABEL_OBJECTS * shared + total) / (_LABEL_OBJECTS + many))
+        factors[1] = np.where(many > 1, each, np.sqrt(shared))
+        return ranges, float(np.sqrt(shared)), factors
+
+
+def _robust_variance(squares: Floats, weight: float) -> float:
+    """Return the variance with Huber's proposal 2 (Huber 1964) from squares (n,), and 1 with this weight."""
+    variance = 1.0
+    for _ in range(_ROUNDS):
+        limited = max(float(np.minimum(squares, HUBER_K**2 * variance).sum()), 0.0) / _HUBER_SHARE
+        before, variance = variance, (weight + limited) / (weight + len(squares))
+        if abs(variance - before) < 1e-6 * before:
+            break
+    return variance
