@@ -22,6 +22,7 @@ from objslam.core.result import RunResult
 from objslam.core.status import reach, status_of
 from objslam.core.types import Association, Rays
 from objslam.frontend.up import up_axis
+from objslam.mapping.bodies.hidden_feet import with_hidden_feet
 from objslam.mapping.checks.assessment import assess, evidence_of
 from objslam.mapping.checks.residuals import misses
 from objslam.mapping.doubts.find import with_doubts
@@ -134,7 +135,7 @@ def describe(
                 features=_best_view(rays, kept, sizes_of_images),
             )
         )
-    return ObjectMap(tuple(objects), shared_covariance=_shared(objects, estimate)), residual
+    return ObjectMap(with_hidden_feet(tuple(objects)), shared_covariance=_shared(objects, estimate)), residual
 
 
 def _best_view(rays: Rays, mine: Ints, image: Floats) -> Floats32 | None:

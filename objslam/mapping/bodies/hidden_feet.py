@@ -1,0 +1,70 @@
+"""Objects whose foot was never seen, as the other objects of their label show.
+
+A lamp post behind parked cars shows only its upper half, and no box of the cars says so if a detector missed them. Its body
+then ends where the post comes into view. The other posts are higher, and stand on the ground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from objslam.core.arrays import Floats
+from objslam.core.object_map import MapObject
+from objslam.core.statistics import NORMAL_MEDIAN
+
+_FEWEST = 4
+"""The fewest objects of a label that show how high its things are. With a larger number, fewer hidden feet are found."""
+_ALIKE = 0.1
+"""The things of a label are alike if half of the heights differ from the median by less than this share, and so do half of
+the feet, as a share of the height. With a larger share, labels of different things count as well."""
+_SIGMAS = 3.0
+"""A thing is shorter than the others, or its foot is higher, by more than this number of standard deviations of the others.
+A larger number finds fewer hidden feet."""
+_LEAST = 0.1
+"""It is also shorter by at least this share of the height of the others. A larger share finds fewer hidden feet."""
+
+
+def with_hidden_feet(objects: tuple[MapObject, ...]) -> tuple[MapObject, ...]:
+    """Return the objects, with larger standard deviations of heights and of size where a foot may be hidden.
+
+    If a thing is shorter than the others of its label, and its foot is higher by about as much, its centre may be too high
+    by half of what is missing. Nobody knows whether it is another thing, so it does not move.
+    """
+    changed = list(objects)
+    for label in sorted({one.label for one in objects}):
+        mine = [j for j, one in enumerate(objects) if one.label == label and one.body and one.covariance is not None]
+        if len(mine) < _FEWEST:
+            continue
+        missing = _missing(*_heights_and_feet([objects[j] for j in mine]))
+        for j, length in zip(mine, missing.tolist(), strict=True):
+            one = objects[j]
+            if length and one.body is not None and one.covariance is not None:
+                size_sigma = np.hypot(one.body.size_sigma, [0.0, 0.0, length])
+                covariance = one.covariance + np.diag([0.0, 0.0, (length / 2) ** 2])
+                changed[j] = replace(one, covariance=covariance, body=replace(one.body, size_sigma=size_sigma))
+    return tuple(changed)
+
+
+def _heights_and_feet(objects: list[MapObject]) -> tuple[Floats, Floats, Floats]:
+    """Return the heights (n,), their standard deviations (n,), and the heights of the feet (n,) of objects, m."""
+    told = [
+        (one.body.size[2], one.body.size_sigma[2], one.position[2] - one.body.size[2] / 2) for one in objects if one.body
+    ]
+    height, sigma, foot = np.array(told).T
+    return height, sigma, foot
+
+
+def _missing(height: Floats, sigma: Floats, foot: Floats) -> Floats:
+    """Return how much (n,), m, of each thing may be missing at its foot, 0 if nothing is. The arguments are as returned by
+    `_heights_and_feet`."""
+    usual, low = float(np.median(height)), float(np.median(foot))
+    spread = [float(np.median(np.abs(part))) for part in (height - usual, foot - low)]
+    if max(spread) > _ALIKE * usual:
+        return np.zeros(len(height))
+    short, raised = usual - height, foot - low
+    shorter, higher = (_SIGMAS * one / NORMAL_MEDIAN for one in spread)
+    # A height that is unsure because its foot may be hidden is no reason against a hidden foot.
+    hidden = (short > np.maximum(sigma, max(shorter, _LEAST * usual))) & (raised > np.maximum(short / 2, higher))
+    return np.where(hidden, short, 0.0)
