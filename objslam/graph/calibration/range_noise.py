@@ -46,8 +46,9 @@ class RangeNoise:
     def estimate(self, off: Floats, labels: int, prior: float) -> tuple[float, float, Floats]:
         """Return the factors on the noise of single ranges and on their bias, and both factors (2, L) for each label.
 
-        off: (q,) m, the residuals. labels: the number of labels. prior: the weight of the nominal noise, as a number of
-        residuals.
+        The factors of a label are NaN if it has fewer than two objects with a bias. One object tells nothing about its
+        label: its rays may be those of two things, or its place may be wrong. off: (q,) m, the residuals. labels: the number
+        of labels. prior: the weight of the nominal noise, as a number of residuals.
         """
         count, label = len(self.landmark_label), self.landmark_label
         number = np.bincount(self.owner, minlength=count)
@@ -55,31 +56,34 @@ class RangeNoise:
         deviation = np.abs(off - middle[self.owner]) / self.sigma
         free = max(len(off) - int((number > 0).sum()), 0)
         ranges = float(np.sqrt((prior + free * (np.median(deviation) / NORMAL_MEDIAN) ** 2) / (prior + free)))
-        factors = np.ones((2, labels)) * [[ranges], [1.0]]
-        own = np.bincount(self.label, minlength=labels)
-        objects = np.bincount(label[number > 0], minlength=labels)
-        within = np.nan_to_num(grouped_median(deviation, self.label, labels)) / NORMAL_MEDIAN
-        free_of = np.maximum(own - objects, 0)
-        factors[0] = np.sqrt((prior * ranges**2 + free_of * within**2) / (prior + free_of))
         bias = np.nan_to_num(grouped_median(self.bias, self.owner, count))
         has = np.flatnonzero((number > 1) & (bias > 0))
         if not len(has):
-            return ranges, 1.0, factors
-        typical = np.sqrt(grouped_median(self.sigma**2, self.owner, count)[has]) * factors[0, label[has]]
-        squares = (middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2
-        shared = _robust_variance(squares, min(prior, float(_PRIOR_OBJECTS)))
+            return ranges, 1.0, np.full((2, labels), np.nan)
+        objects = np.bincount(label[number > 0], minlength=labels)
+        within = np.nan_to_num(grouped_median(deviation, self.label, labels)) / NORMAL_MEDIAN
+        free_of = np.maximum(np.bincount(self.label, minlength=labels) - objects, 0)
+        own = np.sqrt((prior * ranges**2 + free_of * within**2) / (prior + free_of))
         many = np.bincount(label[has], minlength=labels)
+        own = np.where(many > 1, own, ranges)
+        typical = np.sqrt(grouped_median(self.sigma**2, self.owner, count)[has]) * own[label[has]]
+        squares = (middle[has] ** 2 - typical**2 / number[has]) / bias[has] ** 2
+        # Where no label has two objects, nothing tells bad labels from bad places, and both are noise.
+        limit = HUBER_K**2 if many.max() > 1 else np.inf
+        shared = _robust_variance(squares, min(prior, float(_PRIOR_OBJECTS)), limit)
         total = np.maximum(np.bincount(label[has], squares, labels), 0.0)
         each = np.sqrt((_LABEL_OBJECTS * shared + total) / (_LABEL_OBJECTS + many))
-        factors[1] = np.where(many > 1, each, np.sqrt(shared))
-        return ranges, float(np.sqrt(shared)), factors
+        return ranges, float(np.sqrt(shared)), np.where(many > 1, [own, each], np.nan)
 
 
-def _robust_variance(squares: Floats, weight: float) -> float:
-    """Return the variance with Huber's proposal 2 (Huber 1964) from squares (n,), and 1 with this weight."""
-    variance = 1.0
+def _robust_variance(squares: Floats, weight: float, limit: float) -> float:
+    """Return the variance with Huber's proposal 2 (Huber 1964) from squares (n,), and 1 with this weight.
+
+    limit: a square counts up to this number of variances. With inf, the result is the mean.
+    """
+    variance, share = 1.0, _HUBER_SHARE if np.isfinite(limit) else 1.0
     for _ in range(_ROUNDS):
-        limited = max(float(np.minimum(squares, HUBER_K**2 * variance).sum()), 0.0) / _HUBER_SHARE
+        limited = max(float(np.minimum(squares, limit * variance).sum()), 0.0) / share
         before, variance = variance, (weight + limited) / (weight + len(squares))
         if abs(variance - before) < 1e-6 * before:
             break

@@ -256,7 +256,7 @@ def _updated(
     if "ranges" in kinds and len(rows.ranges.owner):
         off = residual[system.first_range : system.first_range + len(rows.ranges.owner)] * _range_sigma(rows, noise)
         found["ranges"], found["range_bias"], factors = rows.ranges.estimate(off, len(rows.label_names), prior)
-        ranged = np.unique(rows.ranges.label).tolist()
+        ranged = np.flatnonzero(np.isfinite(factors[0])).tolist()
         names = [rows.label_names[label] for label in ranged]
         found["by_label"] = tuple(map(LabelNoise, names, *np.clip(factors[:, ranged], *_LIMITS).tolist()))
     steps = len(rows.rest)
