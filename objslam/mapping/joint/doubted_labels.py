@@ -176,7 +176,7 @@ def evidence_against(named: JointState, other: JointState) -> float:
     assert other.errors is not None
     found, most = named.errors.noise, other.errors.noise
     sensors = {name: min(getattr(found, name), _NOISIER * getattr(most, name)) for name in ("rays", "ranges", "range_bias")}
-    held = replace(found, **sensors)
+    held = replace(found, by_label=(), **sensors)  # The noise of single labels would pass the limit.
     assert named.association is not None
     counts = named.association.object >= 0
     return _explained_at(held, other, counts) - _explained_at(held, named, counts)

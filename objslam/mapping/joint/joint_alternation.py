@@ -334,9 +334,7 @@ class JointState:
         sigma, flat = np.hypot(rays.sigma, yaw), LEVEL
         if rough and mine.localized_every:  # A solve corrects tilt and height of the poses. Before it, rays have both.
             flat = flat_scale(rays, (yaw, place), self.settings) if any(noise_up(mine, self.settings)) else LEVEL
-        if (
-            not rough
-        ):  # The solve has shown how large the error is that all ranges of an object share. Here each has its own.
+        if not rough:  # A solve has shown how large the error is that all ranges of an object share.
             rays = replace(rays, range_sigma=np.hypot(rays.range_sigma, np.nan_to_num(rays.range_bias)))
         found = associate_globally(
             PosedRays(rays, frames, self.cameras, map_T_camera, sigma, place, flat),
