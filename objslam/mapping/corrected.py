@@ -5,7 +5,7 @@ from dataclasses import replace
 from objslam.core.diagnostics import Ledger
 from objslam.core.types import Log
 from objslam.frontend.shared_errors import SharedErrors
-from objslam.mapping.checks.shared_errors import warn_of_large_errors
+from objslam.mapping.checks.shared_errors import warn_of_large_errors, warn_of_noisy_labels
 from objslam.mapping.solution import Solution, with_noise_of
 
 
@@ -15,6 +15,8 @@ def corrected(solution: Solution, errors: SharedErrors, ledger: Ledger) -> tuple
     errors: the errors that the solve estimated. The returned solution also has the prior of these errors in its calibration,
     and the odometry's drift at each keyframe.
     """
+    if solution.estimate.noise is not None:
+        warn_of_noisy_labels(solution.estimate.noise, ledger)
     calibration = solution.estimate.calibration
     if calibration is None:
         return solution, errors.log
