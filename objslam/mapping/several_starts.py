@@ -146,12 +146,16 @@ class _Found:
         return found
 
     def searched(self, first: JointState) -> Self:
-        """Return what is found with a search from the first map of a start."""
+        """Return what is found with a search from the first map of a start. It confirms the best map if both have the same
+        objects, whichever is better."""
         try:
-            state = self.state.better(_searched(first))
-            return self if state is self.state else replace(self, state=state, confirmed=False)
+            state = _searched(first)
+            best = self.state.better(state)
         except SolveError:  # The map so far is there.
             return self
+        if best is self.state:
+            return self.compared(state)
+        return replace(self, state=best, confirmed=replace(self, confirmed=False).compared(state).confirmed)
 
 
 def _searched(state: JointState) -> JointState:

@@ -111,6 +111,18 @@ def test_a_noisy_map_is_clear_if_another_start_finds_its_objects(monkeypatch, no
     assert found.unclear == unclear
 
 
+@pytest.mark.parametrize(("objects", "unclear"), [((0, 0, 1, 1), False), ((0, 0, 0, 1), True)], ids=["the same", "others"])
+@pytest.mark.parametrize("explained", [140.0, 160.0], ids=["it explains less", "it explains more"])
+def test_a_noisy_map_is_clear_if_the_search_of_another_start_ends_at_its_objects(monkeypatch, explained, objects, unclear):
+    """The first map of the start is better than that of the first exploration, so it is searched at once."""
+    monkeypatch.setattr(several_starts, "associate_tracks", lambda keyframes, rays: Association(np.full(4, -1), np.zeros(0)))
+    monkeypatch.setattr(several_starts, "largest_copy_in", lambda state: 0)
+    monkeypatch.setattr(several_starts, "_searched", lambda first: replace(first, explained=explained))
+    found = _Found(Map(100.0), Map(150.0, noise=1.7)).after(lambda: Map(110.0, noise=1.7, objects=objects))
+    assert found.state.explained == max(150.0, explained)
+    assert found.unclear == unclear
+
+
 @dataclass(frozen=True)
 class Begin:
     """A log before its first association."""
