@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from uneven_drives import uneven_drive
+from log_parts import without_names
+from uneven_drives import shelf_drive, uneven_drive
 
 from objslam.config import Settings, load_settings
 from objslam.core.diagnostics import Ledger
@@ -61,6 +62,19 @@ def test_flat_ground_is_not_found_uneven_whatever_the_mount(mount, seed):
     log = uneven_drive(0.0, seed=seed, mount=mount)
     assert with_uneven_ground(log, settings, ledger, lambda stage, done, total: None) == settings
     assert not ledger.warnings
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tags_above_each_other_are_no_tilt(seed):
+    """If tags on two boards are taken for one thing, the difference of their heights looks like a tilt."""
+    assert uneven_ground(shelf_drive(seed), Settings(mode="fixed")) is None
+
+
+@pytest.mark.parametrize("degrees", [0.5, 2.0, 6.0])
+def test_the_tilt_of_a_drive_past_equal_things_is_found(degrees):
+    """Labels do not tell which post a box shows. The estimate begins below some tilts and above others."""
+    found = uneven_ground(without_names(uneven_drive(np.radians(degrees), 0.0, 1, posts=14)), Settings(mode="fixed"))
+    assert np.degrees(found.tilt) == pytest.approx(degrees, rel=0.3)
 
 
 def test_the_user_may_know_better():
