@@ -22,5 +22,9 @@ def test_the_pipeline_leaves_them_to_its_first_stage():
 import sys, objslam.mapping.pipeline
 
 assert not {"gtsam", "scipy", "numpy.f2py", "torch", "cv2"} & set(sys.modules)
+
+import objslam.graph.calibration.self_calibration
+
+assert "scipy.stats" not in sys.modules  # Its import takes longer than those of all that a solve needs.
 """
     subprocess.run([sys.executable, "-c", script], check=True)
