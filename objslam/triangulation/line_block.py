@@ -13,6 +13,7 @@ from objslam.core.array_module import Tensor, as_type, contiguous, rows
 from objslam.triangulation.bundle import Bundle
 
 _FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # For each of the nine entries of a symmetric matrix, the index of its value in `outer`.
+UPPER, _LOWER = (0, 4, 8, 1, 2, 5), (0, 4, 8, 3, 6, 7)  # For each value in `outer`, the indices of its two entries of nine.
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,16 @@ def outer(a: Tensor, b: Tensor, xp: ModuleType) -> Tensor:
 
     a, b: (3, n, B). `b` may be `a` times a weight, or any other vector.
     """
-    diagonal = [(a[i] * b[i]).sum(axis=0) for i in range(3)]
-    pairs = ((0, 1), (0, 2), (1, 2))
-    return xp.stack(diagonal + [0.5 * (a[i] * b[j] + a[j] * b[i]).sum(axis=0) for i, j in pairs])
+    nine = products(a, b, xp)
+    return 0.5 * (nine[list(UPPER)] + nine[list(_LOWER)])
+
+
+def products(a: Tensor, b: Tensor, xp: ModuleType) -> Tensor:
+    """Return the sums (9, B) of a b^T over the lines of each object, row by row.
+
+    a, b: (3, n, B). One call takes a third of the time of six products and their sums, if objects have some tens of lines.
+    """
+    return xp.einsum("inb,jnb->ijb", a, b).reshape(9, -1)
 
 
 def full(six: Tensor) -> Tensor:

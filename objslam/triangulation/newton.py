@@ -7,7 +7,7 @@ and the Hessian t t^T / d, where t = n x u. The unit of length is about the mean
 from __future__ import annotations
 
 from objslam.core.array_module import Tensor, as_single, as_type, take_along
-from objslam.triangulation.line_block import LineBlock, dot, norm, solve_symmetric
+from objslam.triangulation.line_block import UPPER, LineBlock, dot, norm, products, solve_symmetric
 
 _WEIGHTED_STEPS = 3
 """The number of weighted least-squares steps before Newton's. With fewer, outliers keep more weight."""
@@ -140,7 +140,5 @@ def _hessian(lines: LineBlock, u: Tensor, inverse: Tensor) -> Tensor:
     both zero for a filler."""
     x, y, z = lines.direction
     a, b, c = u
-    t0, t1, t2 = y * c - z * b, z * a - x * c, x * b - y * a
-    w0, w1, w2 = t0 * inverse, t1 * inverse, t2 * inverse
-    pairs = ((t0, w0), (t1, w1), (t2, w2), (t0, w1), (t0, w2), (t1, w2))
-    return lines.xp.stack([(t * w).sum(axis=0) for t, w in pairs])
+    t = lines.xp.stack([y * c - z * b, z * a - x * c, x * b - y * a])
+    return products(t, t * inverse, lines.xp)[list(UPPER)]
