@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from objslam.association.existence import chance_odds, prior_odds, rarer_objects, rates_of_classes, rest_odds, size_odds
+from objslam.association.landmarks import State
 from objslam.association.refinement import velocity_gain
 from objslam.config import Settings
 from objslam.core.arrays import Bools, Floats, Ints
@@ -20,6 +21,8 @@ from objslam.mapping.doubts.evidence import Evidence
 from objslam.mapping.doubts.in_image import fixed_in_image
 from objslam.mapping.doubts.moving import moving_things
 from objslam.mapping.doubts.points import MISSED, Points, as_landmarks, fit_points
+from objslam.mapping.moves.constant_velocity import Sights
+from objslam.mapping.moves.receding_things import moving_along
 
 Reason = Literal[
     "fixed in the image",  # The boxes stay at one place of the image.
@@ -153,9 +156,11 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
     measured = obs.range[points.ray]
     ranged = np.isfinite(measured)
     off = np.abs(measured - distance)[ranged] / obs.range_sigma[points.ray][ranged]
+    along, way = moving_along(_sights(state), obs.position_sigma)
     cases: list[tuple[Bools, Reason]] = [
         (reason != _OPEN, "unclear"),  # The reason of these groups is known, and stays.
         (np.bincount(points.group, minlength=count) < settings.association.min_rays, "few"),
+        (along[known:], "moves"),
         (points.deviation > MISSED, "apart"),
         (np.degrees(parallax) < settings.triangulation.min_parallax_deg, "no parallax"),
         (np.nan_to_num(grouped_median(off, points.group[ranged], count)) > _RANGE_SIGMAS, "range"),
@@ -181,13 +186,35 @@ def _described(evidence: Evidence, groups: list[Ints], reason: Ints, owner: Ints
         rate=rates.mean[label],
         size=state.size[known:],
         usual_size=np.nan_to_num(usual)[label],
-        way=velocity_gain(obs, points.ray, points.group, points.position, factor, stamps)[1],
+        way=np.where(
+            along[known:], way[known:], velocity_gain(obs, points.ray, points.group, points.position, factor, stamps)[1]
+        ),
         range=grouped_median(measured[ranged], points.group[ranged], count),
         distance=grouped_median(distance, points.group, count),
         odds=thing + np.minimum(chance, 0.0),
         object=nearest,
         away=away,
         double=double,
+    )
+
+
+def _sights(state: State) -> Sights:
+    """Return the rays and ranges of the landmarks of a state. The noise of its ranges is right up to a factor for each
+    label."""
+    obs, rays = state.obs, state.assigned
+    known = np.isfinite(obs.range[rays])
+    return Sights(
+        thing=state.owner,
+        time=state.view.stamps[obs.frame[rays]],
+        origin=obs.origin[rays],
+        direction=obs.direction[rays],
+        across=np.hypot(obs.sigma[rays] * state.distance, obs.position_sigma),
+        range=obs.range[rays],
+        nominal=np.where(known, obs.range_sigma[rays], 1.0),
+        bias=np.zeros(len(rays)),
+        half=obs.size[rays, 0] / 2,
+        place=state.landmarks.position,
+        label=state.label,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +11,8 @@ from objslam.core.geometry import angles_off, lengths
 from objslam.core.types import Association
 from objslam.errors import SolveError
 from objslam.frontend.tracks import FEWEST, tracks_of_rays
+from objslam.mapping.moves.ray_noise import RayNoise, noise_of_rays
+from objslam.mapping.moves.receding_things import things_along_the_view
 
 if TYPE_CHECKING:
     from objslam.config import Settings
@@ -67,11 +69,12 @@ def associated_at_rest(state: JointState) -> JointState:
     The solve bent the path to rays that meet by chance. At a bent path, a thing at rest may have one object for each visit,
     and some of its rays are at no object or at a wrong one. So objects that appear twice are merged at the new path. Rounds
     of association follow, and count if they explain the log better. Of the labels that move, these rounds find no objects
-    either.
+    either. Things that move along the view are single objects, which hardly bend a path. If only these are dropped, no
+    rounds follow.
     """
     left, labels = _dropped(state, np.zeros(0, dtype=np.int64))
-    if left is state:
-        return state
+    if left is state or not len(labels):
+        return left
     left = left.merged()
     assert left.association is not None
     assert left.estimate is not None
@@ -90,16 +93,19 @@ def associated_at_rest(state: JointState) -> JointState:
 
 
 def _dropped(state: JointState, known: Ints) -> tuple[JointState, Ints]:
-    """Return the state without objects of things that move, and their labels. known: as in `things_at_rest`."""
+    """Return the state without objects of things that move, and the labels whose things move. known: as in
+    `things_at_rest`."""
     assert state.association is not None
     assert state.estimate is not None
     before = state.association
     given = state.keyframes, state.rays, before, state.estimate, state.solved_poses, state.settings
-    left = things_at_rest(*given, known, None if state.names is None else state.names.label)
+    along = things_along_the_view(*given, state.cameras)
+    left = things_at_rest(*given, known, None if state.names is None else state.names.label, along)
     if left is before:
         return state, known
-    gone = (before.object >= 0) & (left.object < 0)
-    return state.counted(left).solve("association", left, state.solved_poses), np.unique(before.label[before.object[gone]])
+    gone = np.unique(before.object[(before.object >= 0) & (left.object < 0)])
+    # One cart that is pushed away does not tell that the other things of its label move.
+    return state.counted(left).solve("association", left, state.solved_poses), np.unique(before.label[gone[~along[gone]]])
 
 
 def things_at_rest(
@@ -111,6 +117,7 @@ def things_at_rest(
     settings: Settings,
     known: Ints | None = None,
     names: Ints | None = None,
+    along: Bools | None = None,
 ) -> Association:
     """Return the association without objects of things that move, else the association itself.
 
@@ -120,9 +127,12 @@ def things_at_rest(
     because tracks of a few things at rest also pass on to equal things beside them. Of a label that moves, objects stay only
     if long tracks show that they are at rest. If all things have one label, the usual scatter is unknown, and all objects
     stay. estimate: of the association. map_T_camera: (K, 4, 4) its poses. known: labels that are known to move. names: the
-    labels that are known to be names of things at rest, whose objects stay.
+    labels that are known to be names of things at rest, whose objects stay. along: (N,) objects of things that move, as
+    their ranges show (`things_along_the_view`).
     """
     moving = _moving(keyframes, rays, association, estimate, map_T_camera, settings, known)
+    if along is not None:
+        moving |= along
     if names is not None:
         moving &= ~np.isin(association.label, names)
     if not moving.any():
@@ -160,7 +170,7 @@ def _moving(
     pure = np.bincount(owner[told], share, association.count) / np.maximum(many, 1)
     held = np.flatnonzero(owner >= 0)
     origins, directions = rays.in_map(map_T_camera)
-    noise = _noise(keyframes, rays, settings)
+    noise = noise_of_rays(keyframes, rays, settings)
     places = estimate.positions[owner[held]]
     off = angles_off(origins[held], directions[held], places) / noise.at(lengths(places - origins[held]), held)
     number = np.bincount(owner[held], minlength=association.count).astype(np.float64)
@@ -186,25 +196,6 @@ def _moving(
     return np.asarray(of_moving | (wander[label] & ((visits < _VISITS) | ~fits)))
 
 
-@dataclass(frozen=True)
-class _Noise:
-    """The standard deviations of rays. angle: (R,) rad. place: m, of their origins, 0 at solved poses."""
-
-    angle: Floats
-    place: float
-
-    def at(self, distance: Floats, rays: Ints) -> Floats:
-        """Return the standard deviations (n,), rad, of some rays (n,) at things at a distance (n,), m, NaN if unknown."""
-        return np.hypot(self.angle[rays], np.nan_to_num(self.place / np.maximum(distance, 1e-9)))
-
-
-def _noise(keyframes: Keyframes, rays: Rays, settings: Settings) -> _Noise:
-    """Return the noise of rays. At given poses, near things miss their rays by the noise of the poses too."""
-    from objslam.graph.fixed_pose_triangulation import pose_noise
-
-    return _Noise(*(pose_noise(rays, keyframes, settings) if settings.mode == "fixed" else (rays.sigma, 0.0)))
-
-
 def _wander(
     keyframes: Keyframes,
     rays: Rays,
@@ -213,7 +204,7 @@ def _wander(
     map_T_camera: Floats,
     settings: Settings,
     usual: float,
-    noise: _Noise,
+    noise: RayNoise,
 ) -> Bools:
     """Return the labels (L,) whose boxes follow things that move.
 
