@@ -1,7 +1,8 @@
 """Objects whose foot was never seen, as the other objects of their label show.
 
 A lamp post behind parked cars shows only its upper half, and no box of the cars says so if a detector missed them. Its body
-then ends where the post comes into view. The other posts are higher, and stand on the ground.
+then ends where the post comes into view. The other posts end at the same height, and stand on the ground. In a classroom,
+most chairs are such things: desks hide all but their backs.
 """
 
 from __future__ import annotations
@@ -17,20 +18,23 @@ from objslam.core.statistics import NORMAL_MEDIAN
 _FEWEST = 4
 """The fewest objects of a label that show how high its things are. With a larger number, fewer hidden feet are found."""
 _ALIKE = 0.1
-"""The things of a label are alike if half of the heights differ from the median by less than this share, and so do half of
-the feet, as a share of the height. With a larger share, labels of different things count as well."""
+"""The things of a label are alike if half of their tops differ from the median top by less than this share of their height.
+With a larger share, labels of different things count as well."""
+_SEEN = 0.25
+"""The share of the feet that are at least seen. The foot of the things is the quantile of all feet at this share. With a
+larger share, less of hidden feet is found to be missing. With a smaller one, a single low foot counts."""
 _SIGMAS = 3.0
-"""A thing is shorter than the others, or its foot is higher, by more than this number of standard deviations of the others.
-A larger number finds fewer hidden feet."""
+"""A foot is higher than that of the things by more than this number of standard deviations of their tops. A larger number
+finds fewer hidden feet."""
 _LEAST = 0.1
-"""It is also shorter by at least this share of the height of the others. A larger share finds fewer hidden feet."""
+"""A foot is also higher by at least this share of the height of the things. A larger share finds fewer hidden feet."""
 
 
 def with_hidden_feet(objects: tuple[MapObject, ...]) -> tuple[MapObject, ...]:
     """Return the objects, with larger standard deviations of heights and of size where a foot may be hidden.
 
-    If a thing is shorter than the others of its label, and its foot is higher by about as much, its centre may be too high
-    by half of what is missing. Nobody knows whether it is another thing, so it does not move.
+    If things end at the same height, and the foot of one is higher than the lowest feet, its centre may be too high by half
+    of what is missing. Nobody knows whether it is another thing, so it does not move.
     """
     changed = list(objects)
     for label in sorted({one.label for one in objects}):
@@ -59,12 +63,14 @@ def _heights_and_feet(objects: list[MapObject]) -> tuple[Floats, Floats, Floats]
 def _missing(height: Floats, sigma: Floats, foot: Floats) -> Floats:
     """Return how much (n,), m, of each thing may be missing at its foot, 0 if nothing is. The arguments are as returned by
     `_heights_and_feet`."""
-    usual, low = float(np.median(height)), float(np.median(foot))
-    spread = [float(np.median(np.abs(part))) for part in (height - usual, foot - low)]
-    if max(spread) > _ALIKE * usual:
+    top, low = height + foot, float(np.quantile(foot, _SEEN))
+    usual = float(np.median(top))
+    spread = float(np.median(np.abs(top - usual)))
+    if spread > _ALIKE * (usual - low):
         return np.zeros(len(height))
-    short, raised = usual - height, foot - low
-    shorter, higher = (_SIGMAS * one / NORMAL_MEDIAN for one in spread)
+    raised = foot - low
+    short = np.maximum(usual - low - height, raised)
+    hidden = raised > max(_SIGMAS * spread / NORMAL_MEDIAN, _LEAST * (usual - low))
     # A height that is unsure because its foot may be hidden is no reason against a hidden foot.
-    hidden = (short > np.maximum(sigma, max(shorter, _LEAST * usual))) & (raised > np.maximum(short / 2, higher))
+    hidden &= (np.abs(top - usual) < raised / 2) & (short > sigma)
     return np.where(hidden, short, 0.0)
