@@ -62,8 +62,8 @@ def things_along_the_view(
         settings: of the run.
         cameras: of the log.
     """
-    placed = np.isfinite(estimate.positions[:, 0])
-    held = np.flatnonzero((estimate.weight > 0) & (association.object >= 0) & placed[association.object])
+    placed = np.append(np.isfinite(estimate.positions[:, 0]), False)  # The last entry is for rays without an object.
+    held = np.flatnonzero((estimate.weight > 0) & placed[association.object])
     thing, noise = association.object[held], noise_of_rays(keyframes, rays, settings)
     origin, direction = (lines[held] for lines in rays.in_map(map_T_camera))
     distance = lengths(estimate.positions[thing] - origin)
