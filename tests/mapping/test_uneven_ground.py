@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from log_parts import without_names
@@ -15,6 +17,7 @@ from objslam.core.ground.rise import rise_of
 from objslam.core.result import RunResult
 from objslam.core.types import Log
 from objslam.errors import SolveError
+from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
 from objslam.mapping.checks.agreement import agreement, bounded_part
 from objslam.mapping.ground.common_tilt import _PLACE, _Poses
@@ -75,6 +78,25 @@ def test_the_tilt_of_a_drive_past_equal_things_is_found(degrees):
     """Labels do not tell which post a box shows. The estimate begins below some tilts and above others."""
     found = uneven_ground(without_names(uneven_drive(np.radians(degrees), 0.0, 1, posts=14)), Settings(mode="fixed"))
     assert np.degrees(found.tilt) == pytest.approx(degrees, rel=0.3)
+
+
+def from_odometry(tilt: float) -> Log:
+    return replace(without_names(uneven_drive(tilt, 1.5, 1, posts=14)), localization=None)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.01])
+def test_small_tilts_are_left_to_a_joint_map_from_odometry(tilt):
+    assert uneven_ground(from_odometry(tilt), Settings(mode="joint")) is None
+
+
+def test_rough_ground_loses_no_object_of_a_joint_map_from_odometry():
+    """On ground that counts as flat, 3 of the 14 posts are missing, and 15 objects are false."""
+    log = from_odometry(0.035)
+    result, ledger = mapped(log, "mode=joint", *ALONE)
+    assert any("the ground is uneven" in line for line in ledger.warnings)
+    score = evaluate(result.map, log.truth, align="se2", radius=1.0).to_dict()
+    assert (score["matched"], score["false"]) == (14, 0)
+    assert score["inside_95_3d"] >= 0.9
 
 
 def test_the_user_may_know_better():
