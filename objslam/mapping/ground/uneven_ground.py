@@ -33,8 +33,8 @@ _LEAST = 0.5
 larger number allows for uneven ground less often."""
 _LEAST_ALONE = 2.0
 """The same, if the robot has odometry alone. A joint map absorbs small tilts by itself, and more freedom for the path costs
-true objects where labels are no names. Two rough orchards had 2.6 and 3.0, and lost nearly all trees on flat ground. A legged
-robot had 1.7 and five flats 0.6 to 0.9, and their maps were better without. A larger number finds less rough ground."""
+true objects where labels are no names. Two rough orchards had 2.6 and 3.0, and lost nearly all trees on flat ground. A robot
+with legs had 1.7 and five flats 0.6 to 0.9, and their maps were better without. A larger number finds less rough ground."""
 _EXPLAINED = 0.4
 """The least share of the boxes that must fit a point on the ground that was found. With wrong input, fewer fit, and what
 their poses share is not the ground. A larger share finds uneven ground in fewer logs."""
