@@ -10,7 +10,7 @@ from objslam.core.geometry import is_planar
 from objslam.core.ground.rise import rise_of
 from objslam.core.types import Log
 from objslam.frontend.known_errors import coarse
-from objslam.mapping.checks.agreement import agreement, bounded_part
+from objslam.mapping.checks.agreement import Agreement, agreement, bounded_part
 from objslam.mapping.ground.common_tilt import SIGNIFICANT, Uneven, common_tilt
 from objslam.mapping.progress import Progress
 
@@ -81,7 +81,8 @@ def uneven_ground(log: Log, settings: Settings) -> Uneven | None:
     part = bounded_part(log, settings)
     if part.boxes < _FEWEST or part.crowd > _CROWD:
         return None
-    now, fit, least = _FIRST, None, _LEAST_ALONE if log.localization is None else _LEAST
+    alone = log.localization is None
+    now, fit, least = _FIRST, None, _LEAST_ALONE if alone else _LEAST
     for _ in range(_ROUNDS):
         at = agreement(part, part.log, _with(settings, now))
         if at is None or at.share < _EXPLAINED:
@@ -89,11 +90,29 @@ def uneven_ground(log: Log, settings: Settings) -> Uneven | None:
         fit = common_tilt(at.keyframes, at.rays, at.point, at.points, settings.noise.prior)
         if fit is None or fit.ground.gain < SIGNIFICANT or fit.ground.share < least:
             return None
+        if alone and not _in_both_halves(at, settings):
+            return None
         settled = abs(np.log(fit.ground.share / max(now.share, 1e-9))) < _SAME
         now = fit.ground
         if settled:
             break
     return None if fit is None else fit.lasting()
+
+
+def _in_both_halves(at: Agreement, settings: Settings) -> bool:
+    """Return whether both halves of a log show uneven ground.
+
+    A camera that is moved on the robot tilts all later rays. Without a localisation, this looks like uneven ground, but one
+    half of the log has no such step.
+    """
+    stamps = at.keyframes.stamps[at.rays.keyframe]
+    late = stamps > (stamps.min() + stamps.max()) / 2
+    for half in (late, ~late):
+        point = np.where(half, at.point, -1)
+        fit = common_tilt(at.keyframes, at.rays, point, at.points, settings.noise.prior)
+        if fit is None or fit.ground.gain < SIGNIFICANT or fit.ground.share < _LEAST:
+            return False
+    return True
 
 
 def _with(settings: Settings, ground: Uneven) -> Settings:
