@@ -155,7 +155,7 @@ class _Found:
             return self
         if best is self.state:
             return self.compared(state)
-        return replace(self, state=best, confirmed=replace(self, confirmed=False).compared(state).confirmed)
+        return replace(replace(self, confirmed=False).compared(state), state=best)
 
 
 def _searched(state: JointState) -> JointState:

@@ -10,8 +10,8 @@ from objslam.core.geometry import is_planar
 from objslam.core.ground.rise import rise_of
 from objslam.core.types import Log
 from objslam.frontend.known_errors import coarse
-from objslam.mapping.checks.agreement import Agreement, agreement, bounded_part
-from objslam.mapping.ground.common_tilt import SIGNIFICANT, Uneven, common_tilt
+from objslam.mapping.checks.agreement import Agreement, Part, agreement, bounded_part
+from objslam.mapping.ground.common_tilt import SIGNIFICANT, CommonTilt, Uneven, common_tilt
 from objslam.mapping.progress import Progress
 
 _FIRST = Uneven(np.radians(1.0), 0.05)
@@ -75,14 +75,22 @@ def uneven_ground(log: Log, settings: Settings) -> Uneven | None:
     The tilt is estimated from these points (`common_tilt`), and the points are searched again with this tilt.
     """
     path = log.odometry if log.localization is None else log.localization
-    found = [one.detections for one in log.cameras if one.detections is not None and len(one.detections.frame_stamps)]
-    if path is None or not found or not is_planar(path.poses):
+    boxes = [one.detections for one in log.cameras if one.detections is not None and len(one.detections.frame_stamps)]
+    if path is None or not boxes or not is_planar(path.poses):
         return None
     part = bounded_part(log, settings)
     if part.boxes < _FEWEST or part.crowd > _CROWD:
         return None
     alone = log.localization is None
-    now, fit, least = _FIRST, None, _LEAST_ALONE if alone else _LEAST
+    found = _last_fit(part, settings, _LEAST_ALONE if alone else _LEAST)
+    if found is None or (alone and not _in_both_halves(found[0], settings)):
+        return None
+    return found[1].lasting()
+
+
+def _last_fit(part: Part, settings: Settings, least: float) -> tuple[Agreement, CommonTilt] | None:
+    """Return the last points and the tilt that they show. None if the ground seems flat. least: as `_LEAST`."""
+    now, last = _FIRST, None
     for _ in range(_ROUNDS):
         at = agreement(part, part.log, _with(settings, now))
         if at is None or at.share < _EXPLAINED:
@@ -90,13 +98,11 @@ def uneven_ground(log: Log, settings: Settings) -> Uneven | None:
         fit = common_tilt(at.keyframes, at.rays, at.point, at.points, settings.noise.prior)
         if fit is None or fit.ground.gain < SIGNIFICANT or fit.ground.share < least:
             return None
-        if alone and not _in_both_halves(at, settings):
-            return None
         settled = abs(np.log(fit.ground.share / max(now.share, 1e-9))) < _SAME
-        now = fit.ground
+        now, last = fit.ground, (at, fit)
         if settled:
             break
-    return None if fit is None else fit.lasting()
+    return last
 
 
 def _in_both_halves(at: Agreement, settings: Settings) -> bool:
