@@ -58,3 +58,22 @@ class Estimate:
         rays."""
         before = np.zeros(more.shape) if self.error_covariance is None else self.error_covariance
         return replace(self, covariance=self.covariance + more, error_covariance=before + more)
+
+    def of_objects(self, kept: Bools, rays: Bools) -> Self:
+        """Return the estimate of some of its objects (N,) at the same poses.
+
+        The rays that are not among `rays` (R,) weigh 0.
+        """
+        number = np.cumsum(kept) - 1
+        return replace(
+            self,
+            positions=self.positions[kept],
+            covariance=self.covariance[kept],
+            seen_sigma=self.seen_sigma[kept],
+            solved=self.solved[kept],
+            weight=np.where(rays, self.weight, 0.0),
+            correlated=None if self.correlated is None else self.correlated[kept],
+            tags={int(number[i]): tag for i, tag in self.tags.items() if kept[i]},
+            error_covariance=None if self.error_covariance is None else self.error_covariance[kept],
+            moved_by_held=None if self.moved_by_held is None else self.moved_by_held[kept],
+        )

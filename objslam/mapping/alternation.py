@@ -9,7 +9,7 @@ from objslam.config import Settings
 from objslam.core.camera import Camera
 from objslam.core.diagnostics import Ledger
 from objslam.core.trace import Trace
-from objslam.core.types import Keyframes, Rays
+from objslam.core.types import Association, Keyframes, Rays
 from objslam.errors import SolveError
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.checks.unexplained import warn_of_unexplained
@@ -52,6 +52,7 @@ def solve(
     doubted: tuple[str, ...] = ()
     unsettled = copied = 0
     unfinished = False
+    whole: Association | None = None
     estimated = errors
     if settings.mode == "fixed":
         at = FixedPoses(frames, rays, keyframes, rays_of_keyframes, cameras, settings)
@@ -59,7 +60,8 @@ def solve(
             at, association, estimate, rounds = associate_fixed(at, progress, trace)
         else:
             at, association, estimate, rounds = calibrate_fixed(at, errors, ledger, progress, trace)
-        keyframes, rays_of_keyframes = at.seen, at.rays_seen
+        keyframes, rays_of_keyframes, whole = at.seen, at.rays_seen, association
+        association, estimate = at.without_things_along_the_view(association, estimate)
     elif not frames.localized_every and frames.odom_T_base is None:
         raise SolveError("the joint mode needs odometry or localisation", hint="give one of them, or use --mode fixed")
     else:  # The fixed mode does without these modules, and the many below them.
@@ -92,4 +94,4 @@ def solve(
     recorded = tuple(trace.rounds if trace else ())
     solved = Solution(keyframes, rays_of_keyframes, association, estimate, rounds, recorded)
     judged = replace(solved, doubted=doubted, unsettled=unsettled, unfinished=unfinished, copied=copied)
-    return replace(judged, errors=estimated)
+    return replace(judged, errors=estimated, whole=whole)

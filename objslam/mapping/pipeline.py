@@ -236,8 +236,7 @@ def _run(
         missing = missing or late
         diagnosis = diagnosis.with_findings([missing] if missing else [])
         say(diagnosis, ledger)
-    shown = None if earlier is None else earlier.lasting
-    told = None if shown is None else (shown.yaw, shown.xy)
+    told = None if earlier is None or earlier.lasting is None else (earlier.lasting.yaw, earlier.lasting.xy)
     if (
         settings.checks.use
         and settings.mode == "joint"
@@ -318,7 +317,8 @@ def _run(
     testable = open_mode and settings.mode == "fixed" and not diagnosis.certain  # A joint solve may refute what boxes show.
     if not why and settings.checks.use and testable and unclear and odometry_contradicts(given, settings):
         why = "the odometry shows that the localisation errs for seconds"
-    return result, why, MapAtPoses(None if late is None else lasting, solution.rays, solution.association, trusted)
+    found = solution.rays, solution.whole or solution.association
+    return result, why, MapAtPoses(None if late is None else lasting, *found, trusted)
 
 
 def _path_after(log: Log, path: Trajectory, keyframes: Keyframes, map_T_base: Floats, settings: Settings) -> Trajectory:

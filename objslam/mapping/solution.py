@@ -97,7 +97,8 @@ class Solution:
     although no further round was allowed. unfinished: whether the search for a clear map took all its solves
     (`joint.max_solves`). copied: the objects in the largest part of the map that shows the same things as another part.
     errors: the estimated errors, as a function of the measurements. None if none were estimated. If a held error is gross,
-    it is among them too.
+    it is among them too. whole: in fixed mode, the association before things that move along the view were dropped. A joint
+    solve does better with it, because it finds such things again at its own poses.
     """
 
     keyframes: Keyframes
@@ -114,6 +115,7 @@ class Solution:
     unfinished: bool = False
     copied: int = 0
     errors: SharedErrors | None = None
+    whole: Association | None = None
 
 
 def as_centres(solution: Solution) -> Solution:

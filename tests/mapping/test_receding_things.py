@@ -169,12 +169,13 @@ def with_people(log: Log) -> Log:
     return replace(more, cameras=(replace(more.cameras[0], detections=replace(found, depths=depths)),))
 
 
-def test_a_joint_map_has_no_people_who_walk() -> None:
+@pytest.mark.parametrize("mode", ["fixed", "joint"])
+def test_a_map_has_no_people_who_walk(mode: str) -> None:
     """Of three people, one or two were objects, with sigmas of 0.1 m."""
     left = make_camera("left", focal=380.0, position=(0.0, 0.0, 0.8), yaw=np.pi / 2)
     noise = {"sigma": NOISE, "sigma_per_m": 0.0}
     log = with_people(simulate(preset("rooms", cameras=(left,), missed=0.1, false=0.0, depth=noise), 1))
-    result = pipeline.run(log, load_settings(None, ("mode=joint", "checks.use=false", "output.recording=false")), Ledger())
+    result = pipeline.run(log, load_settings(None, (f"mode={mode}", "checks.use=false", "output.recording=false")), Ledger())
     labels = [one.label for one in result.map.objects]
     assert (labels.count("person"), len(labels)) == (0, 15)
     assert [one.reason for one in result.doubts if one.label == "person"] == ["moves"]

@@ -17,7 +17,7 @@ from objslam.core.trace import Parameters, Trace
 from objslam.core.types import Association, Keyframes, Rays
 from objslam.frontend.shared_errors import SharedErrors
 from objslam.mapping.fixed.pose_noise import noise_in_frames
-from objslam.mapping.moves.moving_things import things_at_rest
+from objslam.mapping.moves.moving_things import things_at_rest, without_things
 from objslam.mapping.progress import Progress
 from objslam.mapping.solution import seen_something
 
@@ -112,6 +112,19 @@ class FixedPoses:
         given = self.seen, self.rays_seen, association, estimate, self.seen.map_T_camera
         left = things_at_rest(*given, self.settings)
         return (association, estimate) if left is association else (left, self.solve(left, trace, parameters))
+
+    def without_things_along_the_view(self, association: Association, estimate: Estimate) -> tuple[Association, Estimate]:
+        """Return the association and the estimate without objects of things that move along the view, as their ranges show.
+
+        Both stay the same if there are none. At given poses, the other objects stay where they are."""
+        from objslam.mapping.moves.receding_things import things_along_the_view
+
+        if self.settings.association.method == "by_label":
+            return association, estimate
+        held = self.seen, self.rays_seen, association, estimate, self.seen.map_T_camera
+        along = things_along_the_view(*held, self.settings, self.cameras)
+        left = without_things(association, along)
+        return (association, estimate) if left is association else (left, estimate.of_objects(~along, left.object >= 0))
 
     def _posed(self, more: Floats | float) -> PosedRays:
         """Return all rays at the given poses. more: as in `associate`."""

@@ -135,17 +135,22 @@ def things_at_rest(
         moving |= along
     if names is not None:
         moving &= ~np.isin(association.label, names)
-    if not moving.any():
+    return without_things(association, moving)
+
+
+def without_things(association: Association, gone: Bools) -> Association:
+    """Return the association without some of its objects (N,), whose rays are refuted. It is the same if none is gone."""
+    if not gone.any():
         return association
-    number = np.append(np.where(moving, -1, np.cumsum(~moving) - 1), -1)
-    refuted = moving[association.object] & (association.object >= 0)
+    number = np.append(np.where(gone, -1, np.cumsum(~gone) - 1), -1)
+    refuted = gone[association.object] & (association.object >= 0)
     return Association(
         number[association.object],
-        association.label[~moving],
-        label_weights=None if association.label_weights is None else association.label_weights[~moving],
-        existence=None if association.existence is None else association.existence[~moving],
+        association.label[~gone],
+        label_weights=None if association.label_weights is None else association.label_weights[~gone],
+        existence=None if association.existence is None else association.existence[~gone],
         refuted=refuted if association.refuted is None else refuted | association.refuted,
-        few_rays=None if association.few_rays is None else association.few_rays[~moving],
+        few_rays=None if association.few_rays is None else association.few_rays[~gone],
     )
 
 
