@@ -3,14 +3,16 @@
 import numpy as np
 
 from objslam.core.arrays import Floats, Ints
+from objslam.core.geometry import angles_off
 from objslam.core.types import Association, Keyframes, Rays
 
 _LONGEST = 1.0
 """The longest time (s) between two boxes of a track that follow each other. Over a longer time, the robot drives past the
 thing, and the next box is not where the odometry expects it."""
 _NEAR = np.radians(6.0)
-"""The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
-moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
+"""The largest angle (rad) between a ray and where the ray before it in its track predicts it by the odometry. Without a
+range, only turns are predicted. Then a thing beside the robot moves by 5 degrees if the robot drives 8 % of its distance
+between the images. A larger angle joins neighbours more often."""
 _BRIDGED = 0.5
 """The longest time (s) between two boxes of a track if the detector missed the thing between them. Ten robots were
 simulated. With 5 to 15 images a second, the bridge reduced the errors of clock and turns to a third. With 1 s and 2 images a
@@ -25,9 +27,9 @@ FEWEST = 3
 def associate_tracks(keyframes: Keyframes, rays: Rays) -> Association:
     """Return an association with an object for each track of at least three rays.
 
-    Two rays of one label in neighbouring images are linked if each is the nearest one to the other. A detector misses boxes.
-    So a ray without a link is then compared with the image one further back, and so on. Linked rays are a track. Rays of
-    shorter tracks have no object.
+    Two rays of one label in neighbouring images are linked if each is the nearest one to the other (`_angles`). A detector
+    misses boxes. So a ray without a link is then compared with the image one further back, and so on. Linked rays are a
+    track. Rays of shorter tracks have no object.
 
     keyframes: with odometry, which predicts each ray in the next image.
     """
@@ -47,24 +49,40 @@ def tracks_of_rays(keyframes: Keyframes, rays: Rays, path_T_camera: Floats) -> t
     A ray that continues no track, and that no ray continues, is a track of its own. path_T_camera: (K, 4, 4) the poses of
     the cameras in any frame, by odometry or solved.
     """
-    direction = np.einsum("rij,rj->ri", path_T_camera[rays.keyframe, :3, :3], rays.direction)
+    origin, direction = rays.in_map(path_T_camera)
     root = np.arange(len(rays))
     last, first = np.ones((2, len(rays)), dtype=bool)  # Whether a ray is the last of its track so far, and the first.
     for gap in range(1, _IMAGES + 1):
         one, two = _neighbours(keyframes, rays, gap)
-        cosine = np.einsum("pi,pi->p", direction[one], direction[two])
-        near = np.flatnonzero((cosine > np.cos(_NEAR)) & last[one] & first[two])
-        one, two, cosine = one[near], two[near], cosine[near]
-        forward, backward = np.full((2, len(rays)), -1.0)
-        np.maximum.at(forward, one, cosine)
-        np.maximum.at(backward, two, cosine)
-        linked = (cosine == forward[one]) & (cosine == backward[two])
+        angle = _angles(origin, direction, rays.range, one, two)
+        near = np.flatnonzero((angle < _NEAR) & last[one] & first[two])
+        one, two, angle = one[near], two[near], angle[near]
+        forward, backward = np.full((2, len(rays)), np.inf)
+        np.minimum.at(forward, one, angle)
+        np.minimum.at(backward, two, angle)
+        linked = (angle == forward[one]) & (angle == backward[two])
         root[two[linked]] = one[linked]
         last[one[linked]], first[two[linked]] = False, False
     while (root[root] != root).any():
         root = root[root]
     _, track, length = np.unique(root, return_inverse=True, return_counts=True)
     return track.ravel(), length
+
+
+def _angles(origin: Floats, direction: Floats, range_m: Floats, one: Ints, two: Ints) -> Floats:
+    """Return the angles (P,), rad, by which pairs of rays miss each other.
+
+    Each ray of a pair with a range ends at a point, and the other ray misses it by an angle. If both have a range, the
+    smaller angle counts, because one range may be wrong. If none has one, the angle between the directions counts, which is
+    right for a thing far away. A thing that the robot passes moves on by many degrees between two images: of boxes on
+    shelves beside a robot, 31 % were linked to a neighbour without the ranges, and 2 % with them.
+
+    origin, direction: (R, 3) of the rays. range_m: (R,) m, NaN without one. one, two: (P,) the rays of each pair.
+    """
+    end = origin + direction * range_m[:, None]
+    from_ranges = np.fmin(*(angles_off(origin[ray], direction[ray], end[other]) for ray, other in ((one, two), (two, one))))
+    between = angles_off(np.zeros_like(direction[one]), direction[one], direction[two])
+    return np.where(np.isnan(from_ranges), between, from_ranges)
 
 
 def _neighbours(keyframes: Keyframes, rays: Rays, gap: int) -> tuple[Ints, Ints]:

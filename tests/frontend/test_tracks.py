@@ -5,16 +5,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from objslam.core.types import Rays
 from objslam.frontend.tracks import associate_tracks
 
 AHEAD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 
 
-class Rays(SimpleNamespace):
-    """What tracks need of rays."""
-
-    def __len__(self):
-        return len(self.keyframe)
+def rays_of(keyframe, direction, label, ranges=None):
+    """Rays with what tracks need."""
+    count = len(keyframe)
+    unknown, zero = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
+    ranges = unknown if ranges is None else ranges
+    boxes = np.full((count, 4), np.nan)
+    return Rays(keyframe, direction, unknown, ranges, unknown, unknown, label, unknown, boxes, zero, ("a", "b"))
 
 
 def tracks(keyframe, angle, label=None, *, turn=0.0, step=0.1):
@@ -32,7 +35,7 @@ def tracks(keyframe, angle, label=None, *, turn=0.0, step=0.1):
     local = np.array(angle) - yaw[keyframe]
     direction = np.stack([np.cos(local), np.sin(local), np.zeros(len(local))], axis=1) @ AHEAD
     label = np.zeros(len(keyframe), dtype=np.int64) if label is None else np.array(label)
-    return associate_tracks(keyframes, Rays(keyframe=keyframe, direction=direction, label=label)).object.tolist()
+    return associate_tracks(keyframes, rays_of(keyframe, direction, label)).object.tolist()
 
 
 def test_each_thing_is_a_track_while_the_robot_turns():
@@ -68,3 +71,31 @@ def test_things_of_two_labels_and_far_angles_are_not_joined():
 def test_images_that_are_too_far_apart_in_time_are_not_joined():
     assert tracks([0, 1, 2], [0.0, 0.0, 0.0], step=0.9) == [0, 0, 0]
     assert tracks([0, 1, 2], [0.0, 0.0, 0.0], step=1.1) == [-1, -1, -1]
+
+
+@pytest.mark.parametrize(("known", "wrong"), [(1.0, 0.001), (0.5, 0.1)])
+def test_ranges_tell_where_equal_things_beside_the_robot_go(known, wrong):
+    """A robot drives past tags 0.4 m from each other, and they move on by half their distance from image to image."""
+    rng = np.random.default_rng(0)
+    tags = np.array([[0.4 * i, 1.5, z] for i in range(20) for z in (0.5, 1.1)])
+    places = np.array([[0.2 * k, 0.0, 0.8] for k in range(40)])
+    to = tags - places[:, None]
+    keyframe, thing = np.nonzero(np.abs(to[..., 0]) < 1.0)
+    to = to[keyframe, thing]
+    distance = np.linalg.norm(to, axis=1)
+    direction = to / distance[:, None] + rng.normal(0, 0.005, to.shape)
+    ranges = np.where(rng.random(len(to)) < known, distance + rng.normal(0, 0.03, len(to)), np.nan)
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    keyframes = SimpleNamespace(
+        stamps=0.25 * np.arange(len(places)),
+        camera=np.zeros(len(places), dtype=np.int64),
+        odom_T_base=poses,
+        base_T_camera=np.tile(np.eye(4), (len(places), 1, 1)),
+    )
+    rays = rays_of(keyframe, direction / np.linalg.norm(direction, axis=1)[:, None], np.zeros_like(thing), ranges)
+    owner = associate_tracks(keyframes, rays).object
+    order = np.lexsort((keyframe, owner))
+    follow = (np.diff(owner[order]) == 0) & (owner[order][1:] >= 0)
+    assert follow.sum() > 0.8 * known * len(to)
+    assert (np.diff(thing[order])[follow] != 0).mean() < wrong
