@@ -4,7 +4,8 @@ If several landmarks fit under one shift and turn within the drift, this is evid
 factor. It compares two hypotheses: the landmarks here are the landmarks there, or all landmarks here are new.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -85,6 +86,10 @@ class Recognition:
         enough = self.evidence >= settings.loop_evidence and self.lead >= settings.loop_lead
         return enough and len(self.pairs) >= MIN_LANDMARKS
 
+    def against(self, other: Self | None) -> Self:
+        """Return this recognition with its lead over another explanation too. None counts as the evidence 0."""
+        return self if other is None else replace(self, lead=min(self.lead, self.evidence - max(other.evidence, 0.0)))
+
 
 def recognise_place(
     here: Constellation,
@@ -131,6 +136,36 @@ def recognise_place(
     correction[:2, 3] += pivot - correction[:2, :2] @ pivot
     lead = evidence[best] - evidence[other].max(initial=0.0)
     return Recognition(correction, pairs[best], float(evidence[best]), float(lead))
+
+
+def repetition(
+    position: Floats,
+    covariance: Floats,
+    label: Ints,
+    here: Bools,
+    together: Bools,
+    pivot: Floats,
+    prior: Floats,
+    density: Floats,
+) -> Recognition | None:
+    """Return the best match of some landmarks with others that a frame shows beside them. None if nothing matches.
+
+    Both cannot be the same, so the match shows how far the place repeats itself, as the doors of a corridor do.
+
+    Args:
+        position, covariance, label: (N, 3) m, (N, 3, 3) m^2, (N,) of all landmarks.
+        here: (N,) which ones are matched.
+        together: (N, N) whether some frame shows both.
+        pivot, prior: as in `recognise_place`.
+        density: (N,) as in `label_densities`.
+    """
+    apart = here[:, None] & together & (label[:, None] == label)
+    np.fill_diagonal(apart, False)
+    one, two = np.flatnonzero(apart.any(axis=1)), np.flatnonzero(apart.any(axis=0))
+    if not len(one):
+        return None
+    a, b = (neighbourhood(position[which], covariance[which], label[which], pivot) for which in (one, two))
+    return recognise_place(a, b, pivot, prior, density[one], apart[np.ix_(one, two)])
 
 
 @dataclass(frozen=True)

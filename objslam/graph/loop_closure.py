@@ -7,7 +7,15 @@ import gtsam
 import numpy as np
 
 from objslam.association.appearance.evidence import Looks
-from objslam.association.place_recognition import MIN_LANDMARKS, POSE_FLOOR, label_densities, neighbourhood, recognise_place
+from objslam.association.place_recognition import (
+    MIN_LANDMARKS,
+    POSE_FLOOR,
+    Constellation,
+    label_densities,
+    neighbourhood,
+    recognise_place,
+    repetition,
+)
 from objslam.config import AssociationSettings
 from objslam.core.arrays import Bools, Floats, Ints
 from objslam.core.geometry import adjoint, exp_se3, inverse, log_se3
@@ -72,6 +80,10 @@ class Landmarks:
 
     def __len__(self) -> int:
         return len(self.label)
+
+    def around(self, which: Ints, pivot: Floats) -> Constellation:
+        """Return landmarks `which` (n,) as a neighbourhood of a point (2,) m."""
+        return neighbourhood(self.position[which], self.covariance[which], self.label[which], pivot)
 
     def and_also(self, position: Floats, covariance: Floats, label: Ints) -> Self:
         """Return the landmarks and n further ones that no frame has seen yet. position: (n, 3) m. label: (n,)."""
@@ -169,6 +181,9 @@ def find_closure(
     A pair is a recent and an old landmark of one label. A search is made only if it has a new pair, or if the recent
     landmark of a pair has many more rays than at the last search (`_MORE`). A pair counts once for each tried drift.
 
+    Where things repeat, as the doors of a corridor do, recent landmarks also match others that some frame shows beside them.
+    They are certainly not the same. So a loop needs its lead over the best of these matches too (`repetition`).
+
     window: the solved graph. now: the newest keyframe. looks: what the landmarks look like, None if this is not known.
     """
     map_T_camera = window.map_T_camera
@@ -194,10 +209,7 @@ def find_closure(
         before = np.minimum(landmarks.last[two], landmarks.first[one].min())
         epochs = np.unique(before // _EPOCH)[::-1][:_EPOCHS]
         anchors = [int(before[before // _EPOCH == e].max()) for e in epochs]
-        a, b = (
-            neighbourhood(landmarks.position[which], landmarks.covariance[which], landmarks.label[which], pivot)
-            for which in (one, two)
-        )
+        a, b = landmarks.around(one, pivot), landmarks.around(two, pivot)
         alike: Floats | float = 0.0
         if looks is not None:
             each = np.repeat(one, len(two)), np.tile(two, len(one))
@@ -205,7 +217,10 @@ def find_closure(
         for prior in relative_covariances(marginals, map_T_camera, anchors, now):
             compared += int(possible.sum())
             found = recognise_place(a, b, pivot, prior, density[one], possible[np.ix_(one, two)], alike)
-            if found is not None and found.is_sure(settings) and (best is None or found.evidence > best.evidence):
+            if found is None or not found.is_sure(settings) or (best is not None and found.evidence <= best.evidence):
+                continue
+            table = landmarks.position, landmarks.covariance, landmarks.label
+            if found.against(repetition(*table, here, landmarks.together, pivot, prior, density)).is_sure(settings):
                 best = Closure(found.correction, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.evidence)
     return best, compared
 
@@ -235,10 +250,7 @@ def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Flo
         if len(one) < MIN_LANDMARKS or len(two) < MIN_LANDMARKS:
             continue
         pivot = map_T_camera[cut, :2, 3]
-        a, b = (
-            neighbourhood(landmarks.position[which], landmarks.covariance[which], landmarks.label[which], pivot)
-            for which in (one, two)
-        )
+        a, b = landmarks.around(one, pivot), landmarks.around(two, pivot)
         for bend in _BENDS:
             loop = recognise_place(a, b, pivot, np.diag(bend) ** 2, density[one], pairs[np.ix_(one, two)])
             if loop is None or loop.evidence <= 0:

@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from objslam.association.place_recognition import Constellation, Recognition, recognise_place
+from objslam.association.place_recognition import (
+    Constellation,
+    Recognition,
+    label_densities,
+    neighbourhood,
+    recognise_place,
+    repetition,
+)
 from objslam.config import AssociationSettings
 from objslam.core.geometry import lift_se2
 
@@ -133,3 +140,57 @@ def test_how_sure_a_place_must_be_is_a_setting():
     found = Recognition(np.eye(4), np.zeros((2, 2), dtype=np.int64), evidence=8.0, lead=4.0)
     asked = [{}, {"loop_evidence": 8.5}, {"loop_lead": 4.5}]
     assert [found.is_sure(AssociationSettings.model_validate(more)) for more in asked] == [True, False, False]
+
+
+def corridor(doors, y=0.0):
+    """Doors on both sides, 4 m from each other, and a plate beside each of them."""
+    places = [
+        (4.0 * i + step, y + side, z) for i in range(doors) for side in (-1, 1) for step, z in ((0.0, 1.0), (0.7, 1.5))
+    ]
+    return np.array(places), np.tile([0, 1], 2 * doors)
+
+
+def recognised(position, label, here, there, together):
+    """The recognition of landmarks `here` among those `there`, and the same against the repetition of the place."""
+    count, pivot, prior = len(label), position[here, :2].mean(axis=0), np.diag([2.5, 2.5, 0.2]) ** 2
+    covariance, density = np.tile(SIGMA**2 * np.eye(3), (count, 1, 1)), label_densities(position, label)
+    one, two = (neighbourhood(position[mask], covariance[mask], label[mask], pivot) for mask in (here, there))
+    possible = (one.label[:, None] == two.label) & ~together[np.ix_(here, there)]
+    found = recognise_place(one, two, pivot, prior, density[here], possible)
+    again = repetition(position, covariance, label, here, together, pivot, prior, density)
+    return found, found.against(again), again
+
+
+def frames_of_two_doors(count):
+    """Which of the landmarks of a corridor some frame shows together: those of doors that follow each other."""
+    door = np.arange(count) // 4
+    return np.abs(door[:, None] - door) <= 1
+
+
+def test_the_next_doors_of_a_corridor_are_not_those_before():
+    """The last two pairs of doors fit those two places back, which no frame shows beside them. Wheels may slip by 8 m."""
+    rng = np.random.default_rng(0)
+    position, label = corridor(6)
+    position += rng.normal(0, 0.02, position.shape)
+    door = np.arange(len(label)) // 4
+    found, against, again = recognised(position, label, door >= 4, door < 4, frames_of_two_doors(len(label)))
+    assert found.is_sure(AssociationSettings())
+    assert abs(found.correction[0, 3]) > 7
+    assert again.evidence > 7
+    assert not against.is_sure(AssociationSettings())
+
+
+def test_a_corridor_is_recognised_on_the_way_back():
+    """Its doors repeat too, but all of them fit at the right place, and only some of them one door aside."""
+    rng = np.random.default_rng(0)
+    (before, label), (after, _) = corridor(6), corridor(6, y=0.6)
+    after[:, 0] += 0.5
+    position = np.concatenate([before, after])
+    position += rng.normal(0, 0.02, position.shape)
+    later = np.arange(len(position)) >= len(before)
+    together = np.kron(np.eye(2, dtype=bool), frames_of_two_doors(len(label)))
+    found, against, again = recognised(position, np.tile(label, 2), later, ~later, together)
+    assert again.evidence > 7
+    assert against.is_sure(AssociationSettings())
+    np.testing.assert_allclose(against.correction[:2, 3], [-0.5, -0.6], atol=0.1)
+    assert against.lead < found.evidence

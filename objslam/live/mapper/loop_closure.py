@@ -39,31 +39,49 @@ def close_loop(m: MapState) -> None:
     if state == m.schedule.compared:
         return
     m.schedule.compared = state
-    possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~_together(m)
+    together = _together(m)
+    possible = here[:, None] & there & (landmarks.label[:, None] == landmarks.label) & ~together
     one, two = np.flatnonzero(possible.any(axis=1)), np.flatnonzero(possible.any(axis=0))
     if min(len(one), len(two)) < place_recognition.MIN_LANDMARKS:
         return
-    found = _recognise(m, one, two, possible[np.ix_(one, two)], newest)
+    found = _recognise(m, one, two, possible[np.ix_(one, two)], newest, together)
     if found is not None:
         _close(m, one[found.pairs[:, 0]], two[found.pairs[:, 1]], found.correction)
 
 
-def _recognise(m: MapState, one: Ints, two: Ints, possible: Bools, newest: int) -> place_recognition.Recognition | None:
+def _recognise(
+    m: MapState, one: Ints, two: Ints, possible: Bools, newest: int, together: Bools
+) -> place_recognition.Recognition | None:
+    """Return how the landmarks in rows `one` are sure to be those in rows `two`, None if they are not.
+
+    They have to match better than landmarks that some frame shows `together` (N, N), because such places repeat themselves.
+    possible: which pairs may be the same. newest: the row of the newest keyframe.
+    """
     landmarks, k = m.landmarks, m.keyframes
     pivot = m.graph.pose(int(k.id[newest]))[:2, 3]
-    density = place_recognition.label_densities(landmarks.position, landmarks.label)[one]
+    density = place_recognition.label_densities(landmarks.position, landmarks.label)
     a, b = (
         place_recognition.neighbourhood(landmarks.position[n], covariances(landmarks, n), landmarks.label[n], pivot)
         for n in (one, two)
     )
     lately = np.unique(landmarks.last[two])[::-1]
+    rows = np.arange(len(landmarks))
     best: place_recognition.Recognition | None = None
     for stamp in lately[np.linspace(0, len(lately) - 1, min(_ANCHORS, len(lately))).astype(np.int64)]:
         anchor = int(np.argmin(np.abs(k.stamp - stamp)))
         if k.stamp[anchor] >= k.stamp[newest]:
             continue
-        found = place_recognition.recognise_place(a, b, pivot, _planar(m, anchor, newest), density, possible)
-        if found is not None and found.is_sure(m.settings.association) and (best is None or found.evidence > best.evidence):
+        prior = _planar(m, anchor, newest)
+        found = place_recognition.recognise_place(a, b, pivot, prior, density[one], possible)
+        if (
+            found is None
+            or not found.is_sure(m.settings.association)
+            or (best is not None and found.evidence <= best.evidence)
+        ):
+            continue
+        table, here = (landmarks.position, covariances(landmarks, rows), landmarks.label), np.isin(rows, one)
+        repeated = place_recognition.repetition(*table, here, together, pivot, prior, density)
+        if found.against(repeated).is_sure(m.settings.association):
             best = found
     return best
 
