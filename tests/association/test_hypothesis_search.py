@@ -139,6 +139,21 @@ def test_sizes_show_ranges_where_rays_to_several_things_meet_far_away():
     np.testing.assert_array_equal(np.isfinite(ranged_by_size(obs, some, SEARCH.gate, SEARCH.parallax, 0).range), some)
 
 
+def test_sizes_show_ranges_along_a_street_of_many_equal_things():
+    """The more things there are, the fewer pairs of rays are to one of them: 17 %. All rays also meet down the street."""
+    rng = np.random.default_rng(0)
+    posts = np.array([[5.0 * i, side, 0.5] for i in range(40) for side in (-3.0, 3.0)])
+    posts[:, :2] += rng.uniform(-1.0, 1.0, (80, 2))
+    poses = lift_se2(np.column_stack([np.linspace(-6.0, 200.0, 400), np.zeros((400, 2))]))
+    scene = watch(posts, poses, pixel_sigma=1.0)
+    to = posts[scene.whose] - scene.keyframes.map_T_camera[scene.rays.keyframe, :3, 3]
+    away = np.linalg.norm(to, axis=1)
+    seen = np.flatnonzero((away < 25.0) & (abs(np.degrees(np.arctan2(to[:, 1], to[:, 0]))) < 30.0))
+    obs = observed(replace(scene, rays=scene.rays.take(seen), whose=scene.whose[seen]))
+    ranged = ranged_by_size(obs, np.ones(len(obs), dtype=bool), SEARCH.gate, SEARCH.parallax, 0)
+    np.testing.assert_allclose(ranged.range, away[seen], rtol=0.25)
+
+
 def test_sizes_show_no_ranges_where_rays_meet_only_at_the_things():
     obs = observed(watch(THREE, circle(60), pixel_sigma=2.0))
     every = np.ones(len(obs), dtype=bool)
