@@ -87,7 +87,7 @@ def _angles(origin: Floats, direction: Floats, range_m: Floats, one: Ints, two: 
     from_ranges = np.fmin(*(angles_off(origin[ray], direction[ray], end[other]) for ray, other in ((one, two), (two, one))))
     between = angles_off(np.zeros_like(direction[one]), direction[one], direction[two])
     unknown = np.isnan(from_ranges)
-    return np.where(unknown, between, from_ranges), np.where(unknown, _NEAR, _NEAR_BY_RANGE)
+    return np.where(unknown, between, from_ranges), np.asarray(np.where(unknown, _NEAR, _NEAR_BY_RANGE), dtype=np.float64)
 
 
 def _neighbours(keyframes: Keyframes, rays: Rays, gap: int) -> tuple[Ints, Ints]:
