@@ -156,13 +156,15 @@ class Closure:
     """A loop: recent landmarks that are the same as old landmarks.
 
     correction: (4, 4) moves the later poses in map to where they should be. now: (P,) the recent landmarks. before: (P,) for
-    each of these the old landmark. evidence: the log odds of the loop.
+    each of these the old landmark. evidence: the log odds of the loop. repeated: the log odds that the recent landmarks are
+    others that a frame shows beside them. They are not, so places like this one repeat (`repetition`).
     """
 
     correction: Floats
     now: Ints
     before: Ints
     evidence: float
+    repeated: float = 0.0
 
 
 def find_closure(
@@ -242,6 +244,8 @@ def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Flo
     possible = (landmarks.label[:, None] == landmarks.label) & ~landmarks.together
     density = np.zeros(len(landmarks))
     density[counts] = label_densities(landmarks.position[counts], landmarks.label[counts])
+    table = landmarks.position, landmarks.covariance, landmarks.label
+    together = landmarks.together & np.isfinite(middle) & np.isfinite(middle)[:, None]
     found: dict[tuple[tuple[int, ...], tuple[int, ...]], Closure] = {}
     begins = np.unique(landmarks.first[counts])
     for cut in begins[np.unique(np.linspace(0, len(begins) - 1, _CUTS).round().astype(int))]:
@@ -255,7 +259,10 @@ def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Flo
             loop = recognise_place(a, b, pivot, np.diag(bend) ** 2, density[one], pairs[np.ix_(one, two)])
             if loop is None or loop.evidence <= 0:
                 continue
-            closure = Closure(loop.correction, one[loop.pairs[:, 0]], two[loop.pairs[:, 1]], loop.evidence)
+            now, before = one[loop.pairs[:, 0]], two[loop.pairs[:, 1]]
+            here = np.isin(np.arange(len(landmarks)), now)
+            again = repetition(*table, here, together, pivot, np.diag(bend) ** 2, density)
+            closure = Closure(loop.correction, now, before, loop.evidence, 0.0 if again is None else again.evidence)
             same = tuple(closure.now.tolist()), tuple(closure.before.tolist())
             if same not in found or found[same].evidence < closure.evidence:
                 found[same] = closure
@@ -265,18 +272,16 @@ def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Flo
 def closed_path(closure: Closure, landmarks: Landmarks, map_T_camera: Floats, drift: Floats) -> Floats:
     """Return the path (K, 4, 4) after a loop closure.
 
-    The correction is spread over the keyframes from the last one that saw an old landmark of the loop to the first one that
-    saw a recent landmark of it. drift: (K,) as for `distribute_correction`."""
+    The correction is spread over the keyframes from the last one that saw an old landmark to the first one that saw a recent
+    landmark. drift: (K,) as for `distribute_correction`."""
     back = int(landmarks.first[closure.now].min())
     left = int(np.minimum(landmarks.last[closure.before], back).max())
     return distribute_correction(map_T_camera, closure.correction, min(left, max(back - 1, 0)), back, drift)
 
 
 def heading_variance(drift: Floats) -> Floats:
-    """Return the variance (K,), rad^2, of the heading at each keyframe, by the drift (K, 6, 6) of the odometry.
-
-    It never falls, so its increase shows how far the heading drifted between two keyframes.
-    """
+    """Return the variance (K,), rad^2, of the heading at each keyframe, by the drift (K, 6, 6) of the odometry. It never
+    falls, so its increase shows how far the heading drifted between two keyframes."""
     return np.maximum.accumulate(np.linalg.eigvalsh(drift[:, :3, :3])[:, -1])
 
 

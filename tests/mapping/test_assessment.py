@@ -37,6 +37,11 @@ def test_a_usual_result_is_good() -> None:
         ({"resolved": 0, "unexplained": 900}, "bad", "No object has a place, because 100 % of the used boxes agree on none"),
         ({"findings": ("rays miss",)}, "check", "The input has an error that the warnings explain (rays miss)."),
         ({"findings": ("noise",)}, "check", "The poses or depths are far noisier than the settings say, and the warnings"),
+        (
+            {"findings": ("equal things nearer than the poses err",)},
+            "check",
+            "Equal things stand nearer to each other than the poses err",
+        ),
         ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
         ({"copied": 7}, "check", "A part of the map with 7 objects looks like another part, at another place"),
         ({"unsettled": 3}, "check", "It is not settled which boxes show which object: the last round of association still"),

@@ -13,8 +13,9 @@ from objslam.core.noise import NoiseFactors
 from objslam.core.types import Log
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import joint_solve, pipeline
+from objslam.mapping.checks.finding import NEIGHBOURS
 from objslam.mapping.moves import phantoms
-from objslam.mapping.moves.phantoms import BENT, NEIGHBOURS, check_neighbours
+from objslam.mapping.moves.phantoms import BENT, check_neighbours
 from objslam.simulation import DriveSettings, PoseNoise, simulate
 
 ALONE = ("bodies.use=false", "calibration.use=false", "output.recording=false")

@@ -12,7 +12,7 @@ from objslam.frontend.bearings import CUT_OFF
 from objslam.frontend.keyframes import OFF_PATH, UNCOVERED
 from objslam.frontend.log_part import part_in_words
 from objslam.io.detections_jsonl import MALFORMED
-from objslam.mapping.checks.finding import NOISIER
+from objslam.mapping.checks.finding import NEIGHBOURS, NOISIER
 
 Level = Literal["good", "check", "bad"]
 
@@ -249,7 +249,9 @@ def _check(e: Evidence) -> list[str]:
     if e.fixed and e.odometry_frame:
         # Drift splits an object into parts, and the rays of each part fit it well. So the residuals do not show drift.
         found.append("The poses come from the odometry, so the map has its drift: --mode joint corrects it.")
-    errors = [name for name in e.findings if name != NOISIER]
+    errors = [name for name in e.findings if name not in (NOISIER, NEIGHBOURS)]
+    if NEIGHBOURS in e.findings:
+        found.append("Equal things stand nearer to each other than the poses err, so their boxes may be exchanged.")
     if NOISIER in e.findings:
         found.append("The poses or depths are far noisier than the settings say, and the warnings say how noisy.")
     if errors:

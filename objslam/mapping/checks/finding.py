@@ -5,6 +5,9 @@ from typing import Any, Literal
 
 JUMPS = "localisation jumps"
 """The name of the finding that a localisation jumps. If it does so often, it errs for seconds."""
+NEIGHBOURS = "equal things nearer than the poses err"
+"""The name of the finding that the errors of poses are as large as the distances of equal things. It is no error of the
+input."""
 NOISIER = "noise"
 """The name of the finding that a log is far noisier than the settings say. It is no error of the input."""
 

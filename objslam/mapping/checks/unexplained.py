@@ -40,5 +40,6 @@ def _cause(rays: Rays, left: Bools, number: Ints) -> str:
         return f"; unless most things move, the input may be wrong: check {_INPUT}"
     names = ", ".join(f"'{rays.label_names[i]}'" for i in np.flatnonzero(bad)[np.argsort(-number[bad], kind="stable")][:3])
     return (
-        f"; the other labels fit, so the input is probably right: things labelled {names} move, or hide each other in rows"
+        f"; the other labels fit, so the input is probably right: things labelled {names} move, hide each other, or stand "
+        "in long rows of equal things"
     )

@@ -170,7 +170,7 @@ def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> s
             middle = f"({(box[0] + box[2]) / 2:.0f}, {(box[1] + box[3]) / 2:.0f})"
             return (
                 f" stay at pixel {middle} of camera {camera} while the camera turns: "
-                "a part of the robot, or a ghost of the detector"
+                "a part of the robot, a ghost of the detector, or equal things that the robot passes in the same way"
             )
         case "on an object":
             o = result.map.objects[groups.object[g]]

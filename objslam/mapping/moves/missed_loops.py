@@ -108,11 +108,13 @@ def _copies(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, of: Asso
     """Return the loops that copies show, with the most evidence first. middle: (N,), map_T_camera: (K, 4, 4).
 
     Of many searches, one may find a loop by chance. So the evidence must be larger than for a loop of a single search
-    (`association.loop_evidence`), by the logarithm of the number of searches (Bonferroni)."""
+    (`association.loop_evidence`), by the logarithm of the number of searches (Bonferroni). Where things repeat, as the doors
+    of a corridor do, it must be larger than that of matches which are certainly wrong, by `association.loop_lead`."""
     from objslam.graph.loop_closure import SEARCHES, find_missed_closures
 
     found, enough = find_missed_closures(landmarks, middle, map_T_camera), of.loop_evidence + np.log(SEARCHES)
-    return [loop for loop in found if len(loop.now) > _BY_CHANCE and loop.evidence >= enough]
+    sure = [loop for loop in found if len(loop.now) > _BY_CHANCE and loop.evidence >= enough]
+    return [loop for loop in sure if loop.evidence - max(loop.repeated, 0.0) >= of.loop_lead]
 
 
 def _with_rounds(state: JointState) -> JointState:

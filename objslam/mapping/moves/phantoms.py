@@ -9,7 +9,7 @@ import numpy as np
 
 from objslam.core.noise import NoiseFactors
 from objslam.core.statistics import grouped_median
-from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.finding import NEIGHBOURS, Finding
 from objslam.mapping.joint.relocalization import relocalize
 from objslam.mapping.moves.odometry_witness import lasting_by_odometry, lasting_long
 
@@ -29,8 +29,6 @@ _APART = 2.0
 """Lasting errors of poses shift the rays to a thing, far ones by more. Two things of one label cannot be told apart if the
 distance between them is less than this multiple of the shift. A ray errs by more than 2 standard deviations in 5 % of the
 cases. A larger value warns of more maps."""
-NEIGHBOURS = "equal things nearer than the poses err"
-"""The name of the finding that the errors of poses are as large as the distances of equal things."""
 BENT = "a path that may be bent to false objects"
 """The name of the finding that the odometry contradicts both the poses and the boxes. The path may then be bent, because
 some labels have several objects."""
