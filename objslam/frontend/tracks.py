@@ -12,11 +12,11 @@ thing, and the next box is not where the odometry expects it."""
 _NEAR = np.radians(6.0)
 """The largest angle (rad) between a ray and the ray before it in its track, turned by the odometry. A thing beside the robot
 moves by 5 degrees if the robot drives 8 % of its distance between the images. A larger angle joins neighbours more often."""
-_MISS = 6.0
+_MISS = 5.0
 """If ranges show where things are, the way of the robot is predicted too, and rays of one track hardly miss each other. The
 largest angle of a link is then this multiple of the median miss, at most `_NEAR`. The median was 0.3 to 0.5 degrees in
 buildings, 0.9 on rough ground, and 2 for a robot that sways on its legs. Recorded posts stand 17 cm apart, in groups: with 6
-degrees, 27 % of the links joined neighbours, and with 3 degrees 20 %. A larger multiple joins neighbours more often."""
+degrees, 27 % of the links joined neighbours, and with 2.5 degrees 19 %. A larger multiple joins neighbours more often."""
 _LEAST_MISS = np.radians(2.0)
 """The largest angle (rad) of a link by ranges is at least this. In a box that something hides in part, the centre moves by a
 degree or two, however small the median is. A larger angle joins neighbours more often."""
