@@ -43,7 +43,7 @@ def test_a_usual_result_is_good() -> None:
             "Equal things stand nearer to each other than the poses err",
         ),
         ({"misses": 3.04}, "check", "The rays miss their objects 3.0 times as far as the settings say"),
-        ({"copied": 7}, "check", "A part of the map with 7 objects looks like another part, at another place"),
+        ({"copied": 7}, "check", "A part of the map with 7 objects looks like another part, at another place: the place"),
         ({"unsettled": 3}, "check", "It is not settled which boxes show which object: the last round of association still"),
         (
             {"unfinished": True},

@@ -295,9 +295,9 @@ def _check(e: Evidence) -> list[str]:
         )
     if e.copied:
         found.append(
-            f"A part of the map with {_objects(e.copied)} looks like another part, at another place: the robot probably "
-            "came back there unnoticed. Then the path is bent, and the map shows things twice. Depths, or more labels, "
-            "would show where the robot was."
+            f"A part of the map with {_objects(e.copied)} looks like another part, at another place: the place repeats "
+            "itself, or the robot came back there unnoticed. In the second case the path is bent, and the map shows things "
+            "twice." + _depths_would_show(e)
         )
     if e.uncalibrated:
         found.append("The errors that all measurements share could not be estimated, so the sigmas lack them.")
