@@ -39,5 +39,5 @@ def test_the_input_may_be_wrong_if_no_label_fits(without):
 def test_the_input_is_probably_right_if_the_other_labels_fit():
     """Desks that hide each other, and people who walk, say nothing against the input."""
     (said,) = warned((104, 900, 0), (695, 100, 33))
-    assert "so the input is probably right: things labelled 'desk', 'person' move, or hide each other" in said
+    assert "so the input is probably right: things labelled 'desk', 'person' move, hide each other, or stand" in said
     assert "wrong" not in said
