@@ -99,3 +99,23 @@ def test_ranges_tell_where_equal_things_beside_the_robot_go(known, wrong):
     follow = (np.diff(owner[order]) == 0) & (owner[order][1:] >= 0)
     assert follow.sum() > 0.8 * known * len(to)
     assert (np.diff(thing[order])[follow] != 0).mean() < wrong
+
+
+@pytest.mark.parametrize(("sway", "joined"), [(0.0, False), (1.5, True)])
+def test_a_robot_that_sways_has_a_wider_gate(sway, joined):
+    """A robot at rest sees two things with ranges. At half time, one of them seems to step aside by 4 or 5.5 degrees.
+
+    A robot that sways by 1.5 degrees from image to image may see such a step. To a robot on wheels, it is another thing."""
+    step = np.radians(5.5)
+    keyframe = np.repeat(np.arange(20), 2)
+    sways = np.radians(sway) * np.where(np.arange(20) % 2, 1.0, -1.0)[keyframe] / 2
+    angle = np.tile([0.0, 1.0], 20) + sways + np.where((keyframe >= 10) & (np.arange(40) % 2 == 0), step, 0.0)
+    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], axis=1)
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    keyframes = SimpleNamespace(
+        stamps=0.1 * np.arange(20), camera=np.zeros(20, dtype=np.int64), odom_T_base=poses, base_T_camera=poses
+    )
+    label = np.zeros(40, dtype=np.int64)
+    owner = associate_tracks(keyframes, rays_of(keyframe, direction, label, np.full(40, 3.0))).object
+    assert len(set(owner[::2].tolist())) == (1 if joined else 2)
+    assert len(set(owner[1::2].tolist())) == 1

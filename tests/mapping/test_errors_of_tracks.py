@@ -51,7 +51,7 @@ def test_wrong_labels_and_other_errors_hide_neither_turns_nor_clock():
 
 
 def test_tracks_show_the_bias_of_gyroscopes():
-    """Two fifths of each drive. The fewest tracks show little, and then the prior pulls the bias to 0."""
+    """Two fifths of each drive. A few tracks show little, and then the prior pulls the bias to 0."""
     pairs = []
     for seed in (5002, 5008, 5009):
         log, true = robot(seed, "gyro")
