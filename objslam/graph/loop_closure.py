@@ -227,7 +227,7 @@ def find_closure(
     return best, compared
 
 
-def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Floats) -> list[Closure]:
+def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, sure: float = np.inf) -> list[Closure]:
     """Return loops that a whole solved path may have missed, with the most evidence first.
 
     A search during initialisation allows for the drift that the odometry says. Landmarks may be confused after an unlikely
@@ -236,7 +236,7 @@ def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Flo
     before it. The loops are proposals, and a solve must judge them.
 
     middle: (N,) the median keyframe of the rays of each landmark, NaN for landmarks that do not count. map_T_camera: (K, 4,
-    4) the solved poses.
+    4) the solved poses. sure: closures with at least this evidence are compared with repetitions. The others have 0 there.
     """
     counts = np.flatnonzero(np.isfinite(middle))
     if len(counts) < 2 * MIN_LANDMARKS:
@@ -255,17 +255,18 @@ def find_missed_closures(landmarks: Landmarks, middle: Floats, map_T_camera: Flo
             continue
         pivot = map_T_camera[cut, :2, 3]
         a, b = landmarks.around(one, pivot), landmarks.around(two, pivot)
-        for bend in _BENDS:
-            loop = recognise_place(a, b, pivot, np.diag(bend) ** 2, density[one], pairs[np.ix_(one, two)])
+        for prior in np.square(_BENDS)[:, None] * np.eye(3):
+            loop = recognise_place(a, b, pivot, prior, density[one], pairs[np.ix_(one, two)])
             if loop is None or loop.evidence <= 0:
                 continue
             now, before = one[loop.pairs[:, 0]], two[loop.pairs[:, 1]]
+            same = tuple(now.tolist()), tuple(before.tolist())
+            if same in found and found[same].evidence >= loop.evidence:
+                continue
             here = np.isin(np.arange(len(landmarks)), now)
-            again = repetition(*table, here, together, pivot, np.diag(bend) ** 2, density)
-            closure = Closure(loop.correction, now, before, loop.evidence, 0.0 if again is None else again.evidence)
-            same = tuple(closure.now.tolist()), tuple(closure.before.tolist())
-            if same not in found or found[same].evidence < closure.evidence:
-                found[same] = closure
+            again = repetition(*table, here, together, pivot, prior, density) if loop.evidence >= sure else None
+            repeated = 0.0 if again is None else again.evidence
+            found[same] = Closure(loop.correction, now, before, loop.evidence, repeated)
     return sorted(found.values(), key=lambda closure: -closure.evidence)
 
 

@@ -126,7 +126,9 @@ class _Found:
         return replace(self, first=first.better(self.first), state=state.replaced(best), confirmed=same)
 
     def after(self, start: Callable[[], JointState]) -> Self:
-        """Return what is found with one more start. It is searched only if its first map is better than all before."""
+        """Return what is found with one more start. It is searched only if its first map is better than all before.
+
+        If not, and if it has the objects of the best map, it confirms this map. A search would lead to the same map."""
         try:
             first = start()
             promising = self.first.gain(first) > 0
@@ -134,7 +136,9 @@ class _Found:
             return self
         if promising:
             return replace(self, first=first).searched(first)
-        return replace(self, left=(*self.left, first)).compared(first)
+        if first.association is not None and finds_same_objects(self.state, first.association):
+            return self.compared(first)
+        return replace(self, left=(*self.left, first))
 
     def with_the_others(self) -> Self:
         """Return what is found with the starts that are left, while the map is unclear and solves are left."""

@@ -60,7 +60,7 @@ def test_the_laps_come_together(laps):
 
 def test_laps_come_together_if_no_single_closure_explains_more(laps, monkeypatch):
     """Rays of a later visit that belong to wrong landmarks of an earlier one fit only the bent path."""
-    monkeypatch.setattr(missed_loops, "_with_a_loop", lambda state: None)
+    monkeypatch.setattr(missed_loops, "_with_a_loop", lambda state, solved: None)
     _, things, _ = laps
     state = solved(laps, apart=True)
     found = with_missed_loops(state)
@@ -68,6 +68,22 @@ def test_laps_come_together_if_no_single_closure_explains_more(laps, monkeypatch
     assert found.explained > state.explained
     alone = solved(laps, apart=False)
     assert with_missed_loops(alone) is alone
+
+
+def test_no_closure_of_a_state_is_solved_twice(laps, monkeypatch):
+    """The closures that alone explain less are tried together, and most of them are those that were tried alone."""
+    solved_ones, of, as_measured = [], missed_loops._solved, JointState.explained.fget
+
+    def counted(state, closure, landmarks):
+        solved_ones.append((state.association.object.tobytes(), closure.now.tobytes(), closure.before.tobytes()))
+        return of(state, closure, landmarks)
+
+    monkeypatch.setattr(missed_loops, "_solved", counted)
+    # Each closure seems to explain less.
+    monkeypatch.setattr(JointState, "explained", property(lambda state: as_measured(state) - 1e4 * len(state.rounds)))
+    with_missed_loops(solved(laps, apart=True))
+    assert len(solved_ones) >= 2
+    assert len(set(solved_ones)) == len(solved_ones)
 
 
 @pytest.mark.parametrize("apart", [True, False])

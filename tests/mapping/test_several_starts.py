@@ -18,6 +18,9 @@ from objslam.mapping.joint.joint_alternation import JointState
 from objslam.mapping.several_starts import _Found
 from objslam.simulation import preset, simulate
 
+OTHER = (0, 0, 0, 1)
+"""The objects of four rays, other than those of a `Map` by default."""
+
 
 @dataclass(frozen=True)
 class Map:
@@ -63,9 +66,19 @@ def test_only_a_start_with_a_better_first_map_is_searched(monkeypatch, first, se
     """Two first maps are compared. The map after the first search has more evidence than both."""
     search = (lambda one: pytest.fail("it was searched")) if searched is None else (lambda one: Map(searched))
     monkeypatch.setattr(several_starts, "_searched", search)
-    found = _Found(Map(100.0), Map(150.0)).after(lambda: Map(first))
+    start = Map(first, objects=OTHER)
+    found = _Found(Map(100.0), Map(150.0)).after(lambda: start)
     assert (found.first.explained, found.state.explained) == expected
-    assert found.left == ((Map(first),) if searched is None else ())
+    assert found.left == ((start,) if searched is None else ())
+
+
+def test_a_start_with_the_objects_of_the_best_map_is_never_searched(monkeypatch):
+    """A search from there would lead to the same map."""
+    monkeypatch.setattr(several_starts, "_searched", lambda one: pytest.fail("it was searched"))
+    monkeypatch.setattr(several_starts, "_unclear", lambda one, confirmed: True)
+    found = _Found(Map(100.0), Map(150.0)).after(lambda: Map(90.0))
+    assert found.confirmed
+    assert found.with_the_others().state.explained == 150.0
 
 
 def test_the_other_starts_are_searched_at_last(monkeypatch):
@@ -82,7 +95,7 @@ def test_the_other_starts_are_searched_at_last(monkeypatch):
     monkeypatch.setattr(several_starts, "_unclear", lambda one, confirmed: True)
     found = _Found(Map(100.0), Map(150.0))
     for explained in (70.0, 90.0, 80.0):
-        found = found.after(lambda explained=explained: Map(explained))
+        found = found.after(lambda explained=explained: Map(explained, objects=OTHER))
     assert not searched
     assert found.with_the_others().state.explained == 190.0
     assert searched == [90.0, 80.0, 70.0]
@@ -93,7 +106,7 @@ def test_the_other_starts_are_searched_at_last(monkeypatch):
     [
         (1.7, (0, 0, 1, 1), True, False),
         (1.7, (1, 1, 0, 0), True, False),
-        (1.7, (0, 0, 0, 1), True, True),
+        (1.7, OTHER, True, True),
         (3.6, (0, 0, 1, 1), True, True),
         (1.0, (0, 0, 1, 1), False, True),
     ],
@@ -111,7 +124,7 @@ def test_a_noisy_map_is_clear_if_another_start_finds_its_objects(monkeypatch, no
     assert found.unclear == unclear
 
 
-@pytest.mark.parametrize(("objects", "unclear"), [((0, 0, 1, 1), False), ((0, 0, 0, 1), True)], ids=["the same", "others"])
+@pytest.mark.parametrize(("objects", "unclear"), [((0, 0, 1, 1), False), (OTHER, True)], ids=["the same", "others"])
 @pytest.mark.parametrize("explained", [140.0, 160.0], ids=["it explains less", "it explains more"])
 def test_a_noisy_map_is_clear_if_the_search_of_another_start_ends_at_its_objects(monkeypatch, explained, objects, unclear):
     """The first map of the start is better than that of the first exploration, so it is searched at once."""

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from objslam.graph.loop_closure import Closure, Landmarks
     from objslam.mapping.joint.joint_alternation import JointState
 
+    Attempts = dict[tuple[bytes, bytes], JointState | None]
+    """The attempts at closures of one state, by the landmarks `now` and `before` of each. None without a solution."""
+
 _BY_CHANCE = 5
 """A part of a map is a copy if more than this number of its landmarks has the relative positions of others. With a larger
 number, smaller copies are not noticed. With a smaller one, rows of equal things look like copies, and other starts take
@@ -44,33 +47,38 @@ def with_missed_loops(state: JointState) -> JointState:
     """
     held = replace(state, hold=state.errors is not None)
     best = held
-    while not best.spent and (closed := _with_a_loop(best)) is not None:
-        best = closed
+    solved: Attempts = {}
+    while not best.spent and (closed := _with_a_loop(best, solved)) is not None:
+        best, solved = closed, {}
     if best is not held:
+        solved = {}  # They are closures of another state.
         try:
             best = state.better(best.released(state.hold))
         except SolveError:  # The map without the closures is there.
             best = state
         if best is not state:
             state = _with_rounds(best)
-    return _with_all_loops(state)
+    return _with_all_loops(state, solved)
 
 
-def _with_all_loops(state: JointState) -> JointState:
+def _with_all_loops(state: JointState, solved: Attempts) -> JointState:
     """Return the state after closures of all loops that copies show, and rounds, if the log is then better explained.
 
     A single closure may explain the log worse. Some rays of a later visit belong to wrong landmarks of an earlier one, and
     fit only the bent path. The rounds free these rays, but only if all parts of the path are where they should be. A solved
     closure is not merged, because landmarks of parts that are not closed yet stand between the others.
+
+    solved: the closures of this state that are solved already.
     """
     best = replace(state.attempt(), hold=state.errors is not None)
     for _ in range(0 if best.spent else _TRIED):
         landmarks, middle = _of_state(best)
         copies = _copies(landmarks, middle, best.solved_poses, state.settings.association)
-        closed = [one for closure in copies[:_COMPARED] if (one := _closed(best, closure, landmarks)) is not None]
+        tried = [_closed(best, closure, landmarks, solved) for closure in copies[:_COMPARED]]
+        closed = [one for one in tried if one is not None]
         if not closed:
             break
-        best = max(closed, key=lambda one: one.explained)
+        best, solved = max(closed, key=lambda one: one.explained), {}
     if best.association is state.association:
         return state
     assert best.association is not None
@@ -112,7 +120,8 @@ def _copies(landmarks: Landmarks, middle: Floats, map_T_camera: Floats, of: Asso
     of a corridor do, it must be larger than that of matches which are certainly wrong, by `association.loop_lead`."""
     from objslam.graph.loop_closure import SEARCHES, find_missed_closures
 
-    found, enough = find_missed_closures(landmarks, middle, map_T_camera), of.loop_evidence + np.log(SEARCHES)
+    enough = of.loop_evidence + np.log(SEARCHES)
+    found = find_missed_closures(landmarks, middle, map_T_camera, enough)
     sure = [loop for loop in found if len(loop.now) > _BY_CHANCE and loop.evidence >= enough]
     return [loop for loop in sure if loop.evidence - max(loop.repeated, 0.0) >= of.loop_lead]
 
@@ -128,13 +137,14 @@ def _with_rounds(state: JointState) -> JointState:
     return state.better(found)
 
 
-def _with_a_loop(state: JointState) -> JointState | None:
-    """Return the state after the closure of one loop that explains the log better. None without one."""
+def _with_a_loop(state: JointState, solved: Attempts) -> JointState | None:
+    """Return the state after the closure of one loop that explains the log better. None without one. solved: takes each
+    closure that was tried."""
     from objslam.graph.loop_closure import find_missed_closures
 
     landmarks, middle = _of_state(state)
     for closure in find_missed_closures(landmarks, middle, state.solved_poses)[:_TRIED]:
-        closed = _closed(state, closure, landmarks)
+        closed = _closed(state, closure, landmarks, solved)
         if closed is not None and closed.explained > state.explained:
             return closed
     return None
@@ -164,7 +174,16 @@ def _landmarks(
     return landmarks, np.where(enough, middle, np.nan)
 
 
-def _closed(state: JointState, closure: Closure, landmarks: Landmarks) -> JointState | None:
+def _closed(state: JointState, closure: Closure, landmarks: Landmarks, solved: Attempts) -> JointState | None:
+    """Return an attempt after the solve of a closure. None if it has no solution. solved: of this state. A closure that is
+    in it is not solved again."""
+    which = closure.now.tobytes(), closure.before.tobytes()
+    if which not in solved:
+        solved[which] = _solved(state, closure, landmarks)
+    return solved[which]
+
+
+def _solved(state: JointState, closure: Closure, landmarks: Landmarks) -> JointState | None:
     """Return an attempt after the solve of a closure. None if it has no solution."""
     from objslam.graph.loop_closure import closed_path, heading_variance
 
