@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from synthetic_result import clusters, synthetic_result
 
+from objslam.core.bodies.body import Body
 from objslam.core.object_map import ObjectMap
 from objslam.core.result import Doubt, RunResult
 from objslam.mapping.doubts.find import with_doubts
@@ -56,3 +58,24 @@ def test_a_map_most_of_whose_objects_are_unsure_needs_a_look() -> None:
     assert some.summary["assessment"]["level"] == "good"
     assert most.summary["assessment"]["level"] == "check"
     assert most.summary["assessment"]["reasons"][0].startswith(f"{count // 2 + 1} positions have a sigma above 0.5 m")
+
+
+@pytest.mark.parametrize(
+    ("parallax", "frame", "depth_sigma", "told"),
+    [
+        (12.0, "map", 0.1, "Drive around it, or past it nearby."),
+        (80.0, "map", 0.1, "A better localisation helps, and more views do not."),
+        (80.0, "odometry", 0.1, "Come back from there to things that were seen before."),
+        (80.0, "odometry", 1.1, "Drive to where another side of it shows, or set its size: bodies.sizes={"),
+    ],
+    ids=["little parallax", "noisy poses", "a path that drifts", "a body whose depth does not show"],
+)
+def test_the_advice_is_of_use_against_the_cause(parallax: float, frame: str, depth_sigma: float, told: str) -> None:
+    result = result_of(0.6)
+    body = Body("cuboid", np.array([1.0, 0.2, 0.5]), 0.3, np.array([0.1, depth_sigma, 0.1]), 0.1)
+    turn = np.array([[np.cos(0.3), -np.sin(0.3), 0], [np.sin(0.3), np.cos(0.3), 0], [0, 0, 1]])
+    wide = turn @ np.diag([1e-4, 0.36, 1e-4]) @ turn.T
+    one, *others = result.map.objects
+    one = replace(one, covariance=wide, body=body, parallax_deg=parallax)
+    result = with_doubts(replace(result, map=ObjectMap((one, *others), frame)))
+    assert told in unsure(result)[0].text

@@ -46,7 +46,7 @@ def test_a_thing_that_is_no_body_is_as_unsure_as_its_outline_is_unlike():
     exact = found.centre_covariance + repeated**2 * np.eye(3)
     assert inside(off, exact) < 0.9
     assert inside(off, exact + found.unlike[:, :3, :3]) >= 0.92
-    placed = _body(found, 0, np.zeros((3, 3)), clear=True)
+    placed = _body(found, 0, np.zeros((3, 3)), np.zeros((6, 6)), clear=True)
     np.testing.assert_allclose(placed.covariance[:3, :3], exact[0] + found.unlike[0, :3, :3], rtol=1e-9)
 
 

@@ -21,6 +21,7 @@ from objslam.mapping.bodies.boxes_in_front import edges_behind_boxes
 from objslam.mapping.bodies.cut_boxes import cut_edges_of
 from objslam.mapping.bodies.surfaces import range_shift
 from objslam.mapping.solution import CentreShift, Solution
+from objslam.triangulation.bodies.hidden_flanks import hidden_flanks
 from objslam.triangulation.bodies.prior import apparent_half_axes
 from objslam.triangulation.bodies.solve import Bodies, solve_bodies
 
@@ -71,11 +72,13 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     at_border = views.border.reshape(-1, 2, 2).sum(axis=1)
     found = replace(found, hidden=np.maximum(found.hidden - at_border, 0))
     clear, behind = _shifts_clearly(found, views), _behind_things(found, views)
+    flanks = np.where(found.shape > 0, hidden_flanks(boxes.edges(), found.axes).T, 0.0).T
+    clear |= flanks.any(axis=(1, 2))  # Covariances of points by rays do not contain what the flanks may hide.
     bodies: list[PlacedBody | None] = [None] * solution.association.count
     extra = _beyond_rays(solution, settings, views)
     for at, j in enumerate(views.objects.tolist()):
         if found.shape[at]:
-            body = _body(found, at, extra[at], clear=bool(clear[at] or behind[at]))
+            body = _body(found, at, extra[at], flanks[at], clear=bool(clear[at] or behind[at]))
             bodies[j] = replace(body, behind=bool(behind[at]))
     to_centre = CentreShift(np.zeros((len(solution.rays), 3)), np.zeros(len(solution.rays)))
     to_centre.direction[views.ray] = np.einsum("bji,bj->bi", boxes.poses[:, :3, :3], found.to_centre)
@@ -202,9 +205,9 @@ def _beyond_rays(solution: Solution, settings: Settings, views: _Views) -> Float
     return np.asarray(np.einsum("nij,nj,nkj->nik", vectors, np.maximum(size, 0.0), vectors))
 
 
-def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
-    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. clear: whether the object gets the centre
-    of the body as its position."""
+def _body(found: Bodies, at: int, extra: Floats, flanks: Floats, *, clear: bool) -> PlacedBody:
+    """Return one body. extra: (3, 3) m^2, added to the covariance of the centre. flanks: (6, 6) m^2, as `hidden_flanks`.
+    clear: whether the object gets the centre of the body as its position."""
     centre, half, yaw = found.axes[at, :3], found.axes[at, 3:6], found.axes[at, 6]
     covariance = found.covariance[at] + found.unlike[at]
     covariance[:3, :3] += repeated_error(found.share[0], half) ** 2 * np.eye(3)
@@ -213,7 +216,7 @@ def _body(found: Bodies, at: int, extra: Floats, *, clear: bool) -> PlacedBody:
     slope = found.slope[at].copy()
     slope[:6] *= to_size[:, None]
     covariance = slope @ covariance @ slope.T
-    covariance[:6, :6] += found.between_shapes[at] * np.outer(to_size, to_size)
+    covariance[:6, :6] += (found.between_shapes[at] + flanks) * np.outer(to_size, to_size)
     covariance[:3, :3] += extra
     sigma = np.sqrt(np.diagonal(covariance))
     body = Body(SHAPES[found.shape[at]], 2 * half, float(yaw), sigma[3:6], min(float(sigma[6]), UNKNOWN_YAW))

@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
+from objslam.core.arrays import Floats
+from objslam.core.bodies.body import Body
 from objslam.core.maps.shared_covariance import jacobian, own_part, root_of
+from objslam.core.object_map import MapObject
 from objslam.core.result import Doubt, RunResult
 
 _NAMED = 3
 """The most objects that the assessment names. A larger number makes the assessment longer."""
+_WIDE = 30.0
+"""If the rays of an object span at least this angle (deg), more views would hardly make its point surer. A wide sigma then
+comes from the poses or from the body. With a larger angle, more people are told to drive around the object."""
+_BY_BODY = 0.7
+"""A sigma comes from the body if half the sigma of its size, in the same direction, is at least this share of it. With a
+larger share, fewer people are told to look at another side of the object."""
 _MOST = 0.5
 """A map is good only if at most this share of its objects with a position is unsure. With a larger share, more maps are
 good."""
@@ -26,7 +35,8 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
     if result.map.shared_covariance is not None:
         shared = jacobian(np.array([o.position for o in known])) @ root_of(result.map.shared_covariance)
         covariance = own_part(covariance, shared)
-    sigma = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    variance, axes = np.linalg.eigh(covariance)
+    sigma, direction = np.sqrt(variance[:, -1]), axes[:, :, -1]
     most = result.settings.triangulation.sure_sigma
     found = []
     for i in np.argsort(-sigma, kind="stable").tolist():
@@ -39,8 +49,7 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
                 "wide sigma",
                 o.label,
                 f"{o.label} #{o.id} has a sigma of {sigma[i]:.2f} m in its least certain direction "
-                f"(triangulation.sure_sigma {most:g} m): its {o.rays} rays span {o.parallax_deg:.1f} deg. Drive around "
-                "it, or past it nearby.",
+                f"(triangulation.sure_sigma {most:g} m): {_why(o, float(sigma[i]), direction[i], result.map.frame)}",
                 (o.id,),
                 o.position,
                 np.flatnonzero(result.association.object == o.id),
@@ -48,6 +57,28 @@ def unsure_objects(result: RunResult) -> list[Doubt]:
             )
         )
     return found
+
+
+def _why(o: MapObject, sigma: float, direction: Floats, frame: str) -> str:
+    """Return the cause of a wide sigma (m), and what to do. direction: (3,) unit, of the sigma. frame: of the map."""
+    if o.body is not None and _sigma_by_size(o.body, direction) >= _BY_BODY * sigma:
+        return (
+            "its boxes do not show how far it goes on in this direction. Drive to where another side of it shows, or set "
+            f"its size: bodies.sizes={{{o.label}: [length, width, height]}}."
+        )
+    span = f"its {o.rays} rays span {o.parallax_deg:.1f} deg"
+    if o.parallax_deg < _WIDE:
+        return f"{span}. Drive around it, or past it nearby."
+    if frame == "odometry":
+        return f"{span}, so it is the path that is not sure there. Come back from there to things that were seen before."
+    return f"{span}, so it is the poses that are not sure there. A better localisation helps, and more views do not."
+
+
+def _sigma_by_size(body: Body, direction: Floats) -> float:
+    """Return the standard deviation (m) that the unknown size of a body gives to its centre in a direction (3,)."""
+    cos, sin = np.cos(body.yaw), np.sin(body.yaw)
+    along = np.array([cos, sin, 0.0]) @ direction, np.array([-sin, cos, 0.0]) @ direction, direction[2]
+    return float(np.linalg.norm(body.size_sigma * np.array(along))) / 2
 
 
 def in_assessment(doubts: list[Doubt], result: RunResult) -> list[str]:
