@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
@@ -35,23 +35,29 @@ often. A command of a few seconds prints no progress, and one that fails at once
 @dataclass
 class SpeakingLedger(Ledger):
     """A ledger that can print its warnings while a command works. So a user need not wait for the end of a run to hear that
-    the input is wrong. told: how many of the warnings are printed already."""
+    the input is wrong. A run that starts again, with poses that are solved too, may take a warning back. told: the warnings
+    that are printed already."""
 
-    told: int = 0
+    told: list[str] = field(default_factory=list)
 
     def speak(self) -> None:
         """Print the warnings that are not printed yet."""
-        new = self.warnings[self.told :]
-        self.told += len(new)
+        new = [one for one in self.warnings if one not in self.told]
+        self.told += new
         _say_warnings(new)
+
+    def taken_back(self) -> list[str]:
+        """Return the warnings that are printed, and no longer in the ledger."""
+        return [one for one in self.told if one not in self.warnings]
 
 
 def report(ledger: Ledger) -> None:
-    """Print each drop and warning of a ledger as one line on stderr, without the warnings that are printed already."""
-    lines = ledger.lines()
-    told = ledger.told if isinstance(ledger, SpeakingLedger) else 0
-    drops = len(lines) - len(ledger.warnings)
-    _say_warnings(lines[:drops] + lines[drops + told :])
+    """Print each drop and warning of a ledger as one line on stderr, without the warnings that are printed already. Name the
+    printed warnings that are no longer true."""
+    told, back = (ledger.told, ledger.taken_back()) if isinstance(ledger, SpeakingLedger) else ([], [])
+    _say_warnings([line for line in ledger.lines() if line not in told])
+    for line in back:
+        say(f"taken back, because the run could explain it: {line}", stderr=True)
 
 
 def _say_warnings(lines: list[str]) -> None:

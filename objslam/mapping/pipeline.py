@@ -150,7 +150,7 @@ def _run(
         if settings.checks.use:
             diagnosis = diagnose(expected, settings, ledger, progress)
             settings, diagnosis = with_sparse_noise(expected, settings, diagnosis, ledger, progress)
-            if settings.mode == "fixed" or not diagnosis.refutable:
+            if (settings.mode == "fixed" and not (open_mode and both)) or not diagnosis.refutable:
                 say(diagnosis, ledger)  # No solve will refute the findings, so a user need not wait for one.
         if diagnosis.certain and settings.mode == "joint":
             ledger.warn("the poses are not solved, because a solve cannot correct wrong input")

@@ -302,9 +302,9 @@ def test_a_quiet_command_and_a_short_one_print_no_progress_into_a_pipe(monkeypat
         with progress_bar(ledger, quiet=True) as show:
             show("solve", 0, 0)
             ledger.warn("first")
-            wait_for(lambda: ledger.told == 1)
+            wait_for(lambda: len(ledger.told) == 1)
             ledger.warn("second")
-            wait_for(lambda: ledger.told == 2)
+            wait_for(lambda: len(ledger.told) == 2)
         assert screen.getvalue() == "warning: first\nwarning: second\n"
 
 
@@ -325,6 +325,25 @@ def test_a_warning_is_printed_while_a_command_works_and_only_once(monkeypatch, k
         assert screen.getvalue()[mark:].splitlines() == [
             "warning: dropped 2: boxes below rays.min_score",
             "warning: the map is empty",
+        ]
+
+
+def test_a_run_that_starts_again_prints_its_new_warnings_and_takes_old_ones_back():
+    """The first solve, at the given poses, warns of the input. The second one solves the poses too, and explains it."""
+    with terminal_in_place_of_stderr("", io.StringIO()) as screen:
+        ledger = SpeakingLedger()
+        ledger.warn("tags are left out")
+        before = ledger.copy()
+        ledger.warn("the boxes do not agree with the poses")
+        ledger.speak()
+        ledger.restore(before)
+        ledger.warn("the poses are solved too")
+        ledger.warn("tags are left out")
+        mark = len(screen.getvalue())
+        report(ledger)
+        assert screen.getvalue()[mark:].splitlines() == [
+            "warning: the poses are solved too",
+            "taken back, because the run could explain it: the boxes do not agree with the poses",
         ]
 
 
