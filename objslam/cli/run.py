@@ -168,9 +168,11 @@ def say_result(result: RunResult, more: str, out: Path, removed: tuple[str, ...]
             say(f"errors that all measurements share: {none}")
     noise = result.summary.get("noise") or {}
     factors = {words: f"{noise.get(name, 1.0):.2g}" for name, words in _NOISE.items()}
-    for name in ("heading", "place"):
+    of = result.settings.localization
+    for name, nominal, unit in (("heading", math.degrees(of.yaw), "deg"), ("place", 100 * of.xy, "cm")):
         if noise.get(f"{name}_share"):
-            factors[_NOISE[name]] += f" for {noise[f'{name}_seconds']:.2g} s"
+            size = f"{noise[name] * nominal:.2g} {unit} for {noise[f'{name}_seconds']:.2g} s"
+            factors[_NOISE[name]] += f" ({size})"
     if found := [f"{words} {factor}" for words, factor in factors.items() if factor != "1"]:
         say(f"noise found in the log (1 = as set): {', '.join(found)}")
     counts = result.summary["counts"]

@@ -206,7 +206,9 @@ def test_a_lost_thing_is_not_excused_by_a_neighbour_that_has_boxes_of_its_own():
     assert (found.kind, found.reason, found.label) == ("boxes", "unclear", "ball")
     assert found.position == pytest.approx([1.5, 0.06, 0.4], abs=0.02)
     assert len(found.rays) > 0.9 * (mine == j).sum()
-    assert found.text.endswith(", and the odds are more than 1000 to 1 for an object.")
+    assert found.text.endswith(
+        ", and the odds are more than 1000 to 1 for an object, but no search kept one there: a thing may be missing."
+    )
 
 
 def test_the_verdict_says_where_boxes_of_a_thing_are_that_the_map_lacks():

@@ -209,9 +209,12 @@ def why_no_object(result: RunResult, groups: BoxGroups, g: int, rays: Ints) -> s
         case _:
             odds = min(float(np.exp(np.abs(groups.odds[g]))), _SURE)
             number = f"more than {_SURE}" if odds == _SURE else f"{odds:.0f}" if odds >= 10 else f"{odds:.1f}"
-            close = "close, " if abs(groups.odds[g]) < _CLOSE else ""
-            side = "for" if groups.odds[g] > 0 else "against"
-            return f": their rays meet within {miss}, and the odds are {close}{number} to 1 {side} an object"
+            meet = f": their rays meet within {miss}, and the odds are"
+            if groups.odds[g] <= 0:
+                return f"{meet} {number} to 1 against an object"
+            if groups.odds[g] < _CLOSE:
+                return f"{meet} {number} to 1 for an object, which is too close to add one"
+            return f"{meet} {number} to 1 for an object, but no search kept one there: a thing may be missing"
 
 
 def _frames(count: int) -> str:
