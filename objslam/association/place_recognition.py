@@ -190,14 +190,19 @@ class _Problem:
 
 def _moved(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
     """Return offsets (..., N, 3) under corrections (..., 3), and their Jacobians (..., N, 3, 3)."""
-    cos, sin = np.cos(x[..., 2, None]), np.sin(x[..., 2, None])
-    turned_x, turned_y = cos * offset[..., 0] - sin * offset[..., 1], sin * offset[..., 0] + cos * offset[..., 1]
+    turned_x, turned_y = _turned(offset, x)
     z = np.broadcast_to(offset[..., 2], turned_x.shape)
     moved = np.stack([turned_x + x[..., 0, None], turned_y + x[..., 1, None], z], axis=-1)
     jacobian = np.zeros((*turned_x.shape, 3, 3))
     jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1.0
     jacobian[..., 0, 2], jacobian[..., 1, 2] = -turned_y, turned_x
     return moved, jacobian
+
+
+def _turned(offset: Floats, x: Floats) -> tuple[Floats, Floats]:
+    """Return the x and the y (..., N) of offsets (..., N, 3), turned by the yaw of corrections (..., 3)."""
+    cos, sin = np.cos(x[..., 2, None]), np.sin(x[..., 2, None])
+    return cos * offset[..., 0] - sin * offset[..., 1], sin * offset[..., 0] + cos * offset[..., 1]
 
 
 def _candidates(problem: _Problem) -> tuple[Ints, Ints]:
@@ -270,14 +275,24 @@ def _gauss_newton(problem: _Problem, a: Ints, b: Ints, begin: Ints, information:
 
 
 def _quick_score(problem: _Problem, a: Ints, b: Ints, x: Floats) -> Floats:
-    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner. a, b: (C,) pairs, sorted by a."""
+    """Return the gain (H,) of corrections (H, 3) if each landmark takes its best partner. a, b: (C,) pairs, sorted by a.
+
+    Under one correction, few of the pairs are close. Only these get a gain, which takes a third of the time of all gains."""
     score = -0.5 * np.einsum("hi,ij,hj->h", x, problem.weight, x)
-    first = np.flatnonzero(np.diff(a, prepend=-1))
+    moved = np.stack(_turned(problem.offset, x)) + x.T[:2, :, None]
+    target, reach = problem.target[b, :2].T, 2 * SAME_POINT_WIDE * problem.spread[a, b] ** 2
+    up = problem.target[b, 2] - problem.offset[a, 2]
     size = max(1, _GAINS_AT_ONCE // len(a))
     for begin in range(0, len(x), size):
-        part = slice(begin, begin + size)
-        gain = _gains(problem, a, b, x[part])
-        score[part] += np.maximum(np.maximum.reduceat(gain, first, axis=1), 0.0).sum(axis=1)
+        off = target[:, None] - moved[:, begin : begin + size].take(a, axis=2)
+        # The squared distance in standard deviations is at least that along the largest axis, whose variance is below the
+        # trace.
+        row, pair = np.nonzero(off[0] * off[0] + off[1] * off[1] <= reach)
+        if len(row):
+            gain = _gain(problem, a[pair], b[pair], np.stack([*off[:, row, pair], up[pair]], axis=1))
+            first = np.flatnonzero(np.diff(row * len(problem.offset) + a[pair], prepend=-1))
+            best = np.maximum(np.maximum.reduceat(gain, first), 0.0)
+            score[begin : begin + size] += np.bincount(row[first], best, len(off[0]))
     return score
 
 
