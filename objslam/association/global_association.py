@@ -288,10 +288,10 @@ def _merged_and_dropped(task: _Task, state: State) -> tuple[State, Floats, Bools
 def _without_ghosts(task: _Task, state: State, likely: Floats, sized: Bools) -> tuple[State, Floats, Bools]:
     """Replace pairs of landmarks at crossings by the two things whose rays cross there. Return what `_without_crossings`
     returns."""
-    refuted, earlier = np.zeros(len(state.matched), dtype=bool), set[bytes]()
+    refuted, earlier, tried = np.zeros(len(state.matched), dtype=bool), set[bytes](), set[bytes]()
     while len(earlier) < _TURNS and (key := state.matched.tobytes()) not in earlier:
         earlier.add(key)
-        replaced = replace_ghosts(state, task.gate, task.seed)
+        replaced = replace_ghosts(state, task.gate, tried, task.seed)
         if replaced is state:
             break
         state, likely, dropped = _merged_and_dropped(task, _alternate(task, replaced))

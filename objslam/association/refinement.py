@@ -88,13 +88,15 @@ def right_by_chance(obs: Observations) -> Floats:
     return share
 
 
-def ray_costs(obs: Observations, position: Floats, noise: Floats | float, gate: float) -> Floats:
-    """Return -2 ln likelihood (R,) of each ray for its point, up to a constant. It is at most `gate`, the cost of a ray
-    without a landmark. position: (R, 3) or (3,) m. noise: (R,) or one factor on the nominal noise."""
-    off2, distance = squared_offsets(obs, position)
-    return np.asarray(
-        np.minimum(off2 / variance(obs, distance, noise) + 4 * np.log(noise) + range_costs(obs, distance), gate)
-    )
+def ray_costs(
+    obs: Observations, position: Floats, noise: Floats | float, gate: float, of: Ints | slice = slice(None)
+) -> Floats:
+    """Return -2 ln likelihood (E,) of rays for their points, up to a constant. It is at most `gate`, the cost of a ray
+    without a landmark. position: (E, 3) or (3,) m. noise: (E,) or one factor on the nominal noise. of: (E,) the ray of each
+    point, by default all rays."""
+    off2, distance = squared_offsets(obs, position, of)
+    cost = off2 / variance(obs, distance, noise, of) + 4 * np.log(noise) + range_costs(obs, distance, of=of)
+    return np.asarray(np.minimum(cost, gate))
 
 
 def refine(obs: Observations, ray: Ints, index: Ints, start: Floats, noise: Floats, iterations: int = _ITERATIONS) -> Floats:

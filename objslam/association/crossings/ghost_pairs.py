@@ -43,12 +43,13 @@ _LEAST_SIN2 = np.sin(np.radians(5.0)) ** 2
 fewer."""
 
 
-def replace_ghosts(state: State, gate: float, seed: int = 0) -> State:
+def replace_ghosts(state: State, gate: float, tried: set[bytes], seed: int = 0) -> State:
     """Replace each pair of landmarks of one label by two other points if these explain the rays of both clearly better.
 
     Args:
         state: landmarks at solved or given poses.
         gate: the squared deviation of a ray that belongs to no landmark.
+        tried: the rays of pairs that were tried at these poses. They are not tried again, and the new ones are added.
         seed: of the random pairs of rays.
     Returns:
         The state with new positions, and with the rays assigned to them. The same state if no pair was replaced.
@@ -59,6 +60,9 @@ def replace_ghosts(state: State, gate: float, seed: int = 0) -> State:
         if taken[pair].any():
             continue
         held = np.flatnonzero(np.isin(state.matched, pair))
+        if (key := held.tobytes()) in tried:
+            continue
+        tried.add(key)
         obs, noise = state.obs.take(held), float(state.class_noise[state.label[pair[0]]])
         found = _best_points(obs, noise, gate, np.random.default_rng([seed, *pair]))
         if found is None:
@@ -124,4 +128,5 @@ def _settled(obs: Observations, points: Floats, noise: float, gate: float) -> tu
 
 def _costs(obs: Observations, points: Floats, noise: float, gate: float) -> Floats:
     """Return -2 ln likelihood (P, R) of each ray for each of P points, as `ray_costs`."""
-    return np.stack([ray_costs(obs, point, noise, gate) for point in points])
+    every = np.tile(np.arange(len(obs)), len(points))
+    return ray_costs(obs, np.repeat(points, len(obs), axis=0), noise, gate, every).reshape(len(points), -1)
