@@ -37,6 +37,10 @@ Other starts would make objects of these. A wrong path makes objects of their ow
 nothing against the path. Wrong maps of a simulated drive had 0.96 and more, and right maps with people who walk 0.8 and
 less. With a smaller share, more logs are tried from other starts."""
 
+_HOPELESS = 0.8
+"""A start is not searched at last if its first map explains less than this share of what the best map explains. In simulated
+logs, searches raised what first maps explain by at most 13 %. With a larger share, fewer starts are searched."""
+
 
 def from_several_starts(
     state: JointState, known: InitialEstimate | None = None, named: JointState | None = None
@@ -141,10 +145,11 @@ class _Found:
         return replace(self, left=(*self.left, first))
 
     def with_the_others(self) -> Self:
-        """Return what is found with the starts that are left, while the map is unclear and solves are left."""
+        """Return what is found with the starts that are left, while the map is unclear and solves are left. Starts with
+        hopeless first maps are left out."""
         found = self
         for first in sorted(self.left, key=lambda one: -one.explained):
-            if first.spent or not found.unclear:
+            if first.spent or first.explained < _HOPELESS * found.state.explained or not found.unclear:
                 break
             found = found.searched(first)
         return found
