@@ -92,8 +92,9 @@ class Sight:
             np.stack([*quadratic, *linear, constant], axis=1).astype(np.float32),
             np.stack(powers).astype(np.float32),
         )
-        rank = np.arange(len(i)) - np.searchsorted(i, i)  # The landmarks of a ray follow one another.
-        for k in range(int(rank.max(initial=-1)) + 1):
-            these = np.flatnonzero(rank == k)
-            best[i[these]] = np.minimum(best[i[these]], factors[these] @ table)
-        return best
+        number = np.bincount(i, minlength=len(some))  # The landmarks of a ray follow one another.
+        order, first = np.argsort(-number, kind="stable"), np.cumsum(number) - number
+        for k in range(int(number.max(initial=0))):  # With the rays in this order, each step changes the first rows.
+            rows = best[: np.count_nonzero(number > k)]
+            np.minimum(rows, factors[first[order[: len(rows)]] + k] @ table, out=rows)
+        return best[np.argsort(order)]
