@@ -37,9 +37,9 @@ Other starts would make objects of these. A wrong path makes objects of their ow
 nothing against the path. Wrong maps of a simulated drive had 0.96 and more, and right maps with people who walk 0.8 and
 less. With a smaller share, more logs are tried from other starts."""
 
-_HOPELESS = 0.8
-"""A start is not searched at last if its first map explains less than this share of what the best map explains. In simulated
-logs, searches raised what first maps explain by at most 13 %. With a larger share, fewer starts are searched."""
+_HOPELESS = 0.2
+"""A start is not searched at last if its first map explains less than the best map does, by more than this share. In
+simulated logs, searches raised what first maps explain by at most 13 %. With a larger share, more starts are searched."""
 
 
 def from_several_starts(
@@ -149,7 +149,8 @@ class _Found:
         hopeless first maps are left out."""
         found = self
         for first in sorted(self.left, key=lambda one: -one.explained):
-            if first.spent or first.explained < _HOPELESS * found.state.explained or not found.unclear:
+            behind = found.state.explained - first.explained
+            if first.spent or behind > _HOPELESS * abs(found.state.explained) or not found.unclear:
                 break
             found = found.searched(first)
         return found
