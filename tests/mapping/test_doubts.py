@@ -74,6 +74,11 @@ def test_one_object_taken_as_two_may_be_one():
     assert (found.kind, set(found.objects)) == ("pair", {4, count})
     assert found.numbers["probability"] > 0.5
     assert set(found.rays) == set(mine)
+    first, second = (result.map[4].label + f" #{one}" for one in (4, count))
+    assert found.text.endswith(f" {first} was seen before {second}, so it may have moved from one place to the other.")
+    for share in (2, 3):  # If their boxes alternate in time, it cannot have moved.
+        later[mine] = np.where(np.arange(len(mine)) % share, 4, count)
+        assert words._if_moved(reassociated(result, later), 4, count) == ""
     before, after = (one.summary["assessment"] for one in (result, doubtful))
     assert (before["level"], after["level"]) == ("good", "check")
     assert after["reasons"][0].startswith("1 object may be a double")

@@ -22,6 +22,9 @@ number, more odds are named."""
 _DISAGREE = 2.0
 """The rays of an object disagree if they pass it at more than this multiple of their noise (root mean square). With a larger
 number, fewer objects are said to have rays that disagree."""
+_SPAN = (0.1, 0.9)
+"""The quantiles of the stamps of an object's boxes that say when it was seen. Single boxes of other things do not count. A
+wider span finds fewer pairs whose boxes follow one another in time."""
 _BESIDE = 0.5
 """A sentence names the nearest object up to this distance (m), if the object has the label of the boxes. An object of
 another label is named within its own size. A larger distance names more objects."""
@@ -74,7 +77,7 @@ def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:
             "may be one",
             a.label,
             f"{_name(a)} and {_name(b)} may be one (probability {pairs.probability[i]:.2f}): they are {_length(apart)} "
-            f"apart, {pairs.sigmas[i]:.1f} sigma; {frames}.",
+            f"apart, {pairs.sigmas[i]:.1f} sigma; {frames}.{_if_moved(result, j, k)}",
             (a.id, b.id),
             (a.position + b.position) / 2,
             np.flatnonzero(np.isin(result.association.object, [j, k])),
@@ -83,6 +86,18 @@ def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:
                 **{"frames_with_both": pairs.together[i], "frames_with_both_expected": expected},
             },
         )
+
+
+def _if_moved(result: RunResult, j: int, k: int) -> str:
+    """Return the sentence about a pair whose boxes follow one another in time, "" if they do not."""
+    stamps = result.keyframes.stamps[result.rays.keyframe]
+    (a, first), (b, second) = sorted(
+        ((one, np.quantile(stamps[result.association.object == one], _SPAN)) for one in (j, k)), key=lambda of: of[1][0]
+    )
+    if first[1] >= second[0]:
+        return ""
+    names = _name(result.map.objects[a]), _name(result.map.objects[b])
+    return f" {names[0]} was seen before {names[1]}, so it may have moved from one place to the other."
 
 
 def _splits(result: RunResult, splits: Splits) -> Iterator[Doubt]:
