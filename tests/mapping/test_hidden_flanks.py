@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mapping.hiding_drives import Solid, hiding_drive
 
-from objslam.config import load_settings
+from objslam.config import Settings, load_settings
 from objslam.core.diagnostics import Ledger
 from objslam.core.object_map import ObjectMap
 from objslam.core.types import Log
@@ -38,9 +38,9 @@ def past_it(frames: int = 90) -> np.ndarray:
     return np.concatenate([there, np.column_stack([x[::-1], np.full(frames, 0.1), np.full(frames, np.radians(130))])])
 
 
-def mapped(log: Log) -> tuple[ObjectMap, np.ndarray]:
+def mapped(log: Log, settings: Settings = SETTINGS) -> tuple[ObjectMap, np.ndarray]:
     """The map, and the squared Mahalanobis errors of its objects."""
-    result = pipeline.run(log, SETTINGS, Ledger())
+    result = pipeline.run(log, settings, Ledger())
     return result.map, np.array([m.squared_3d for m in evaluate(result.map, log.truth, radius=1.0).objects.matches])
 
 
@@ -88,3 +88,19 @@ def test_a_flat_thing_that_was_seen_from_behind_is_flat(monkeypatch: pytest.Monk
     before, _ = mapped(log)
     for a, b in zip(found.objects, before.objects, strict=True):
         np.testing.assert_allclose(a.covariance, b.covariance)
+
+
+def test_a_flat_thing_of_a_known_size_has_no_hidden_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = hiding_drive(3, noise=1.0, solids=rack(panels=True, depth=0.15), plane=past_it())
+    size = {"crate": tuple((2 * HALF * [1.0, 0.15, 1.0]).tolist())}
+    known = SETTINGS.model_copy(update={"bodies": SETTINGS.bodies.model_copy(update={"sizes": size})})
+    found, squared = mapped(log, known)
+    assert (squared <= INSIDE_95_3D).mean() >= 0.8
+    unknown, _ = mapped(log)
+    without_flanks(monkeypatch)
+    before, _ = mapped(log, known)
+    for a, b, c in zip(found.objects, before.objects, unknown.objects, strict=True):
+        assert a.covariance is not None
+        assert c.covariance is not None
+        np.testing.assert_allclose(a.covariance, b.covariance)
+        assert np.trace(a.covariance) < np.trace(c.covariance)

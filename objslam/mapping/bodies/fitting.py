@@ -56,11 +56,12 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     prior = settings.rays.box_sigma
     told = settings.noise.rays
     learn = prior == type(settings.rays)().box_sigma if told == "auto" else told
+    names = tuple(solution.rays.label_names[solution.association.label[j]] for j in views.objects)
     found = solve_bodies(
         boxes.edges,
         boxes.points,
         boxes.half,
-        tuple(solution.rays.label_names[solution.association.label[j]] for j in views.objects),
+        names,
         side=boxes.side,
         share=2 * prior,
         learn=learn,
@@ -72,7 +73,9 @@ def with_bodies(solution: Solution, cameras: tuple[Camera, ...], settings: Setti
     at_border = views.border.reshape(-1, 2, 2).sum(axis=1)
     found = replace(found, hidden=np.maximum(found.hidden - at_border, 0))
     clear, behind = _shifts_clearly(found, views), _behind_things(found, views)
-    flanks = np.where(found.shape > 0, hidden_flanks(boxes.edges(), found.axes).T, 0.0).T
+    # A point has no flanks, and a body of a known size hides nothing.
+    unsized = (found.shape > 0) & np.array([name not in settings.bodies.sizes for name in names])
+    flanks = unsized[:, None, None] * hidden_flanks(boxes.edges(), found.axes)
     clear |= flanks.any(axis=(1, 2))  # Covariances of points by rays do not contain what the flanks may hide.
     bodies: list[PlacedBody | None] = [None] * solution.association.count
     extra = _beyond_rays(solution, settings, views)

@@ -90,9 +90,11 @@ def _pairs(result: RunResult, pairs: Pairs) -> Iterator[Doubt]:
 
 def _if_moved(result: RunResult, j: int, k: int) -> str:
     """Return the sentence about a pair whose boxes follow one another in time, "" if they do not."""
-    stamps = result.keyframes.stamps[result.rays.keyframe]
+    stamps, owner = result.keyframes.stamps[result.rays.keyframe], result.association.object
+    if not ((owner == j).any() and (owner == k).any()):  # An object of an older map may have no box today.
+        return ""
     (a, first), (b, second) = sorted(
-        ((one, np.quantile(stamps[result.association.object == one], _SPAN)) for one in (j, k)), key=lambda of: of[1][0]
+        ((one, np.quantile(stamps[owner == one], _SPAN)) for one in (j, k)), key=lambda of: of[1][0]
     )
     if first[1] >= second[0]:
         return ""

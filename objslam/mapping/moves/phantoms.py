@@ -43,6 +43,10 @@ UNTOLD = "errors of poses that the solve does not show"
 _MOST = 60
 """The most objects that are tried as phantoms. The least likely objects are tried first. Each takes a search of the path and
 a solve. A larger number finds more phantoms in large maps, and takes longer."""
+_LOST = 0.5
+"""An object is no phantom if more than this share of its rays belongs to no object without it. Then they count as false
+boxes, which explains the log worse. Three phantoms of simulated drives lost 0 to 0.2 of their rays. Objects that lost more
+than half lowered the log odds by 17 and more. With a larger share, more objects are tried with a solve."""
 _COARSE = 100.0
 """If the most likely path with all objects loses more log evidence than this, phantoms are not searched. The path search is
 then too coarse for the log, and each path without an object loses about as much. In 12 simulated drives the path lost at
@@ -61,12 +65,6 @@ def begins_with_lasting_errors(state: JointState) -> bool:
     """Return whether the odometry alone says that the localisation errs for seconds, before any ray has an object. False
     objects hide such errors from a solve."""
     return has_lasting_errors(state) and state.errors is not None and max(lasting_long(state.errors.noise)) >= _LARGE
-
-
-_LOST = 0.5
-"""An object is no phantom if more than this share of its rays belongs to no object without it. Then they count as false
-boxes, which explains the log worse. Three phantoms of simulated drives lost 0 to 0.2 of their rays. Objects that lost more
-than half lowered the log odds by 17 and more. With a larger share, more objects are tried with a solve."""
 
 
 def check_neighbours(
