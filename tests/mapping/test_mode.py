@@ -14,6 +14,9 @@ from objslam.core.result import RunResult
 from objslam.core.types import Log, Trajectory
 from objslam.evaluation.evaluate import evaluate
 from objslam.mapping import pipeline
+from objslam.mapping.checks.diagnosis import Diagnosis
+from objslam.mapping.checks.finding import Finding
+from objslam.mapping.checks.hypotheses.disagreement import DISAGREE
 from objslam.simulation import PoseNoise, preset, simulate
 
 pytestmark = pytest.mark.usefixtures("one_start")
@@ -100,3 +103,34 @@ def test_odometry_of_another_time_costs_no_map(monkeypatch):
     result = pipeline.run(log, load_settings(None, ALONE), Ledger())
     assert result.summary["mode"] == "fixed"
     assert result.summary["assessment"]["level"] != "good"
+
+
+@pytest.mark.parametrize(
+    ("more", "odometry", "basis", "told"),
+    [
+        ((), True, "boxes", False),
+        ((), True, "log", True),
+        ((), False, "boxes", True),
+        (("mode=fixed",), True, "boxes", True),
+    ],
+    ids=["a joint solve may refute it", "no solve can refute it", "without odometry", "the poses stay as given"],
+)
+def test_wrong_input_is_named_before_the_solve_unless_a_second_solve_may_refute_it(
+    monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...], odometry: bool, basis: str, told: bool
+):
+    message, ledger = "the boxes disagree with the poses", Ledger()
+    monkeypatch.setattr(
+        pipeline, "diagnose", lambda *given: Diagnosis((Finding(DISAGREE, message, spoils=False, basis=basis),))
+    )
+
+    class Solved(Exception):
+        """The solve began."""
+
+    def solve(*given, **named):
+        raise Solved(message in ledger.warnings)
+
+    monkeypatch.setattr(pipeline, "solve", solve)
+    log = drive() if odometry else replace(drive(), odometry=None)
+    with pytest.raises(Solved) as begun:
+        pipeline.run(log, load_settings(None, (*HELD, "checks.use=true", *more)), ledger)
+    assert begun.value.args == (told,)
