@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from association_scenes import Scene, watch
 
+from objslam.association.crossings import ghost_pairs
 from objslam.core.arrays import Floats
 from objslam.core.geometry import angles_off, lift_se2
 from objslam.core.types import Association
@@ -69,3 +70,19 @@ def test_the_names_of_ghosts_do_not_matter() -> None:
     turned = replace(association, object=len(points) - 1 - association.object)
     second = seen.associate(guess=(turned, points[::-1].copy()))
     np.testing.assert_array_equal(first.object, second.object)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_rays_of_a_pair_are_tried_twice(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ghosts are replaced, so all pairs that still fit badly come again."""
+    seen, tried, of = scene(seed, last=20), list[bytes](), ghost_pairs._best_points
+
+    def noted(obs, *more):
+        tried.append(obs.direction.tobytes())
+        return of(obs, *more)
+
+    monkeypatch.setattr(ghost_pairs, "_best_points", noted)
+    monkeypatch.setattr(ghost_pairs, "_LEAST_GAIN", 0.0)  # Every pair that fits a little worse than usual is tried.
+    seen.associate(guess=guess(seen, np.concatenate([GHOSTS, OTHERS])))
+    assert tried
+    assert len(set(tried)) == len(tried)
